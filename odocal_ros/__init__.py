@@ -1,0 +1,28 @@
+"""
+Calibrate a vehicle's odometer against IMU and GNSS.
+
+Frames   n   local level, east-north-up, Cartesian, fixed to the Earth at the leg's start point
+         b   IMU body: the Imu message's frame i after the nominal rotation, forward-left-up
+         v   vehicle: x along the travel that positive pulses mean, y left, z up
+         i   the Imu message's own frame; in ``w_ib`` and the like: inertial; e: Earth-fixed
+Matrices C_nb takes a vector from b to n; letters that touch must match: f_n = C_nb @ f_b
+Angles   mounting angles: fixed-axis roll, pitch, yaw of the IMU on the vehicle,
+         v_v = C_vb v_b, C_vb = Rz(yaw) Ry(pitch) Rx(roll); yaw > 0: IMU's x axis points left of
+         forward; pitch > 0: below it. yaw is from east, counter-clockwise; heading from north,
+         clockwise
+Units    SI and radians unless the name says otherwise; latitude and longitude in rad inside
+Time     stamp_ns is int64 header time; t is float seconds since the start mark
+Words    mark: a point the operator names; leg: what lies between two; track: the path dead
+         reckoned; chord: straight line between a leg's ends; scale factor: metres of travel per
+         pulse; fix: a GNSS position; pre-roll: samples kept before the start mark
+Modules  config, errors, reasons, samples, leg, messages   what everybody speaks
+         nav      earth, projection, rotations, alignment, strapdown, odometer, dead reckoning
+         calib    methods, their error budget, verdict, combination of legs
+         pipeline one pure function from leg to result
+         sim      drives with known truth        bagio    the only place of rosbags
+         live     the node, the only place of rclpy       offline  the odocal command
+         output   files written
+Flow     messages -> samples -> leg -> pipeline.calibrate -> result -> status, YAML, JSON
+"""
+
+__version__ = '0.1.0'

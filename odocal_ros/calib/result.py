@@ -1,0 +1,112 @@
+"""What comes out: estimates with sigmas, per method, per leg and combined. Frozen, unit-bearing."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.reasons import Reason, Verdict, verdict_of
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its sigma (1 standard deviation) and unit; None: not determined."""
+
+    value: float | None
+    sigma: float | None
+    unit: str
+    method: str = ''
+
+    def as_dict(self) -> dict:
+        """Return the entry of calibration.json."""
+        entry = {'value': self.value, 'sigma': self.sigma, 'unit': self.unit}
+        return entry | ({'method': self.method} if self.method else {})
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """
+    One source of error of an estimate, as one-sigma effects.
+
+    effects : (p, k) effect of k independent unit errors on the p parameters of the method.
+    shared  : the error is the same in every leg of a vehicle (heading source, lever arm).
+    """
+
+    name: str
+    effects: NDArray[np.float64]
+    shared: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """What one method says of one leg, or of all."""
+
+    name: str
+    reasons: tuple[Reason, ...]
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
+    sources: tuple[Source, ...] = ()
+    details: dict = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the gravest verdict of the reasons."""
+        return verdict_of(self.reasons)
+
+
+@dataclass(frozen=True)
+class TrackCheck:
+    """Distance of the dead-reckoned track from the fixes, m."""
+
+    rms: float
+    max: float
+    mean: float
+    end: float
+    percent_of_distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class LegResult:
+    """Everything computed from one leg."""
+
+    start_ns: int
+    stop_ns: int
+    distance: float
+    duration: float
+    imu_samples: int
+    pulses: int
+    fixes: int
+    rejected_fixes: int
+    reasons: tuple[Reason, ...]
+    methods: dict[str, MethodResult]
+    before: TrackCheck | None = None
+    after: TrackCheck | None = None
+    track_n: NDArray | None = None            # (m, 3) corrected dead reckoning, n, m
+    track_before_n: NDArray | None = None     # (m, 3) as configured
+    reference_n: NDArray | None = None        # (k, 3) fixes used
+    origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the gravest of the leg's reasons and its best method's verdict."""
+        order = list(Verdict)
+        best = min((m.verdict for m in self.methods.values()), key=order.index,
+                   default=Verdict.REJECTED)
+        return Verdict.worst([verdict_of(self.reasons), best])
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The combination of all legs: what is published and written."""
+
+    reasons: tuple[Reason, ...]
+    estimates: dict[str, Estimate]
+    methods: dict[str, MethodResult]
+    legs: tuple[LegResult, ...]
+    imu_rotation_xyzw: tuple[float, ...] | None = None  # base_link <- imu frame
+    imu_rotation_rpy: tuple[float, ...] | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the gravest verdict of the reasons."""
+        return verdict_of(self.reasons)

@@ -1,0 +1,21 @@
+"""Errors raised on purpose; each door catches OdocalError once and shows its one sentence."""
+
+
+class OdocalError(Exception):
+    """Base of all errors raised here on purpose: the text says what, where and what to do."""
+
+
+class BadConfig(OdocalError):
+    """A setting is unknown, of the wrong type or out of range: edit the file or parameter."""
+
+
+class BadData(OdocalError):
+    """Samples break their contract (shape, type): mend the source."""
+
+
+class BadBag(OdocalError):
+    """A recording is missing, unreadable or holds nothing usable."""
+
+
+class BadUsage(OdocalError):
+    """A command was asked for something it cannot do as asked: call it again, corrected."""

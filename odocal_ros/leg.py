@@ -1,0 +1,105 @@
+"""
+A leg: what the sensors said between two marks, and the recorder that collects it.
+
+The recorder is the only thing in the package that remembers; both doors feed it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from odocal_ros.samples import (
+    FixSamples, HeadingSamples, ImuSamples, join, no_fix, no_heading, no_imu, no_odometer,
+    no_velocity, OdometerForm, OdometerSamples, take, VelocitySamples)
+
+EMPTY = {
+    'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
+    'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
+}
+SLOTS = tuple(EMPTY)
+COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """
+    What the sensors said between two marks, with the pre-roll before the first.
+
+    Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
+    ``stop_ns``, in order of arrival, as sent. ``odometer`` is the left wheel where
+    ``odometer_right`` is not empty.
+    """
+
+    start_ns: int
+    stop_ns: int
+    imu: ImuSamples = field(default_factory=no_imu)
+    odometer: OdometerSamples = field(default_factory=no_odometer)
+    odometer_right: OdometerSamples = field(default_factory=no_odometer)
+    fix: FixSamples = field(default_factory=no_fix)
+    fix_velocity: VelocitySamples = field(default_factory=no_velocity)
+    heading: HeadingSamples = field(default_factory=no_heading)
+    form: OdometerForm = COUNTER
+
+
+class LegRecorder:
+    """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[str, list] = {slot: [] for slot in SLOTS}
+        self._newest = dict.fromkeys(SLOTS, 0)
+        self.form = COUNTER
+
+    def feed(self, slot: str, block) -> None:
+        """Append a block (one row or many) to a slot of SLOTS."""
+        if len(block.stamp_ns):
+            self._blocks[slot].append(block)
+            self._newest[slot] = int(block.stamp_ns[-1])
+
+    def newest_ns(self, slot: str) -> int:
+        """Return the stamp of the last row fed, 0 before the first."""
+        return self._newest[slot]
+
+    def rows(self, slot: str):
+        """Return all rows of a slot as one block, in order of arrival."""
+        blocks = self._blocks[slot]
+        if not blocks:
+            return EMPTY[slot]()
+        if len(blocks) > 1:
+            self._blocks[slot] = blocks = [join(blocks)]
+        return blocks[0]
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop blocks that lie whole before a stamp, to bound memory."""
+        for slot, blocks in self._blocks.items():
+            keep = 0
+            while keep < len(blocks) and _key(blocks[keep]).max() < stamp_ns:
+                keep += 1
+            del blocks[:keep]
+
+    def clear(self) -> None:
+        """Drop everything, as after a jump of time."""
+        self.__init__()
+
+    def close(self, start_ns: int, stop_ns: int, preroll: float = 600.0) -> Leg:
+        """
+        Return the leg between two marks, with ``preroll`` seconds before the first.
+
+        Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
+        interpolated at the mark; later ones are not, however late the leg is closed.
+        """
+        first_ns = start_ns - round(preroll * 1e9)
+        rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form, **rows)
+
+
+def _key(samples) -> np.ndarray:
+    """Return the stamp by which a row is placed: rows without one go by their arrival."""
+    return np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+
+
+def _cut(samples, first_ns: int, stop_ns: int):
+    key = _key(samples)
+    after = key[key > stop_ns]
+    last_ns = after.min() if len(after) else stop_ns
+    keep = (key >= first_ns) & (key <= last_ns)
+    return samples if keep.all() else take(samples, keep)

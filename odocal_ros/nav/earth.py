@@ -1,0 +1,79 @@
+"""The Earth: WGS 84 ellipsoid, gravity and rates; geodetic and Earth-fixed coordinates."""
+
+import numpy as np
+
+A = 6378137.0                  # m, semi-major axis
+F = 1 / 298.257223563          # flattening
+E2 = F * (2 - F)               # first eccentricity squared
+OMEGA = 7.292115e-5            # rad/s, Earth rate
+GAMMA_E = 9.7803253359         # m/s^2, normal gravity at the equator
+K_GAMMA = 0.00193185265241     # Somigliana's constant
+M_GAMMA = 0.00344978650684     # omega^2 a^2 b / GM
+
+
+def radii(latitude):
+    """Return meridian and normal radius of curvature, m, at a latitude, rad: (...)."""
+    w2 = 1 - E2 * np.sin(latitude) ** 2
+    normal = A / np.sqrt(w2)
+    return normal * (1 - E2) / w2, normal
+
+
+def gravity(latitude, height):
+    """Return normal gravity, m/s^2, at latitude (rad) and height (m) (NIMA TR8350.2, 4-1, 4-3)."""
+    s2 = np.sin(latitude) ** 2
+    gamma_0 = GAMMA_E * (1 + K_GAMMA * s2) / np.sqrt(1 - E2 * s2)
+    return gamma_0 * (1 - 2 / A * (1 + F + M_GAMMA - 2 * F * s2) * height + 3 / A**2 * height**2)
+
+
+def earth_rate_n(latitude):
+    """Return the Earth's turn rate in ENU, rad/s: (...) to (..., 3)."""
+    latitude = np.asarray(latitude, dtype=float)
+    zero = np.zeros_like(latitude)
+    return np.stack([zero, OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)], -1)
+
+
+def transport_rate_n(latitude, height, velocity_n):
+    """Return the turn rate of the local level against the Earth, ENU, rad/s: (..., 3)."""
+    meridian, normal = radii(latitude)
+    east, north = velocity_n[..., 0], velocity_n[..., 1]
+    return np.stack([-north / (meridian + height), east / (normal + height),
+                     east * np.tan(latitude) / (normal + height)], -1)
+
+
+def ecef_from_geodetic(latitude, longitude, height):
+    """Return Earth-fixed coordinates, m, of rad, rad, m: (...) to (..., 3)."""
+    latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
+    normal = radii(latitude)[1]
+    level = (normal + height) * np.cos(latitude)
+    return np.stack([level * np.cos(longitude), level * np.sin(longitude),
+                     (normal * (1 - E2) + height) * np.sin(latitude)], -1)
+
+
+def geodetic_from_ecef(r_e):
+    """
+    Return latitude, longitude (rad), height (m) of Earth-fixed coordinates, m: (..., 3).
+
+    Bowring's start and Newton-like steps on the reduced latitude: within 1e-9 m up to 100 km
+    of height, poles included.
+    """
+    x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
+    b = A * (1 - F)
+    p = np.hypot(x, y)
+    beta = np.arctan2(A * z, b * p)
+    for _ in range(3):
+        latitude = np.arctan2(z + E2 / (1 - E2) * b * np.sin(beta) ** 3,
+                              p - E2 * A * np.cos(beta) ** 3)
+        beta = np.arctan2((1 - F) * np.sin(latitude), np.cos(latitude))
+    s, c = np.sin(latitude), np.cos(latitude)
+    height = p * c + z * s - A * np.sqrt(1 - E2 * s * s)
+    return latitude, np.arctan2(y, x), height
+
+
+def C_en(latitude, longitude):
+    """Return the rotation that takes ENU to Earth-fixed axes: (...) to (..., 3, 3)."""
+    latitude, longitude = np.broadcast_arrays(latitude, longitude)
+    sp, cp, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    zero = np.zeros_like(sp)
+    return np.stack([np.stack([-sl, -sp * cl, cp * cl], -1),
+                     np.stack([cl, -sp * sl, cp * sl], -1),
+                     np.stack([zero, cp, sp], -1)], -2)

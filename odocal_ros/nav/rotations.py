@@ -1,0 +1,111 @@
+"""
+Rotations: matrices, quaternions (x y z w, as ROS sends them) and fixed-axis roll, pitch, yaw.
+
+``q_nb`` and ``C_nb`` take a vector from b to n. All functions take (..., 3), (..., 4) or
+(..., 3, 3) arrays.
+"""
+
+import numpy as np
+
+
+def skew(a):
+    """Return the matrix of the cross product with a: (..., 3) to (..., 3, 3)."""
+    return np.cross(np.asarray(a, dtype=float)[..., None, :], -np.eye(3))
+
+
+def exp_so3(phi):
+    """Return the rotation matrix of rotation vector phi, rad: (..., 3) to (..., 3, 3)."""
+    half = np.linalg.norm(phi, axis=-1)[..., None, None] / 2
+    S = skew(phi)
+    return np.eye(3) + np.sinc(2 * half / np.pi) * S + np.sinc(half / np.pi) ** 2 / 2 * S @ S
+
+
+def transpose(C):
+    """Return the inverse rotation: (..., 3, 3)."""
+    return np.swapaxes(C, -1, -2)
+
+
+def quat_from_rotvec(phi):
+    """Return the quaternion of rotation vector phi, rad: (..., 3) to (..., 4)."""
+    phi = np.asarray(phi, dtype=float)
+    half = np.sqrt(np.einsum('...i,...i->...', phi, phi)) / 2
+    q = np.empty((*phi.shape[:-1], 4))
+    q[..., :3] = phi * (np.sinc(half / np.pi) / 2)[..., None]
+    q[..., 3] = np.cos(half)
+    return q
+
+
+def quat_multiply(p, q):
+    """Return the product: p_ab, q_bc to q_ac, (..., 4)."""
+    px, py, pz, pw = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
+    qx, qy, qz, qw = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    return np.stack([pw * qx + px * qw + py * qz - pz * qy,
+                     pw * qy - px * qz + py * qw + pz * qx,
+                     pw * qz + px * qy - py * qx + pz * qw,
+                     pw * qw - px * qx - py * qy - pz * qz], axis=-1)
+
+
+def quat_conjugate(q):
+    """Return the inverse of a unit quaternion: (..., 4)."""
+    return np.asarray(q, dtype=float) * [-1.0, -1.0, -1.0, 1.0]
+
+
+def matrix_from_quat(q):
+    """Return the rotation matrix of a quaternion of any length but zero: (..., 4)."""
+    q = np.asarray(q, dtype=float)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    s = 2 / np.einsum('...i,...i->...', q, q)
+    C = np.empty((*q.shape[:-1], 3, 3))
+    C[..., 0, 0] = 1 - s * (y * y + z * z)
+    C[..., 0, 1] = s * (x * y - z * w)
+    C[..., 0, 2] = s * (x * z + y * w)
+    C[..., 1, 0] = s * (x * y + z * w)
+    C[..., 1, 1] = 1 - s * (x * x + z * z)
+    C[..., 1, 2] = s * (y * z - x * w)
+    C[..., 2, 0] = s * (x * z - y * w)
+    C[..., 2, 1] = s * (y * z + x * w)
+    C[..., 2, 2] = 1 - s * (x * x + y * y)
+    return C
+
+
+def quat_from_matrix(C):
+    """
+    Return the quaternion (w >= 0) of a rotation matrix: (..., 3, 3) to (..., 4).
+
+    The row of the symmetric 4 x 4 matrix 4 q q^T with the largest diagonal is taken, so that no
+    attitude loses digits.
+    """
+    C = np.asarray(C, dtype=float)
+    xx, yy, zz = C[..., 0, 0], C[..., 1, 1], C[..., 2, 2]
+    sx, sy, sz = (C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
+                  C[..., 1, 0] - C[..., 0, 1])
+    xy, xz, yz = C[..., 0, 1] + C[..., 1, 0], C[..., 0, 2] + C[..., 2, 0], \
+        C[..., 1, 2] + C[..., 2, 1]
+    rows = np.stack([np.stack([1 + xx - yy - zz, xy, xz, sx], -1),
+                     np.stack([xy, 1 - xx + yy - zz, yz, sy], -1),
+                     np.stack([xz, yz, 1 - xx - yy + zz, sz], -1),
+                     np.stack([sx, sy, sz, 1 + xx + yy + zz], -1)], -2)
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1)[..., None]
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def matrix_from_rpy(rpy):
+    """Return Rz(yaw) Ry(pitch) Rx(roll) (fixed axes, URDF): (..., 3) rad to (..., 3, 3)."""
+    rpy = np.asarray(rpy, dtype=float)
+    (cr, cp, cy), (sr, sp, sy) = (np.moveaxis(f(rpy), -1, 0) for f in (np.cos, np.sin))
+    return np.stack([np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
+                     np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
+                     np.stack([-sp, cp * sr, cp * cr], -1)], -2)
+
+
+def rpy_from_matrix(C):
+    """Return fixed-axis roll, pitch, yaw, rad; at pitch +-90 deg roll is set to 0."""
+    C = np.asarray(C, dtype=float)
+    level = np.hypot(C[..., 0, 0], C[..., 1, 0])
+    locked = level < 1e-12
+    roll = np.where(locked, 0.0, np.arctan2(C[..., 2, 1], C[..., 2, 2]))
+    yaw = np.where(locked, np.arctan2(-C[..., 0, 1], C[..., 1, 1]),
+                   np.arctan2(C[..., 1, 0], C[..., 0, 0]))
+    return np.stack([roll, np.arctan2(-C[..., 2, 0], level), yaw], -1)

@@ -1,0 +1,117 @@
+"""Reason codes: what can be said about a leg or a calibration, how grave it is, what to do."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Verdict(Enum):
+    """What a result is good for; ``rejected`` results keep every value they computed."""
+
+    ACCEPTED = 'accepted'
+    CAUTION = 'caution'
+    REJECTED = 'rejected'
+
+    @staticmethod
+    def worst(verdicts) -> 'Verdict':
+        """Return the gravest of many, accepted if there are none."""
+        order = list(Verdict)
+        return max(verdicts, key=order.index, default=Verdict.ACCEPTED)
+
+
+NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
+
+
+class Code(Enum):
+    """A reason code: (gravity, remedy)."""
+
+    # the data that came
+    NO_IMU = REJECT, 'Check the Imu topic and its QoS, or name it with --imu-topic.'
+    NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
+    NO_FIX = REJECT, 'Drive under open sky and wait for a position before the start mark.'
+    FIXES_UNUSABLE = REJECT, ('Wait for a valid position; loosen gnss.min_status or '
+                              'gnss.max_sigma if these fixes are good.')
+    BAD_ROWS_DROPPED = NOTE, 'Mend the driver that sends them; the other rows were used.'
+    STAMPS_NOT_RISING = NOTE, 'Mend the clock of the sender; the rows in order were used.'
+    IMU_GAP = REJECT, ('Mend the Imu stream (QoS depth, CPU load, cable), or mark a leg beside '
+                       'the gap; leg.max_gap is the limit.')
+    TOPIC_GAP = NOTE, 'Mend the stream; the gap lowers the weight, not the leg.'
+    CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
+                             'stamp all sensors with one clock.')
+    COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg; the travel across the '
+                              'reset was bridged at the speed beside it.')
+    COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
+    REVERSING_UNSIGNED = REJECT, ('Do not reverse during a leg, or use an odometer that counts '
+                                  'backwards (odometer.signed).')
+    ODOMETER_REVERSED = REJECT, 'Set odometer.reversed to true (or false if it is).'
+    ODOMETER_STILL = REJECT, 'Check wheel sensor and topic: the fixes move, the counter does not.'
+    IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
+                         'imu.gyro_scale.')
+    IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '
+                                 'axes are forward-right-down.')
+    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; odocal '
+                        'inspect suggests it.')
+    GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
+    BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
+    # the drive
+    NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark: level, gyro '
+                              'bias and heading then come from rest.')
+    LEG_TOO_SHORT = REJECT, 'Drive farther between the marks: leg.min_distance is the least.'
+    CHORD_TOO_SHORT = REJECT, ('End far from where you start: a straight stretch, or mark part '
+                               'of the drive with --leg; the two-point method sees only the line '
+                               'between start and end.')
+    SPEED_TOO_LOW = CAUTION, 'Drive faster than leg.min_speed for at least part of the leg.'
+    LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
+    TRACK_MISMATCH = CAUTION, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
+                               'fixes; drive again on a firm straight road with open sky.')
+    # the estimate
+    YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
+                                  'alignment.heading with its sigma, a dual-antenna heading '
+                                  'topic, or a gyro good enough to gyrocompass.')
+    GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
+                                    'longer standstill, or another heading source.')
+    HEADING_UNAVAILABLE = CAUTION, 'Check the heading source, or set alignment.heading_source.'
+    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that gives ellipsoidal height.'
+    SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
+                                       'odometer; odometer.max_scale_deviation is the limit.')
+    YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
+                                     'source.')
+    SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
+                                      'at both marks), or combine more legs.')
+    YAW_SIGMA_TOO_LARGE = CAUTION, 'Give a better heading, or combine legs with headings of their own.'
+    PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
+    LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
+                              'the combined sigma was widened.')
+    MORE_LEGS_NEEDED = CAUTION, 'Drive more legs: verdict.min_legs.'
+    NO_METHOD = REJECT, 'See the reasons of the legs.'
+
+    def __init__(self, gravity: Verdict, remedy: str) -> None:
+        self.gravity = gravity
+        self.remedy = remedy
+
+    def __new__(cls, *args):
+        """Give each code a value of its own, so that equal pairs do not become aliases."""
+        member = object.__new__(cls)
+        member._value_ = len(cls.__members__)
+        return member
+
+
+@dataclass(frozen=True)
+class Reason:
+    """A code with what was seen: one sentence with the figures."""
+
+    code: Code
+    text: str
+
+    @property
+    def remedy(self) -> str:
+        """Return what the reader can do about it."""
+        return self.code.remedy
+
+    def as_dict(self) -> dict:
+        """Return the entry of calibration.json."""
+        return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
+
+
+def verdict_of(reasons) -> Verdict:
+    """Return the gravest verdict that the reasons ask for."""
+    return Verdict.worst(r.code.gravity for r in reasons)
