@@ -1,0 +1,37 @@
+"""IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI (method.md section 3)."""
+
+from dataclasses import dataclass
+import math
+
+
+@dataclass(frozen=True)
+class Grade:
+    """Error figures of an IMU, each axis, 1 sigma."""
+
+    gyro_noise: float       # rad/s/sqrt(Hz)
+    gyro_bias: float        # rad/s, at turn-on
+    gyro_bias_walk: float   # rad/s/sqrt(s)
+    accel_noise: float      # m/s^2/sqrt(Hz)
+    accel_bias: float       # m/s^2, at turn-on
+    accel_bias_walk: float  # m/s^2/sqrt(s)
+
+
+def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_bias,
+                     accel_bias_walk) -> Grade:
+    """Take deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h)."""
+    hour, root_hour = 3600.0, 60.0
+    return Grade(
+        gyro_noise=math.radians(gyro_noise) / root_hour,
+        gyro_bias=math.radians(gyro_bias) / hour,
+        gyro_bias_walk=math.radians(gyro_bias_walk) / hour / root_hour,
+        accel_noise=accel_noise / root_hour,
+        accel_bias=accel_bias,
+        accel_bias_walk=accel_bias_walk / root_hour)
+
+
+GRADES: dict[str, Grade] = {
+    'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3),
+    'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3),
+    'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4),
+    'navigation': _from_data_sheet(0.001, 0.01, 0.003, 0.005, 5e-4, 5e-5),
+}
