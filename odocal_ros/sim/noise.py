@@ -1,0 +1,38 @@
+"""Random numbers with a stream for each sensor, and the noises made of them."""
+
+import zlib
+
+import numpy as np
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Return the named generator of a seed; no setting of one sensor moves another's numbers."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def white(rng, root_psd: float, rate: float, shape) -> np.ndarray:
+    """Return samples at ``rate`` Hz of white noise of a root PSD, unit/sqrt(Hz)."""
+    return root_psd * rate**0.5 * rng.standard_normal(shape)
+
+
+def random_walk(rng, root_rate: float, rate: float, shape) -> np.ndarray:
+    """Return a random walk from 0 that grows by ``root_rate`` unit/sqrt(s): (n, ...)."""
+    steps = root_rate / rate**0.5 * rng.standard_normal(shape)
+    steps[:1] = 0.0
+    return np.cumsum(steps, axis=0)
+
+
+def gauss_markov(rng, sigma: float, tau: float, t) -> np.ndarray:
+    """
+    Return a first-order Gauss-Markov process in three axes: (n,) s to (n, 3).
+
+    Stationary from the first sample: sigma everywhere, correlation exp(-dt / tau).
+    """
+    decay = np.exp(-np.diff(t, prepend=t[:1]) / tau)
+    drive = sigma * np.sqrt(1 - decay**2)[:, None] * rng.standard_normal((len(t), 3))
+    drive[:1] = sigma * rng.standard_normal((1, 3))
+    x = np.empty_like(drive)
+    last = np.zeros(3)
+    for k, (d, push) in enumerate(zip(decay, drive, strict=True)):
+        x[k] = last = d * last + push
+    return x

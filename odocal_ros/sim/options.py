@@ -1,0 +1,140 @@
+"""What a simulated drive is made of: every choice with its default, checked in one place."""
+
+from dataclasses import dataclass, fields, replace
+import math
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.grades import Grade, GRADES
+
+PERFECT = Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SIM_GRADES = GRADES | {'perfect': PERFECT}
+FIX_NOISES = ('white', 'correlated', 'rtk')
+ODOMETERS = ('counts', 'speed', 'angle')
+Vector = tuple[float, float, float]
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimOptions:
+    """
+    Choices for one drive. None: the scenario's own value (``resolved`` fills them in).
+
+    Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
+    those of method.md section 0; ``mounting_rpy`` is the nominal rotation from the Imu's frame to
+    b that comes on top.
+    """
+
+    scenario: str = 'straight'
+    duration: float | None = None          # s
+    seed: int = 1
+    start_ns: int = 1_750_000_000_000_000_000
+    latitude: float = math.radians(40.0)
+    longitude: float = math.radians(116.0)
+    height: float = 50.0                   # m, ellipsoidal
+    heading: float = math.radians(45.0)    # of the vehicle at the start, clockwise from north
+    slope: float = 0.0                     # rad, steepest part of hills of 1 km length
+
+    imu_grade: str | None = None
+    imu_rate: float = 100.0                # Hz
+    yaw: float | None = None               # rad, yaw mounting angle
+    pitch: float | None = None             # rad, pitch mounting angle
+    roll: float = 0.0                      # rad
+    mounting_rpy: Vector = ORIGIN          # rad, nominal, Imu frame to b
+    imu_lever_arm: Vector = ORIGIN
+    orientation_sigma: float | None = None  # rad; None: the Imu sends no orientation
+
+    odometer: str = 'counts'               # counts, speed or angle (JointState position)
+    odometer_rate: float = 50.0            # Hz
+    odometer_delay: float = 0.0            # s by which its stamps are late
+    odometer_lever_arm: Vector = ORIGIN    # wheel contact point; of two wheels: their middle
+    scale: float | None = None             # m/pulse, 1 or m/rad: what is to be found
+    nominal_scale: float | None = None     # K0, what the operator believes
+    speed_noise: float = 0.0               # m/s, white, of kind speed
+    two_wheels: bool = False
+    wheel_difference: float = 0.004        # K_right / K_left - 1
+    track_width: float = 1.6               # m
+    slip_walk: float = 0.0                 # m/sqrt(s) while moving
+    slip_events: float = 0.0               # per hour of motion
+    slip_size: float = 0.1                 # m spun in each event
+
+    fix_rate: float = 5.0                  # Hz
+    fix_noise: str = 'white'               # white, correlated or rtk
+    fix_sigma: float | None = None         # m, horizontal, each axis; up: twice
+    fix_correlation_time: float = 60.0     # s, of kind correlated
+    fix_delay: float = 0.0                 # s by which its stamps are late
+    antenna_lever_arm: Vector = ORIGIN
+    outliers: float = 0.0                  # share of the fixes
+    outlier_size: float = 20.0             # m
+    outages: tuple[tuple[float, float], ...] = ()   # s from the start, no fixes in between
+
+    heading_sigma: float | None = None     # rad; None: no heading topic
+    heading_rate: float = 10.0             # Hz
+
+
+# what differs by scenario
+DEFAULTS = {
+    'paper': {'duration': 930.0, 'imu_grade': 'navigation', 'pitch': 0.0},
+    'straight': {'duration': 720.0, 'imu_grade': 'industrial'},
+    'out_and_back': {'duration': 600.0, 'imu_grade': 'industrial'},
+    'town': {'duration': 600.0, 'imu_grade': 'consumer'},
+}
+EVERYWHERE = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4)}
+SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
+FINE = 0.001   # m/pulse of the paper's odometer: a coarser pulse would hide 1e-6 of 11 200 m
+POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'scale', 'nominal_scale',
+            'track_width', 'fix_correlation_time', 'duration')
+NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
+                'slip_events', 'slip_size', 'outliers', 'outlier_size', 'seed')
+
+
+def resolved(options: SimOptions) -> SimOptions:
+    """
+    Return options with the scenario's own values in place of None.
+
+    Raises
+    ------
+    BadUsage
+        A name is unknown or a figure is out of range.
+
+    """
+    _choice('--scenario', options.scenario, DEFAULTS)
+    _choice('--fix-noise', options.fix_noise, FIX_NOISES)
+    _choice('--odometer', options.odometer, ODOMETERS)
+    defaults = EVERYWHERE | DEFAULTS[options.scenario]
+    scale, nominal = SCALES[options.odometer]
+    if options.scenario == 'paper':
+        scale = FINE if options.odometer == 'counts' else scale
+        nominal = 1.2 * (options.scale or scale)
+    elif options.scale is not None:
+        nominal = options.scale * nominal / scale
+    defaults |= {'scale': scale, 'nominal_scale': nominal,
+                 'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5}
+    filled = replace(options, **{name: value for name, value in defaults.items()
+                                 if getattr(options, name) is None})
+    _check(filled)
+    return filled
+
+
+def _check(options):
+    _choice('--imu-grade', options.imu_grade, SIM_GRADES)
+    for field in fields(options):
+        value = getattr(options, field.name)
+        flag = '--' + field.name.replace('_', '-')
+        if isinstance(value, float) and not math.isfinite(value):
+            raise BadUsage(f'{flag} {value}: want a finite number')
+        if field.name in POSITIVE and not value > 0:
+            raise BadUsage(f'{flag} {value:g}: want a number above 0')
+        if field.name in NOT_NEGATIVE and value is not None and value < 0:
+            raise BadUsage(f'{flag} {value:g}: want 0 or more')
+    if options.outliers > 0.5:
+        raise BadUsage(f'--outliers {options.outliers:g}: a share of the fixes, want 0 to 0.5')
+    if options.two_wheels and options.odometer == 'speed':
+        raise BadUsage('--two-wheels goes with --odometer counts or angle, not with speed')
+    for begin, end in options.outages:
+        if not 0 <= begin < end:
+            raise BadUsage(f'--outage {begin:g}:{end:g}: want A:B, seconds with 0 <= A < B')
+
+
+def _choice(flag, name, names):
+    if name not in names:
+        raise BadUsage(f'{flag} {name}: want one of {", ".join(names)}')

@@ -1,0 +1,105 @@
+"""Piecewise polynomials of time: speeds and turn rates with exact derivatives and integrals."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+ON_BREAK = 1e-9   # s; a sample this near a break lies on it
+
+
+class Profile:
+    """
+    A piecewise polynomial, held constant before its first and after its last break.
+
+    breaks : (m + 1,) rising, s.   powers : (m, d) coefficients of (t - breaks[i]) ** 0, 1, ...
+    """
+
+    def __init__(self, breaks, powers) -> None:
+        self.breaks = np.asarray(breaks, dtype=float)
+        self.powers = np.asarray(powers, dtype=float)
+
+    @property
+    def end(self) -> float:
+        """Return the last break."""
+        return float(self.breaks[-1])
+
+    def __call__(self, t):
+        """Return the values at (...) times; at a jump, what follows it."""
+        return self._on(self._piece(t), t)
+
+    def mean(self, t):
+        """Return the values, at a jump the mean of both sides (a trapezoid rule is then exact)."""
+        t = np.asarray(t, dtype=float)
+        before, after = self._piece(t - ON_BREAK), self._piece(t + ON_BREAK)
+        return (self._on(before, t) + self._on(after, t)) / 2
+
+    def derivative(self) -> 'Profile':
+        """Return the derivative."""
+        order = np.arange(1, self.powers.shape[1])
+        return Profile(self.breaks, self.powers[:, 1:] * order if len(order)
+                       else np.zeros((len(self.powers), 1)))
+
+    def integral(self) -> 'Profile':
+        """Return the integral from the first break."""
+        order = np.arange(1, self.powers.shape[1] + 1)
+        powers = np.concatenate([np.zeros((len(self.powers), 1)), self.powers / order], axis=1)
+        gains = _horner(powers.T, np.diff(self.breaks))
+        powers[1:, 0] = np.cumsum(gains)[:-1]
+        return Profile(self.breaks, powers)
+
+    def _piece(self, t):
+        piece = np.searchsorted(self.breaks, t, side='right') - 1
+        return np.clip(piece, 0, len(self.powers) - 1)
+
+    def _on(self, piece, t):
+        t = np.clip(t, self.breaks[0], self.breaks[-1])
+        return _horner(self.powers.T[:, piece], t - self.breaks[piece])
+
+
+def _horner(powers, x):
+    value = powers[-1]
+    for power in powers[-2::-1]:
+        value = value * x + power
+    return value
+
+
+def line(duration: float, start: float, end: float):
+    """Return one piece: (duration, powers), straight from one value to another."""
+    return duration, (start, (end - start) / duration if duration else 0.0, 0.0, 0.0)
+
+
+def smooth(duration: float, start: float, end: float):
+    """Return one piece with level ends: 3 x^2 - 2 x^3 between the values."""
+    rise = end - start
+    return duration, (start, 0.0, 3 * rise / duration**2, -2 * rise / duration**3)
+
+
+def chain(pieces: Iterable[tuple]) -> Profile:
+    """Join pieces end to end from time 0; pieces of no duration vanish."""
+    kept = [(d, p) for d, p in pieces if d > 0]
+    # breaks rounded to ns, so that a break meant for a sample's stamp is on it
+    breaks = np.round(np.cumsum([0.0] + [d for d, _ in kept]), 9)
+    return Profile(breaks, [p for _, p in kept])
+
+
+def ramp(duration: float, gain: float, blend: float):
+    """
+    Return the acceleration pieces that change speed by ``gain`` within ``duration``.
+
+    It rises and falls in straight lines of ``blend`` seconds (0: at once, as in the paper).
+    """
+    peak = gain / (duration - blend)
+    return [line(blend, 0.0, peak), line(duration - 2 * blend, peak, peak),
+            line(blend, peak, 0.0)]
+
+
+def turn(duration: float, angle: float, blend: float):
+    """Return the turn-rate pieces that turn by ``angle``, with smooth flanks of ``blend`` s."""
+    peak = angle / (duration - blend)
+    return [smooth(blend, 0.0, peak), line(duration - 2 * blend, peak, peak),
+            smooth(blend, peak, 0.0)]
+
+
+def hold(duration: float):
+    """Return the pieces of nothing happening."""
+    return [line(duration, 0.0, 0.0)]

@@ -1,0 +1,118 @@
+"""Named routes: speed and turn rate by time. Stops, ramps, turns; nothing of sensors."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.sim.profile import chain, hold, Profile, ramp, turn
+
+BLEND = 1.0        # s in which an acceleration sets in
+TURN_BLEND = 1.5   # s in which a turn rate sets in
+SIDE_LIMIT = 3.0   # m/s^2 to the side in a turn
+TOWN_LIMIT = math.radians(110.0)   # rad off the first heading, so that a town drive gets away
+
+
+@dataclass(frozen=True)
+class Route:
+    """Speed (m/s) and yaw rate (rad/s) by time, s."""
+
+    speed: Profile
+    yaw_rate: Profile
+
+
+def paper(duration: float, rng) -> Route:
+    """Return the drive of the paper's section 3: 300 s still, 20 m/s for 520 s, 30 s still."""
+    cruise = _rest('paper', duration, 300 + 40 + 40 + 30)
+    pieces = (hold(300) + ramp(40, 20, 0.0) + hold(cruise) + ramp(40, -20, 0.0) + hold(30))
+    return _route([(pieces, hold(duration))])
+
+
+def straight(duration: float, rng) -> Route:
+    """Return one straight run: 60 s still, 25 s up to 12 m/s, cruise, 25 s down, 60 s still."""
+    cruise = _rest('straight', duration, 60 + 25 + 25 + 60)
+    pieces = hold(60) + ramp(25, 12, BLEND) + hold(cruise) + ramp(25, -12, BLEND) + hold(60)
+    return _route([(pieces, hold(duration))])
+
+
+def out_and_back(duration: float, rng) -> Route:
+    """Return a straight out, a stop of 30 s, a U turn at 4 m/s, the same straight back."""
+    around = 5 + 2 + 14 + 2 + 10
+    cruise = _rest('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
+    out = hold(60) + ramp(15, 15, BLEND) + hold(cruise) + ramp(15, -15, BLEND) + hold(30)
+    about = ramp(5, 4, BLEND) + hold(2 + 14 + 2) + ramp(10, 11, BLEND)
+    back = hold(cruise) + ramp(15, -15, BLEND) + hold(60)
+    return _route([(out, hold(60 + 15 + cruise + 15 + 30)),
+                   (about, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
+                   (back, hold(cruise + 75))])
+
+
+def town(duration: float, rng) -> Route:
+    """
+    Return stop and go with a turn and a lane change between stops, all drawn from ``rng``.
+
+    A cycle of a minute or so: 5 to 12 s up to 9 to 14 m/s, cruise, one turn of 60 to 110 deg in
+    6 s or more, 6 to 12 s down, 4 to 15 s still. Turns keep the heading within 110 deg of the
+    first, so that the end lies well away from the start.
+    """
+    left = _rest('town', duration, 20 + 15)
+    stretches, off = [(hold(20), hold(20))], 0.0
+    while left >= 90.0 or not stretches[1:]:
+        speed, rate, off = _town_cycle(rng, off)
+        length = round(sum(d for d, _ in speed), 9)
+        if length > left:
+            break
+        stretches.append((speed, rate))
+        left -= length
+    if not stretches[1:]:
+        raise BadUsage(f'scenario town: --duration {duration:g} s holds no cycle of stop and go; '
+                       'give 135 s or more')
+    stretches.append((hold(15 + left), hold(15 + left)))
+    return _route(stretches)
+
+
+def _town_cycle(rng, off):
+    up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
+    before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
+    weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))
+    angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(60, 110))
+    turning = max(turning, _tenth(abs(angle) * top / SIDE_LIMIT + TURN_BLEND))
+    if abs(off + angle) > TOWN_LIMIT:
+        angle = -angle
+    side = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(4, 10))
+    cruise = before + turning + between + 2 * weave + after
+    speed = ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND) + hold(stop)
+    rate = (hold(up + before) + turn(turning, angle, TURN_BLEND) + hold(between)
+            + turn(weave, side, TURN_BLEND) + turn(weave, -side, TURN_BLEND)
+            + hold(after + down + stop))
+    return speed, rate, off + angle
+
+
+def _tenth(seconds):
+    """Round to 0.1 s: kinks then fall on samples, where a trapezoid rule is exact."""
+    return round(float(seconds), 1)
+
+
+def _rest(name, duration, fixed):
+    if not math.isfinite(duration) or duration < fixed + 10:
+        raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
+                       f'give {fixed + 10:g} s or more')
+    return duration - fixed
+
+
+def _route(stretches) -> Route:
+    """Join stretches of (acceleration pieces, turn-rate pieces) of equal length."""
+    acceleration = chain([p for speed, _ in stretches for p in speed])
+    yaw_rate = chain([p for _, rate in stretches for p in rate])
+    return Route(_clean(acceleration.integral()), yaw_rate)
+
+
+def _clean(speed: Profile) -> Profile:
+    """Take rounding out of standing and cruising: a stop is exactly 0 m/s."""
+    powers = speed.powers.copy()
+    powers[:, 0] = np.round(powers[:, 0], 12)
+    return Profile(speed.breaks, powers)
+
+
+ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town}

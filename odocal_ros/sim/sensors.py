@@ -1,0 +1,189 @@
+"""
+Sensors on a true motion: what each would have sent.
+
+The Imu gives point samples, not means over the interval: the rate and the specific force at the
+stamp; where the acceleration jumps, the mean of both sides. A trapezoid rule over the samples of a
+route whose kinks lie on them is then exact, a cubic one nearly so. White noise is drawn for the
+sample rate, so that sums over time have the stated density.
+"""
+
+import numpy as np
+
+from odocal_ros.nav.earth import radii
+from odocal_ros.nav.rotations import (
+    matrix_from_rpy, quat_from_matrix, quat_from_rotvec, quat_multiply)
+from odocal_ros.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
+from odocal_ros.sim.motion import (
+    attitude, contact_speed, contact_travel, inertial_v, Motion, point)
+from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
+from odocal_ros.sim.options import SIM_GRADES, SimOptions
+
+# seconds from the first Imu sample, so that no two topics sample together
+ODOMETER_PHASE, FIX_PHASE, HEADING_PHASE = 0.002, 0.003, 0.004
+# seconds from measuring to arriving
+IMU_TRANSPORT, FIX_TRANSPORT, HEADING_TRANSPORT = 0.0005, 0.05, 0.01
+FIRST_COUNT = 10_000     # an encoder that was on before the recording
+WHITE_SHARE = 0.2        # of the correlated sigma: receiver noise on top
+SIGMA_FLOOR = 0.001      # m; no receiver reports zero
+SLIP_TIME = 1.0          # s that a slip event takes
+
+
+def stamps(duration: float, rate: float, phase: float = 0.0):
+    """Return sample times: whole ns from the start (n,), and the same in s."""
+    n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
+    ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
+    return ns, ns * 1e-9
+
+
+def imu_rotation(options: SimOptions):
+    """Return C_vi, which takes the Imu's own frame to the vehicle: C_vb C_bi."""
+    return (matrix_from_rpy([options.roll, options.pitch, options.yaw])
+            @ matrix_from_rpy(options.mounting_rpy))
+
+
+def imu_errors(options: SimOptions, n: int):
+    """Return gyro and accelerometer errors in frame i, (n, 3) each: white noise + bias walk."""
+    grade, rate = SIM_GRADES[options.imu_grade], options.imu_rate
+    errors = []
+    for kind, noise, bias, walk in (
+            ('gyro', grade.gyro_noise, grade.gyro_bias, grade.gyro_bias_walk),
+            ('accelerometer', grade.accel_noise, grade.accel_bias, grade.accel_bias_walk)):
+        def draw(part, name=kind):
+            return stream(options.seed, f'{name} {part}')
+        turn_on = bias * draw('bias').standard_normal(3)
+        errors.append(turn_on + random_walk(draw('walk'), walk, rate, (n, 3))
+                      + white(draw('white'), noise, rate, (n, 3)))
+    return errors
+
+
+def imu(motion: Motion, options: SimOptions) -> ImuSamples:
+    """Return the Imu's samples over the whole drive."""
+    ns, t = stamps(motion.duration, options.imu_rate)
+    state = motion.at(t)
+    C_vi = imu_rotation(options)
+    w_v, f_v = inertial_v(state, options.imu_lever_arm)
+    gyro, accel = imu_errors(options, len(t))
+    q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+    variance = np.full(len(t), np.nan)
+    if options.orientation_sigma is not None:
+        q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
+        variance = np.full(len(t), options.orientation_sigma**2)
+    stamp = options.start_ns + ns
+    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_v @ C_vi + gyro,
+                      f_v @ C_vi + accel, q_ni, variance)
+
+
+def heading(motion: Motion, options: SimOptions) -> HeadingSamples:
+    """Return an outside heading of the Imu's x axis, as a dual-antenna receiver sends it."""
+    ns, t = stamps(motion.duration, options.heading_rate, HEADING_PHASE)
+    q_ni = _orientation(motion.at(t), options, options.heading_sigma, 'heading')
+    stamp = options.start_ns + ns
+    return HeadingSamples(stamp, stamp + round(HEADING_TRANSPORT * 1e9), q_ni,
+                          np.full(len(t), options.heading_sigma**2))
+
+
+def _orientation(state, options, sigma, name):
+    """Return q_ni with one heading error for the whole drive: a compass' does not average out."""
+    q_ni = quat_from_matrix(attitude(state) @ imu_rotation(options))
+    error = sigma * stream(options.seed, name).standard_normal()
+    return quat_multiply(quat_from_rotvec([0.0, 0.0, error]), q_ni)
+
+
+def wheel_arms(options: SimOptions):
+    """Return the contact points: one, or left and right about the middle."""
+    middle = np.asarray(options.odometer_lever_arm, dtype=float)
+    half = np.array([0.0, options.track_width / 2, 0.0])
+    return [middle + half, middle - half] if options.two_wheels else [middle]
+
+
+def wheel_scales(options: SimOptions):
+    """Return the true scale of each wheel; the mean of two is ``options.scale``."""
+    half = options.wheel_difference / 2
+    return ([options.scale * (1 - half), options.scale * (1 + half)] if options.two_wheels
+            else [options.scale])
+
+
+def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
+    """Return the samples of each wheel; pulses are whole counts, so late by up to one."""
+    ns, t = stamps(motion.duration, options.odometer_rate, ODOMETER_PHASE)
+    state = motion.at(t)
+    stamp = options.start_ns + ns + round(options.odometer_delay * 1e9)
+    wheels = zip('LR', wheel_arms(options), wheel_scales(options), strict=False)
+    return [OdometerSamples(stamp, stamp, _reading(state, options, side, arm, scale))
+            for side, arm, scale in wheels]
+
+
+def _reading(state, options, side, arm, scale):
+    spun = slip(state, options, side)
+    if options.odometer == 'speed':
+        noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
+        return (contact_speed(state, arm) + np.gradient(spun, state.t) + noise) / scale
+    rolled = (contact_travel(state, arm) + spun) / scale
+    phase = stream(options.seed, f'pulse phase {side}').uniform()   # where the disc stands
+    if options.odometer == 'angle':
+        return rolled + phase
+    return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
+
+
+def slip(state, options: SimOptions, side: str = 'L'):
+    """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
+    spun = np.zeros(len(state.t))
+    moving = state.speed != 0
+    if options.slip_walk:
+        walk = stream(options.seed, f'slip walk {side}')
+        steps = np.sqrt(np.diff(state.t, prepend=state.t[:1])) * walk.standard_normal(len(spun))
+        spun += options.slip_walk * np.cumsum(steps * moving)
+    if options.slip_events:
+        rng = stream(options.seed, f'slip events {side}')
+        hours = moving.sum() / options.odometer_rate / 3600
+        for at in rng.choice(state.t[moving], rng.poisson(options.slip_events * hours)):
+            spun += options.slip_size * np.clip((state.t - at) / SLIP_TIME, 0.0, 1.0)
+    return spun
+
+
+def fixes(motion: Motion, options: SimOptions) -> FixSamples:
+    """Return GNSS fixes of the antenna, without those in an outage."""
+    ns, t = stamps(motion.duration, options.fix_rate, FIX_PHASE)
+    state = motion.at(t)
+    latitude, longitude, height = point(state, options.antenna_lever_arm)
+    error = fix_errors(t, options)
+    meridian, normal = radii(latitude)
+    latitude = latitude + error[:, 1] / (meridian + height)
+    longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
+    variance = np.maximum(_axes(options) ** 2 * _power(options), SIGMA_FLOOR**2)
+    n = len(t)
+    stamp = options.start_ns + ns + round(options.fix_delay * 1e9)
+    samples = FixSamples(
+        stamp, stamp + round(FIX_TRANSPORT * 1e9), latitude, longitude, height + error[:, 2],
+        np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
+        np.full(n, 2 if options.fix_noise == 'rtk' else 0))
+    seen = np.ones(n, dtype=bool)
+    for begin, end in options.outages:
+        seen &= (t < begin) | (t >= end)
+    return FixSamples(*(getattr(samples, name)[seen] for name in (
+        'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
+        'covariance_type', 'status')))
+
+
+def _axes(options):
+    return options.fix_sigma * np.array([1.0, 1.0, 2.0])
+
+
+def _power(options):
+    return 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
+
+
+def fix_errors(t, options: SimOptions):
+    """Return the errors of fixes at (n,) times, ENU, m: (n, 3), outliers included."""
+    draws = stream(options.seed, 'fix white').standard_normal((len(t), 3))
+    if options.fix_noise == 'correlated':
+        slow = gauss_markov(stream(options.seed, 'fix slow'), 1.0,
+                            options.fix_correlation_time, t)
+        draws = slow + WHITE_SHARE * draws
+    errors = _axes(options) * draws
+    rng = stream(options.seed, 'outliers')
+    far, bearing = rng.uniform(size=len(t)), rng.uniform(0, 2 * np.pi, len(t))
+    reach = options.outlier_size * rng.uniform(0.5, 1.5, len(t)) * (far < options.outliers)
+    errors[:, 0] += reach * np.cos(bearing)
+    errors[:, 1] += reach * np.sin(bearing)
+    return errors
