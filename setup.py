@@ -1,0 +1,62 @@
+"""Package for pip and for colcon (ament_python)."""
+
+from glob import glob
+from pathlib import Path
+import re
+
+from setuptools import find_packages, setup
+
+NAME = 'odocal_ros'
+HERE = Path(__file__).resolve().parent
+VERSION = re.search(r"^__version__ = '(.+)'$", (HERE / NAME / '__init__.py').read_text(),
+                    re.MULTILINE).group(1)
+SHARE = f'share/{NAME}'
+
+setup(
+    name=NAME,
+    version=VERSION,
+    description="Calibrate a vehicle's odometer against IMU and GNSS, live or from bags",
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    author='Seed 08f791d2 maintainers',
+    author_email='maintainers@users.noreply.h-seed-08f791d2.example',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (SHARE, ['package.xml']),
+        (f'{SHARE}/config', sorted(glob('config/*'))),
+        (f'{SHARE}/launch', sorted(glob('launch/*'))),
+    ],
+    python_requires='>=3.11',
+    install_requires=[
+        'numpy>=1.26',
+        'pyproj>=3.6',
+        'PyYAML>=6',
+        'rosbags>=0.11',
+        'tqdm>=4',
+    ],
+    extras_require={
+        # ROS 2 Jazzy itself, for machines without a ROS installation (Linux x86-64)
+        'ros': [
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-rclpy',
+            'ros-jazzy-rmw-fastrtps-cpp',
+        ],
+        'dev': [
+            'colcon-common-extensions',
+            'hypothesis>=6',
+            'mpmath>=1.3',
+            'mypy>=1.8',
+            'pytest>=7.4',
+            'ruff>=0.6',
+            'scipy>=1.11',
+            'types-PyYAML',
+        ],
+    },
+    entry_points={'console_scripts': [
+        'calibrator = odocal_ros.live.node:main',
+        'odocal = odocal_ros.offline.cli:main',
+    ]},
+    zip_safe=True,
+)
