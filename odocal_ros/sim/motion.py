@@ -11,8 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.nav.earth import (
-    C_en, earth_rate_n, ecef_from_geodetic, geodetic_from_ecef, gravity, radii,
-    transport_rate_n)
+    C_en,
+    earth_rate_n,
+    ecef_from_geodetic,
+    geodetic_from_ecef,
+    gravity,
+    radii,
+    transport_rate_n,
+)
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Profile
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 import math
+from typing import Any
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.grades import Grade, GRADES
@@ -12,12 +13,13 @@ FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
 Vector = tuple[float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
+BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimOptions:
     """
-    Choices for one drive. None: the scenario's own value (``resolved`` fills them in).
+    Choices for one drive; BY_SCENARIO is the scenario's own value.
 
     Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
     those of method.md section 0; ``mounting_rpy`` is the nominal rotation from the Imu's frame to
@@ -25,7 +27,7 @@ class SimOptions:
     """
 
     scenario: str = 'straight'
-    duration: float | None = None          # s
+    duration: float = BY_SCENARIO   # s
     seed: int = 1
     start_ns: int = 1_750_000_000_000_000_000
     latitude: float = math.radians(40.0)
@@ -34,10 +36,10 @@ class SimOptions:
     heading: float = math.radians(45.0)    # of the vehicle at the start, clockwise from north
     slope: float = 0.0                     # rad, steepest part of hills of 1 km length
 
-    imu_grade: str | None = None
+    imu_grade: str = BY_SCENARIO
     imu_rate: float = 100.0                # Hz
-    yaw: float | None = None               # rad, yaw mounting angle
-    pitch: float | None = None             # rad, pitch mounting angle
+    yaw: float = BY_SCENARIO   # rad, yaw mounting angle
+    pitch: float = BY_SCENARIO   # rad, pitch mounting angle
     roll: float = 0.0                      # rad
     mounting_rpy: Vector = ORIGIN          # rad, nominal, Imu frame to b
     imu_lever_arm: Vector = ORIGIN
@@ -47,8 +49,8 @@ class SimOptions:
     odometer_rate: float = 50.0            # Hz
     odometer_delay: float = 0.0            # s by which its stamps are late
     odometer_lever_arm: Vector = ORIGIN    # wheel contact point; of two wheels: their middle
-    scale: float | None = None             # m/pulse, 1 or m/rad: what is to be found
-    nominal_scale: float | None = None     # K0, what the operator believes
+    scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: what is to be found
+    nominal_scale: float = BY_SCENARIO   # K0, what the operator believes
     speed_noise: float = 0.0               # m/s, white, of kind speed
     two_wheels: bool = False
     wheel_difference: float = 0.004        # K_right / K_left - 1
@@ -59,7 +61,7 @@ class SimOptions:
 
     fix_rate: float = 5.0                  # Hz
     fix_noise: str = 'white'               # white, correlated or rtk
-    fix_sigma: float | None = None         # m, horizontal, each axis; up: twice
+    fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
     fix_correlation_time: float = 60.0     # s, of kind correlated
     fix_delay: float = 0.0                 # s by which its stamps are late
     antenna_lever_arm: Vector = ORIGIN
@@ -89,7 +91,7 @@ NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise'
 
 def resolved(options: SimOptions) -> SimOptions:
     """
-    Return options with the scenario's own values in place of None.
+    Return options with the scenario's own values filled in.
 
     Raises
     ------

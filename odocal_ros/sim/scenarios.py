@@ -8,8 +8,14 @@ from odocal_ros.leg import Leg
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.samples import (
-    FixSamples, HeadingSamples, ImuSamples, no_heading, no_odometer, OdometerForm,
-    OdometerSamples)
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    no_heading,
+    no_odometer,
+    OdometerForm,
+    OdometerSamples,
+)
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, Hills, Motion, Start
 from odocal_ros.sim.noise import stream
@@ -94,7 +100,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
 
 
 def _truth(motion, options, imu) -> Truth:
-    grade = sensors.SIM_GRADES[options.imu_grade]
+    gyro_bias, accel_bias = sensors.turn_on_biases(options)
     t = (imu.stamp_ns - options.start_ns) * 1e-9
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
@@ -104,8 +110,7 @@ def _truth(motion, options, imu) -> Truth:
         wheel_scales=tuple(sensors.wheel_scales(options)), yaw=options.yaw, pitch=options.pitch,
         heading=float(heading_from_yaw(np.arctan2(x_n[1], x_n[0]))), distance=motion.distance,
         start_ns=int(imu.stamp_ns[start]), stop_ns=int(imu.stamp_ns[-1]),
-        gyro_bias=grade.gyro_bias * stream(options.seed, 'gyro bias').standard_normal(3),
-        accel_bias=grade.accel_bias * stream(options.seed, 'accelerometer bias').standard_normal(3))
+        gyro_bias=gyro_bias, accel_bias=accel_bias)
 
 
 def _first_move(motion) -> float:

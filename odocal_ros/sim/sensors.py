@@ -11,10 +11,20 @@ import numpy as np
 
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
-    matrix_from_rpy, quat_from_matrix, quat_from_rotvec, quat_multiply)
+    matrix_from_rpy,
+    quat_from_matrix,
+    quat_from_rotvec,
+    quat_multiply,
+)
 from odocal_ros.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 from odocal_ros.sim.motion import (
-    attitude, contact_speed, contact_travel, inertial_v, Motion, point)
+    attitude,
+    contact_speed,
+    contact_travel,
+    inertial_v,
+    Motion,
+    point,
+)
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 
@@ -41,19 +51,22 @@ def imu_rotation(options: SimOptions):
             @ matrix_from_rpy(options.mounting_rpy))
 
 
+def turn_on_biases(options: SimOptions):
+    """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
+    grade, seed = SIM_GRADES[options.imu_grade], options.seed
+    return (grade.gyro_bias * stream(seed, 'gyro bias').standard_normal(3),
+            grade.accel_bias * stream(seed, 'accelerometer bias').standard_normal(3))
+
+
 def imu_errors(options: SimOptions, n: int):
-    """Return gyro and accelerometer errors in frame i, (n, 3) each: white noise + bias walk."""
-    grade, rate = SIM_GRADES[options.imu_grade], options.imu_rate
-    errors = []
-    for kind, noise, bias, walk in (
-            ('gyro', grade.gyro_noise, grade.gyro_bias, grade.gyro_bias_walk),
-            ('accelerometer', grade.accel_noise, grade.accel_bias, grade.accel_bias_walk)):
-        def draw(part, name=kind):
-            return stream(options.seed, f'{name} {part}')
-        turn_on = bias * draw('bias').standard_normal(3)
-        errors.append(turn_on + random_walk(draw('walk'), walk, rate, (n, 3))
-                      + white(draw('white'), noise, rate, (n, 3)))
-    return errors
+    """Return gyro and accelerometer errors in frame i, (n, 3) each: noise, bias and its walk."""
+    grade, rate, seed = SIM_GRADES[options.imu_grade], options.imu_rate, options.seed
+    gyro, accel = turn_on_biases(options)
+    walks = (random_walk(stream(seed, 'gyro walk'), grade.gyro_bias_walk, rate, (n, 3)),
+             random_walk(stream(seed, 'accelerometer walk'), grade.accel_bias_walk, rate, (n, 3)))
+    return (gyro + walks[0] + white(stream(seed, 'gyro white'), grade.gyro_noise, rate, (n, 3)),
+            accel + walks[1] + white(stream(seed, 'accelerometer white'), grade.accel_noise,
+                                     rate, (n, 3)))
 
 
 def imu(motion: Motion, options: SimOptions) -> ImuSamples:

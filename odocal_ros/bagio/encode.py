@@ -1,0 +1,185 @@
+"""
+Samples to serialised ROS 2 messages (CDR, little endian), many at once in numpy.
+
+Messages of one topic all have the same length (one frame_id, one set of joint names), so a block
+of them is one structured array; no message object is made.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+CDR_HEADER = (0, 1, 0, 0)
+VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """
+    A topic to be written.
+
+    time_ns : (n,) int64 bag times, in the order to be written.
+    pack    : gives the serialised messages of a slice of rows as a structured array.
+    """
+
+    name: str
+    msgtype: str
+    time_ns: np.ndarray
+    pack: Callable[[slice], np.ndarray]
+
+
+class _Layout:
+    """Collects the fields of a message with the padding that CDR puts before them."""
+
+    def __init__(self) -> None:
+        self._fields: list[tuple] = [('cdr', 'u1', 4)]
+        self._size = 0
+        self._texts: dict[str, bytes] = {}
+
+    def add(self, name: str, kind, align: int | None = None) -> '_Layout':
+        """Add a number, or a (number, count) array."""
+        base, count = kind if isinstance(kind, tuple) else (kind, 1)
+        item = np.dtype(base).itemsize
+        gap = -self._size % (align or item)
+        if gap:
+            self._fields.append((f'gap {self._size}', 'u1', (gap,)))
+        self._fields.append((name, base, (count,)) if count > 1 else (name, base))
+        self._size += gap + item * count
+        return self
+
+    def text(self, name: str, text: str) -> '_Layout':
+        """Add a string that is the same in every message."""
+        raw = text.encode() + b'\0'
+        self.add(f'{name} length', '<u4')
+        self._fields.append((name, f'S{len(raw)}'))
+        self._size += len(raw)
+        self._texts[name] = raw
+        return self
+
+    def header(self, frame: str) -> '_Layout':
+        """Add a std_msgs/Header."""
+        return self.add('sec', '<i4').add('nanosec', '<u4').text('frame', frame)
+
+    def packer(self, fill: Callable[[np.ndarray, slice], None], n: int):
+        """Return a function that packs a slice of n rows, ``fill`` setting the fields."""
+        dtype, texts = np.dtype(self._fields), self._texts
+
+        def pack(rows: slice) -> np.ndarray:
+            out = np.zeros(len(range(*rows.indices(n))), dtype)
+            out['cdr'] = CDR_HEADER
+            for name, raw in texts.items():
+                out[name], out[f'{name} length'] = raw, len(raw)
+            fill(out, rows)
+            return out
+        return pack
+
+
+def _stamp(out, stamp_ns):
+    out['sec'], out['nanosec'] = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000
+
+
+def imu(name: str, samples, frame: str = 'imu_link') -> Topic:
+    """Return sensor_msgs/Imu of ImuSamples; no orientation where the yaw variance is NaN."""
+    layout = _Layout().header(frame)
+    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
+                        ('f', VECTOR), ('f_cov', SQUARE)):
+        layout.add(field, kind)
+
+    def fill(out, rows):
+        _stamp(out, samples.stamp_ns[rows])
+        out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
+        _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
+    return Topic(name, 'sensor_msgs/msg/Imu', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def heading(name: str, samples, frame: str = 'imu_link') -> Topic:
+    """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
+    layout = _Layout().header(frame)
+    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
+                        ('f', VECTOR), ('f_cov', SQUARE)):
+        layout.add(field, kind)
+
+    def fill(out, rows):
+        _stamp(out, samples.stamp_ns[rows])
+        out['w_cov'][:, 0] = out['f_cov'][:, 0] = -1.0
+        _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
+    return Topic(name, 'sensor_msgs/msg/Imu', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def _orientation(out, q_ni, variance):
+    out['q'] = q_ni
+    out['q_cov'][:, ::4] = np.where(np.isnan(variance), 0.0, variance)[:, None]
+    out['q_cov'][np.isnan(variance), 0] = -1.0
+
+
+def counter(name: str, samples) -> Topic:
+    """Return std_msgs/Int64 of OdometerSamples: no header, so the bag time is the stamp."""
+    def fill(out, rows):
+        out['data'] = samples.value[rows]
+    return Topic(name, 'std_msgs/msg/Int64', samples.stamp_ns,
+                 _Layout().add('data', '<i8').packer(fill, len(samples.stamp_ns)))
+
+
+def twist(name: str, samples, frame: str = 'base_link') -> Topic:
+    """Return geometry_msgs/TwistStamped of OdometerSamples: forward speed, the rest zero."""
+    layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR)
+
+    def fill(out, rows):
+        _stamp(out, samples.stamp_ns[rows])
+        out['linear'][:, 0] = samples.value[rows]
+    return Topic(name, 'geometry_msgs/msg/TwistStamped', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def joints(name: str, wheels: dict, frame: str = '') -> Topic:
+    """Return sensor_msgs/JointState of OdometerSamples by joint name: positions only."""
+    first = next(iter(wheels.values()))
+    layout = _Layout().header(frame).add('names', '<u4')
+    for joint in wheels:
+        layout.text(f'joint {joint}', joint)
+    layout.add('positions', '<u4')
+    for joint in wheels:
+        layout.add(joint, '<f8')
+    layout.add('velocities', '<u4').add('efforts', '<u4')
+
+    def fill(out, rows):
+        _stamp(out, first.stamp_ns[rows])
+        out['names'] = out['positions'] = len(wheels)
+        for joint, samples in wheels.items():
+            out[joint] = samples.value[rows]
+    return Topic(name, 'sensor_msgs/msg/JointState', first.received_ns,
+                 layout.packer(fill, len(first.stamp_ns)))
+
+
+def fix(name: str, samples, frame: str = 'gnss') -> Topic:
+    """Return sensor_msgs/NavSatFix of FixSamples."""
+    layout = (_Layout().header(frame).add('status', 'i1').add('service', '<u2')
+              .add('place', VECTOR).add('cov', SQUARE).add('cov_type', 'u1'))
+
+    def fill(out, rows):
+        _stamp(out, samples.stamp_ns[rows])
+        out['status'], out['service'] = samples.status[rows], 1
+        out['place'][:, 0] = np.degrees(samples.latitude[rows])
+        out['place'][:, 1] = np.degrees(samples.longitude[rows])
+        out['place'][:, 2] = samples.height[rows]
+        out['cov'] = samples.covariance_n[rows].reshape(-1, 9)
+        out['cov_type'] = samples.covariance_type[rows]
+    return Topic(name, 'sensor_msgs/msg/NavSatFix', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def camera(name: str, time_ns, size: int, rng) -> Topic:
+    """Return sensor_msgs/CompressedImage of ``size`` random bytes each, to make a bag heavy."""
+    time_ns = np.asarray(time_ns, dtype=np.int64)
+    layout = (_Layout().header('camera').text('format', 'jpeg').add('bytes', '<u4')
+              .add('data', ('u1', size)))
+
+    def fill(out, rows):
+        _stamp(out, time_ns[rows])
+        out['bytes'] = size
+        out['data'] = np.frombuffer(rng.bytes(out['data'].size), np.uint8).reshape(-1, size)
+    return Topic(name, 'sensor_msgs/msg/CompressedImage', time_ns,
+                 layout.packer(fill, len(time_ns)))

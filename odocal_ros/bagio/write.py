@@ -1,0 +1,159 @@
+"""Write bags: topics merged by time, whole or not at all."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import shutil
+import tempfile
+
+import numpy as np
+
+from odocal_ros.bagio import encode
+from odocal_ros.bagio.encode import Topic
+from odocal_ros.errors import BadUsage
+
+STORAGES = ('mcap', 'sqlite3', 'rosbag1')
+COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
+BLOCK = 20_000         # messages packed at a time, to bound memory
+BLOCK_BYTES = 2**26    # the same for topics of large messages
+LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
+
+
+def drive_topics(drive) -> list[Topic]:
+    """Return a simulated drive's topics under the names that the node listens to."""
+    topics = [encode.imu('/imu/data', drive.imu), encode.fix('/fix', drive.fix)]
+    kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
+    two = len(right.stamp_ns) > 0
+    if kind == 'angle':
+        wheels = {LEFT_JOINT: left, RIGHT_JOINT: right} if two else {'wheel_joint': left}
+        topics.append(encode.joints('/joint_states', wheels))
+    elif kind == 'speed':
+        topics.append(encode.twist('/odometer', left))
+    elif two:
+        topics += [encode.counter('/odometer/left', left),
+                   encode.counter('/odometer/right', right)]
+    else:
+        topics.append(encode.counter('/odometer', left))
+    if len(drive.heading.stamp_ns):
+        topics.append(encode.heading('/heading', drive.heading))
+    return topics
+
+
+def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
+              compression: str = 'none', force: bool = False,
+              progress: Callable[[float], None] | None = None) -> Path:
+    """
+    Write topics as one bag, messages in order of bag time; return its path.
+
+    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` is told the
+    share written. The bag appears under its name only when it is complete; ``force`` replaces
+    one that is there.
+
+    Raises
+    ------
+    BadUsage
+        The path exists and ``force`` is not set; its folder cannot be written; an unknown
+        storage or a compression the storage does not have.
+
+    """
+    path = Path(path)
+    _check(path, storage, compression, force)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix='.odocal_', dir=path.parent))
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot write there ({error.strerror}); '
+                       'choose another --out') from None
+    try:
+        part = work / path.name      # rosbag2 names its files after the folder
+        (_write_rosbag1 if storage == 'rosbag1' else _write_rosbag2)(
+            part, topics, storage, compression, progress)
+        if force:
+            _remove(path)
+        part.rename(path)
+    except OSError as error:
+        raise BadUsage(f'{path}: writing failed ({error.strerror}); nothing was kept') from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return path
+
+
+def _check(path, storage, compression, force):
+    if storage not in STORAGES:
+        raise BadUsage(f'--storage {storage}: want one of {", ".join(STORAGES)}')
+    if compression not in COMPRESSIONS:
+        raise BadUsage(f'--compression {compression}: want one of {", ".join(COMPRESSIONS)}')
+    lacking = {'sqlite3': ('storage',), 'mcap': (), 'rosbag1': ('message', 'file', 'storage')}
+    if compression in lacking[storage]:
+        raise BadUsage(f'--compression {compression} is not there for --storage {storage}')
+    if path.exists() and not force:
+        raise BadUsage(f'{path} is there already; give --force to replace it, or another --out')
+    if path.exists() and not _is_bag(path):
+        raise BadUsage(f'{path} is there and is no bag; choose another --out')
+
+
+def _is_bag(path: Path) -> bool:
+    """Tell whether a path may be replaced: a bag file, or a folder of nothing but a bag."""
+    suffixes = {'.db3', '.mcap', '.bag', '.zstd', '.db3-wal', '.db3-shm'}
+    if path.is_file():
+        return path.suffix in suffixes
+    return path.is_dir() and all(
+        p.name == 'metadata.yaml' or p.suffix in suffixes for p in path.iterdir())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _write_rosbag2(path, topics, storage, compression, progress):
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import get_typestore, Stores
+    store = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with writer:
+        connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
+        for which, time_ns, raw in _merged(topics, progress):
+            writer.write(connections[which], time_ns, raw)
+
+
+def _write_rosbag1(path, topics, storage, compression, progress):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import get_typestore, Stores
+    store, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
+    with Writer(path) as writer:
+        connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
+        for which, time_ns, raw in _merged(topics, progress):
+            writer.write(connections[which], time_ns,
+                         ros2.cdr_to_ros1(raw, topics[which].msgtype))
+
+
+def _merged(topics, progress):
+    """Yield (index of the topic, bag time, message) in order of time, packed in blocks."""
+    which = np.concatenate([np.full(len(t.time_ns), i) for i, t in enumerate(topics)])
+    order = np.argsort(np.concatenate([t.time_ns for t in topics]), kind='stable')
+    which = which[order]
+    widest = max((t.pack(slice(0, 1)).itemsize for t in topics if len(t.time_ns)), default=1)
+    block = int(np.clip(BLOCK_BYTES // widest, 1, BLOCK))
+    done = [0] * len(topics)
+    for first in range(0, len(which), block):
+        turn = which[first:first + block]
+        queues = []
+        for i, topic in enumerate(topics):
+            rows = slice(done[i], done[i] + int(np.count_nonzero(turn == i)))
+            done[i] = rows.stop
+            queues.append(_messages(topic, rows))
+        for i in turn.tolist():
+            yield (i, *next(queues[i]))
+        if progress:
+            progress(min(1.0, (first + block) / len(which)))
+
+
+def _messages(topic, rows):
+    """Yield (bag time, message) of a slice of rows of one topic."""
+    packed = topic.pack(rows)
+    raw, size = packed.tobytes(), packed.itemsize
+    for k, time_ns in enumerate(topic.time_ns[rows].tolist()):
+        yield time_ns, raw[k * size:(k + 1) * size]
