@@ -94,8 +94,8 @@ class GnssConfig:
     time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown latency of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
     min_status: int = setting(0, '', -1, 2, about='Least NavSatStatus of a fix that is used.')
-    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Horizontal 1 sigma beyond which a fix is '
-                               'not used; 0: off.')
+    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Horizontal 1 sigma beyond which a fix '
+                               'is not used; 0: off.')
     default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes that '
                                    'come without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Time over which fix errors stay '
@@ -121,8 +121,8 @@ class LegConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentConfig:
-    heading_source: str = setting('auto', choices=HEADING_SOURCES, about='Where the heading of the '
-                                  "IMU's x axis comes from.")
+    heading_source: str = setting('auto', choices=HEADING_SOURCES, about='Where the heading of '
+                                  "the IMU's x axis comes from.")
     heading: float = setting(NAN, 'rad', about="Heading of the IMU's x axis at the start mark, "
                              'clockwise from north (a compass quantity).')
     heading_sigma: float = setting(0.0175, 'rad', 0.0, 3.2, about='Uncertainty of a fixed heading '
@@ -161,8 +161,8 @@ class ProjectionConfig:
 class VerdictConfig:
     max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Asked relative sigma of the '
                                      'scale factor.')
-    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw mounting '
-                                   'angle.')
+    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw '
+                                   'mounting angle.')
     min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
 
 
@@ -172,8 +172,8 @@ class OutputConfig:
                              '.')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')
-    formats: tuple[str, ...] = setting(('params', 'autoware', 'transform', 'report'), choices=(
-        'params', 'autoware', 'transform', 'report'), about='Files written beside '
+    formats: tuple[str, ...] = setting(('params', 'autoware', 'transform'), choices=(
+        'params', 'autoware', 'transform'), about='Files written beside '
         'calibration.json.')
 
 

@@ -1,5 +1,6 @@
 """IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI (method.md section 3)."""
 
+import dataclasses
 from dataclasses import dataclass
 import math
 
@@ -35,3 +36,11 @@ GRADES: dict[str, Grade] = {
     'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4),
     'navigation': _from_data_sheet(0.001, 0.01, 0.003, 0.005, 5e-4, 5e-5),
 }
+
+
+def grade_of(imu) -> Grade:
+    """Return the grade of the imu settings with its single figures replaced where given."""
+    grade = GRADES[imu.grade]
+    given = {f.name: getattr(imu, f.name) for f in dataclasses.fields(Grade)}
+    return dataclasses.replace(
+        grade, **{k: v for k, v in given.items() if not math.isnan(v)})

@@ -68,9 +68,23 @@ class LegRecorder:
             self._blocks[slot] = blocks = [join(blocks)]
         return blocks[0]
 
-    def forget_before(self, stamp_ns: int) -> None:
+    def snapshot(self) -> 'LegRecorder':
+        """
+        Return a recorder with the rows so far, which another thread may close.
+
+        This one goes on untouched: ``close`` joins the blocks of the copy, and joined blocks
+        could no longer be forgotten bit by bit.
+        """
+        copy = LegRecorder()
+        copy.form = self.form
+        copy._newest = dict(self._newest)
+        copy._blocks = {slot: list(blocks) for slot, blocks in self._blocks.items()}
+        return copy
+
+    def forget_before(self, stamp_ns: int, slots=SLOTS) -> None:
         """Drop blocks that lie whole before a stamp, to bound memory."""
-        for slot, blocks in self._blocks.items():
+        for slot in slots:
+            blocks = self._blocks[slot]
             keep = 0
             while keep < len(blocks) and _key(blocks[keep]).max() < stamp_ns:
                 keep += 1

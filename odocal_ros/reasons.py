@@ -52,6 +52,9 @@ class Code(Enum):
                         'inspect suggests it.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
+    COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
+    FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
+                                     'the receiver and the sky.')
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark: level, gyro '
                               'bias and heading then come from rest.')
@@ -77,10 +80,12 @@ class Code(Enum):
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
                                       'at both marks), or combine more legs.')
-    YAW_SIGMA_TOO_LARGE = CAUTION, 'Give a better heading, or combine legs with headings of their own.'
+    YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of their '
+                                    'own.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
+    LEG_REJECTED = CAUTION, 'See the reasons of that leg; drive it again or leave it out.'
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs: verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'
 

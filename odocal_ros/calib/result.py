@@ -1,4 +1,4 @@
-"""What comes out: estimates with sigmas, per method, per leg and combined. Frozen, unit-bearing."""
+"""What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
 from dataclasses import dataclass, field
 
@@ -85,6 +85,8 @@ class LegResult:
     track_before_n: NDArray | None = None     # (m, 3) as configured
     reference_n: NDArray | None = None        # (k, 3) fixes used
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
+    bag: str = ''                             # where it was recorded, empty when live
+    C_bi: NDArray | None = None               # (3, 3) nominal rotation used, imu frame to b
 
     @property
     def verdict(self) -> Verdict:

@@ -1,0 +1,200 @@
+"""
+Alignment of a leg: which standstill, which heading source, in the order of design.md section 3.
+
+Pure: takes screened inputs, returns an Alignment and what was found on the way.
+"""
+
+import numpy as np
+
+from odocal_ros.config import Config
+from odocal_ros.grades import Grade, grade_of
+from odocal_ros.nav.alignment import (
+    complete, gyrocompass, level_at_rest, level_in_motion, Level)
+from odocal_ros.nav.angles import wrap, yaw_from_heading
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
+from odocal_ros.nav.strapdown import attitude
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screen import Inputs
+
+MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
+COURSE_DISTANCE = 30.0    # m of track for a course
+COURSE_TIME = 300.0       # s within which it must be driven
+COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
+NEAR = 0.5                # s: a heading sample this near to a moving start is taken
+
+
+def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Config):
+    """
+    Align a leg.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Screened leg.
+    spans : (k, 2) array
+        Standstills, s.
+    metres_per_unit : float
+        Rough scale.
+    fixes_n : (n, 3) array
+        Fixes in n, m.
+    origin : Origin
+        Where n is fixed.
+    config : Config
+        Heading source, grade.
+
+    Returns
+    -------
+    Alignment, reasons.
+
+    """
+    grade = grade_of(config.imu)
+    level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
+    yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
+    reasons += why
+    if source == 'course':
+        yaw, sigma, why = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
+        reasons += why
+    return complete(level, yaw, sigma, source, shared, origin.latitude, grade, gyro_noise), reasons
+
+
+def choose_standstill(spans):
+    """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
+    before = [s for s in spans if s[0] <= 0.5]
+    return before[-1] if before else None
+
+
+def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
+    span = choose_standstill(spans)
+    if span is not None:
+        noise = max(grade.gyro_noise, _measured_noise(inputs, span))
+        return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, noise), noise, ()
+    t = inputs.t_imu
+    first = max(0.0, float(t[0]))
+    pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
+    _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    ends = t[pick][[0, -1]]
+    speed = (inputs.travel.at(ends + 0.5) - inputs.travel.at(ends - 0.5)) * metres_per_unit
+    inside = np.clip(ends + 0.5, *inputs.travel.t[[0, -1]]) - np.clip(
+        ends - 0.5, *inputs.travel.t[[0, -1]])
+    level = level_in_motion(t[pick], inputs.w_b[pick], inputs.f_b[pick], q_0b,
+                            speed / np.maximum(inside, 1e-3), latitude, grade)
+    found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: levelled over '
+                   f'{t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
+                   f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
+    return level, grade.gyro_noise, (found,)
+
+
+def _measured_noise(inputs, span):
+    """Return the white gyro noise seen at rest, rad/s/sqrt(Hz), the largest axis."""
+    pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
+    t, w = inputs.t_imu[pick], inputs.w_b[pick]
+    if len(t) < 20:
+        return 0.0
+    return float((np.diff(w, axis=0).std(axis=0) / np.sqrt(2)).max()
+                 * np.sqrt((t[-1] - t[0]) / (len(t) - 1)))
+
+
+def _heading(inputs, level: Level, latitude, grade, config: Config):
+    """Return yaw of L's x axis, sigma, source, shared, reasons; a course has no yaw yet."""
+    asked = config.alignment.heading_source
+    order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
+    if asked == 'auto' and not np.isnan(config.alignment.heading):
+        order = ['fixed']
+    refusals = []
+    for source in order:
+        if source == 'course':
+            break
+        result, why = SOURCES[source](inputs, level, latitude, grade, config)
+        if result is not None:
+            yaw, sigma = result
+            return yaw, sigma, source, source != 'gyrocompass', ()
+        refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
+                               else Code.HEADING_UNAVAILABLE, f'heading from {source}: {why}'))
+    reasons = tuple(refusals) if asked not in ('auto', 'course') else ()
+    return 0.0, np.pi, 'course', True, reasons
+
+
+def _fixed(inputs, level, latitude, grade, config):
+    if np.isnan(config.alignment.heading):
+        return None, 'alignment.heading is not set'
+    mark_yaw = float(yaw_from_heading(config.alignment.heading))
+    # the heading holds at the mark: carry it back over the turn since the standstill
+    turned = _turn_since(inputs, level) if level.standstill and level.t < -0.5 else 0.0
+    return (mark_yaw - turned, config.alignment.heading_sigma), ''
+
+
+def _turn_since(inputs, level):
+    """Return how far b has turned about the vertical from the level's epoch to the mark, rad."""
+    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
+    if pick.sum() < 2:
+        return 0.0
+    rate = (inputs.w_b[pick] - level.mean_rate_b)
+    _, q = attitude(inputs.t_imu[pick], rate, quat_from_matrix(level.C_Lb), np.zeros(3))
+    C = matrix_from_quat(q[-1])
+    return float(np.arctan2(C[1, 0], C[0, 0]))
+
+
+def _imu_orientation(inputs, level, latitude, grade, config):
+    C_bi = inputs.C_bi
+    return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance, level, config,
+                             lambda C_ni: C_ni @ transpose(C_bi), 0.0)
+
+
+def _heading_topic(inputs, level, latitude, grade, config):
+    return _from_quaternions(inputs.t_heading, inputs.q_heading, inputs.heading_variance, level,
+                             config, lambda C: C, config.alignment.heading_offset)
+
+
+def _from_quaternions(t, q, variance, level, config, to_b, offset):
+    """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
+    if level.standstill:
+        pick = (t >= level.standstill[0]) & (t <= level.standstill[1])
+    else:
+        pick = np.abs(t - level.t) <= NEAR
+        pick &= np.abs(t - level.t) == np.abs(t[pick] - level.t).min() if pick.any() else pick
+    pick = pick & ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    if not pick.any():
+        return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
+    C = to_b(matrix_from_quat(q[pick]))
+    yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
+    stated = float(np.median(variance[pick]))
+    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    return (float(wrap(yaw)), float(sigma)), ''
+
+
+def _gyrocompass(inputs, level, latitude, grade, config):
+    if level.standstill is None:
+        return None, 'needs a standstill'
+    yaw, sigma = gyrocompass(level, latitude, grade)
+    if sigma > COMPASS_LIMIT:
+        return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
+                      f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
+    return (yaw, sigma), ''
+
+
+SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic': _heading_topic,
+           'gyrocompass': _gyrocompass}
+
+
+def _course(inputs, level, metres_per_unit, fixes_n, origin, grade):
+    """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
+    trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
+    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + COURSE_TIME)
+    t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
+                       earth_rate_n(origin.latitude))
+    track = dead_reckon(t, q_nb, inputs.travel)
+    near = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
+    if near.sum() >= 2:
+        true = fixes_n[near, :2] - fixes_n[near][0, :2]
+        dr = track.at(inputs.t_fix[near])[:, :2, 0] * metres_per_unit
+        dr = dr - dr[0]
+        sigma_fix = np.sqrt(np.median(inputs.covariance_n[near, 0, 0]))
+        long_enough = np.hypot(*dr.T) >= max(COURSE_DISTANCE, 8 * sigma_fix)
+        if long_enough.any():
+            k = int(np.argmax(long_enough))
+            yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
+            return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
+    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course either: the fixes do not move '
+                               f'{COURSE_DISTANCE:.0f} m within {COURSE_TIME:.0f} s'),)

@@ -1,0 +1,156 @@
+"""
+The error budget of the two-point method: every source as one-sigma effects on the parameters.
+
+A leg's end displacement D = M f (M: attitude summed over travel, f: scale times forward axis)
+is set equal to the chord between the reference positions. An error e of the chord against D, m,
+moves f by M^-1 e, and so ln K, yaw and pitch; each source is written as the e that one sigma of it
+makes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
+gyro error at time tau turns all that is still to come: r(tau) = D(end) - D(tau).
+"""
+
+import numpy as np
+
+from odocal_ros.calib.result import Source
+from odocal_ros.nav.rotations import skew
+
+PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+
+
+def parameter_gradient(f):
+    """Return the (3, 3) derivative of (ln K, yaw, pitch) by f = K forward_b."""
+    K = np.linalg.norm(f)
+    x, y, z = f
+    level = np.hypot(x, z)
+    return np.array([f / K**2,
+                     [x * y / level / K**2, -level / K**2, z * y / level / K**2],
+                     [-z / level**2, 0.0, x / level**2]])
+
+
+def drift_sources(t, D, C_nb, alignment):
+    """
+    Return the gyro sources as chord errors, each (3, k) m for one sigma.
+
+    Parameters
+    ----------
+    t : (m,) array
+        Epochs from the start of the leg to its end, s.
+    D : (m, 3) array
+        Dead-reckoned displacement from the start, n, m.
+    C_nb : (m, 3, 3) array
+        Attitude.
+    alignment : Alignment
+        Sigmas.
+
+    Returns
+    -------
+    dict of name to (3, k) array: bias (one column an axis of b), noise and bias walk (columns of
+    a Cholesky factor): integrals of r x (the error) over the leg.
+
+    """
+    r = D[-1] - D
+    dt = np.diff(t)
+    # e = integral of (C_nb db) x r
+    turn = -skew(r) @ C_nb
+    bias = np.einsum('nij,n->ij', (turn[:-1] + turn[1:]) / 2, dt) * alignment.gyro_bias_sigma
+    # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
+    slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
+    R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
+    return {'gyro_bias': bias,
+            'gyro_noise': alignment.gyro_noise * _root(_spread(r, dt)),
+            'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
+
+
+def _spread(r, dt):
+    """Return the integral of [r x][r x]^T, (3, 3)."""
+    mid = (r[:-1] + r[1:]) / 2
+    outer = np.einsum('ni,nj,n->ij', mid, mid, dt)
+    return np.trace(outer) * np.eye(3) - outer
+
+
+def _root(covariance):
+    """Return a square root of a covariance that may be singular: A A^T = covariance."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.maximum(value, 0.0))
+
+
+def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_sigma,
+           velocity_change, lever_arm_sigma):
+    """
+    Return the sources of error of (ln K, yaw, pitch) for one leg.
+
+    Parameters
+    ----------
+    f : (3,)
+        Solution, m per unit of travel, in b.      M : (3, 3) attitude summed over travel.
+    start, end : MarkFix
+        Reference positions.
+    t, D, C_nb : arrays
+        The track, as in drift_sources.
+    alignment : Alignment
+        Level, heading and gyro sigmas.
+    quantum : float
+        Size of an odometer count, m.
+    fix_scale : (3,) array
+        Factor on the stated fix sigmas that the residuals ask for, east, north, up.
+    time_sigma : float
+        Unknown latency of fixes, s.
+    velocity_change : (3,)
+        Velocity at the end mark less that at the start, m/s; zero between standing marks.
+    lever_arm_sigma : float
+        m, each axis.
+
+    """
+    forward = D[-1] / np.linalg.norm(D[-1])
+    chord = {
+        'fix_start': fix_scale[:, None] * _root(start.covariance_n),
+        'fix_end': fix_scale[:, None] * _root(end.covariance_n),
+        'initial_heading': np.cross([0.0, 0.0, alignment.heading_sigma], D[-1])[:, None],
+        'initial_level': np.stack([np.cross(axis, D[-1]) for axis in np.eye(3)[:2]], -1)
+        * alignment.level_sigma,
+        **drift_sources(t, D, C_nb, alignment),
+        'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
+        'fix_latency': (velocity_change * time_sigma)[:, None],
+        'antenna_lever_arm': (C_nb[-1] - C_nb[0]) * lever_arm_sigma,
+    }
+    gradient = parameter_gradient(f) @ np.linalg.inv(M)
+    shared = {'fix_latency', 'antenna_lever_arm'} | (
+        {'initial_heading'} if alignment.heading_shared else set())
+    sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
+    height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
+    return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))
+
+
+def _second_order(t, D, alignment, height_variance):
+    """
+    Return what is of second order in the scale.
+
+    Half the distance-weighted variance of a wandering attitude (method.md 1.5), for a gyro bias
+    and noise of the size of their sigmas, and half the square of the tilt that height errors of
+    the fixes feign.
+    """
+    share = np.linalg.norm(np.diff(D, axis=0), axis=1)
+    share = share / max(share.sum(), 1e-12)
+    tm = (t[:-1] + t[1:]) / 2 - t[0]
+    mean = share @ tm
+    by_bias = share @ (tm - mean)**2 * np.max(alignment.gyro_bias_sigma)**2
+    # random walk of attitude: distance-weighted variance of a Wiener process, 1/6 T when even
+    by_noise = alignment.gyro_noise**2 * (t[-1] - t[0]) / 6
+    by_height = height_variance / (D[-1] @ D[-1])
+    # the square of one Gaussian: mean m, standard deviation sqrt(2) m, rms sqrt(3) m
+    size = 0.5 * np.sqrt(3) * np.linalg.norm([by_bias, by_noise, by_height])
+    return Source('second_order', np.array([[size], [0.0], [0.0]]))
+
+
+def total_covariance(sources):
+    """Return the covariance of the parameters from all sources, (p, p)."""
+    return sum(s.effects @ s.effects.T for s in sources)
+
+
+def budget_table(sources, parameters, scale):
+    """
+    Return each source's one-sigma share of each parameter, for calibration.json.
+
+    scale : (p,) factor from the parameters of the sources to those shown (K for ln K).
+    """
+    return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
+                     for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}

@@ -1,0 +1,143 @@
+"""The check: dead reckoning against every fix, before and after the correction; and sanity."""
+
+import numpy as np
+
+from odocal_ros.calib.result import TrackCheck
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+
+DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compared
+CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
+SURE_TURN = 0.5           # rad between pieces: five sigmas of such directions
+LOOSE = 4.0               # sigmas of disagreement that name a mismatch
+SLOP = 0.002              # of the distance: slip, suspension, road
+
+
+def residuals(track, f, start, fixes, antenna_n):
+    """
+    Return dead-reckoned minus fixed positions, (n, 3) m.
+
+    Parameters
+    ----------
+    track : Track
+        Of the leg.
+    f : (3,)
+        Scale times forward axis.
+    start : MarkFix
+        Where the track is pinned.
+    fixes : (t, position_n)
+        Within the leg.
+    antenna_n : callable
+        Times to antenna lever arm in n less that at the start, (n, 3) m.
+
+    """
+    t, position_n = fixes
+    reckoned = start.position_n + (track.at(t) - track.at(start.t)) @ f + antenna_n(t)
+    return reckoned - position_n
+
+
+def track_check(residual, distance) -> TrackCheck:
+    """Return the patent's criteria (max, mean) and more of the residuals, m."""
+    d = np.hypot(*residual.T[:2])
+    return TrackCheck(float(np.sqrt((d**2).mean())), float(d.max()), float(d.mean()),
+                      float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
+
+
+def fix_noise_factor(residual, covariance_n, drift):
+    """
+    Return the factors on stated fix sigmas that residuals ask for, east, north, up: (3,).
+
+    Parameters
+    ----------
+    residual : (n, 3) array
+        Corrected track less fixes, m; NaN up where no height is known.
+    covariance_n : (n, 3, 3) array
+        As stated, m^2.
+    drift : float
+        What the gyros may have bent the track by, m: taken out of the residuals. What is left may
+        still hold errors of the track, so this errs on the wide side; below a factor of 1.25 the
+        stated sigmas stand.
+
+    """
+    stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
+    level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
+    rise = residual[:, 2] - np.median(residual[:, 2])
+    up2 = (np.median(np.abs(rise)) / 0.6745)**2                          # median of a normal law
+    seen = np.array([level2, level2, up2]) - drift**2
+    asked = np.array([stated[0] + stated[1], stated[0] + stated[1], stated[2]])
+    factors = np.sqrt(np.maximum(np.nan_to_num(seen), 0.0) / np.maximum(asked, 1e-12))
+    return np.where(factors > 1.25, factors, 1.0)
+
+
+def mismatch(check: TrackCheck, fix_sigma, drift, distance) -> tuple[Reason, ...]:
+    """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
+    allowed = LOOSE * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP * distance
+    if check.rms <= allowed:
+        return ()
+    return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
+                   f'fixes, {allowed:.1f} m would be believable'),)
+
+
+def pieces(track_2d, fixes_2d, t, sigma):
+    """
+    Cut the drive into pieces long enough for a direction.
+
+    Returns
+    -------
+    middle : (k,) s.   track_direction, course : (k,) rad, from east, ccw.
+    """
+    need = max(DIRECTION_CHORD, CLEAR * sigma)
+    a, cuts = 0, []
+    for b in range(1, len(fixes_2d)):
+        if np.hypot(*(fixes_2d[b] - fixes_2d[a])) >= need:
+            cuts.append((a, b))
+            a = b
+    if not cuts:
+        return np.empty(0), np.empty(0), np.empty(0)
+    a, b = np.array(cuts).T
+    track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
+    return (t[a] + t[b]) / 2, np.arctan2(*track.T[::-1]), np.arctan2(*fix.T[::-1])
+
+
+def gyro_against_course(yaw, course) -> tuple[Reason, ...]:
+    """
+    Compare turns by gyro and by fixes; name a wrong sign or unit of the gyro.
+
+    yaw, course : (k,) rad at the same times; yaw unwrapped, course not.
+    """
+    if len(course) < 3:
+        return ()
+    gyro, true = np.diff(yaw), wrap(np.diff(course))
+    # only turns that are no noise, and not so sharp that left and right look alike
+    clear = (np.abs(true) > SURE_TURN) & (np.abs(true) < 0.8 * np.pi)
+    gyro, true = gyro[clear], true[clear]
+    if len(true) < 2:
+        return ()
+    ratio = float(true @ gyro / (true @ true))
+    alike = abs(float(true @ gyro)) / np.sqrt((true @ true) * max(gyro @ gyro, 1e-12))
+    if alike < 0.7:
+        return ()
+    if ratio < -0.5:
+        return (Reason(Code.GYRO_SIGN, 'the gyro turns against the course of the fixes (ratio '
+                       f'{ratio:+.2f}): its vertical axis has the wrong sign'),)
+    if not 0.5 < ratio < 2.0:
+        unit = ', as deg/s would' if 40 < ratio < 80 else ''
+        return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:.3g} times as far as the course of '
+                       f'the fixes{unit}; imu.gyro_scale wants {1 / ratio:.6g}'
+                       if not unit else f'the gyro turns {ratio:.3g} times as far as the course '
+                       f'of the fixes{unit}: set imu.gyro_scale to 0.017453292519943295'),)
+    return ()
+
+
+def against_travel(track_direction, course, signed) -> tuple[Reason, ...]:
+    """Return REVERSING_UNSIGNED where counts rise while the vehicle drives backwards."""
+    if len(course) < 3:
+        return ()
+    off = wrap(track_direction - course)
+    middle = np.angle(np.median(np.cos(off)) + 1j * np.median(np.sin(off)))
+    back = np.abs(wrap(off - middle)) > np.deg2rad(135)
+    if not back.any() or back.mean() > 0.5:
+        return ()
+    how = 'odometer.signed is false' if not signed else 'the counter does not count down'
+    return (Reason(Code.REVERSING_UNSIGNED, f'on {int(back.sum())} of {len(back)} pieces the '
+                   f'track runs against the fixes: the vehicle reversed and {how}'),)

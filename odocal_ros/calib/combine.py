@@ -1,0 +1,112 @@
+"""Several legs of one vehicle to one result: own errors average down, shared ones do not."""
+
+import numpy as np
+
+from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.reasons import Code, Reason
+
+Z95 = 1.6449       # one-sided 95 % point of the normal law
+
+
+def combine_method(name, results, config) -> MethodResult:
+    """
+    Combine what one method says of several legs.
+
+    Parameters
+    ----------
+    name : str
+        The method.
+    results : list of MethodResult
+        One a leg, at least one.
+
+    Returns
+    -------
+    MethodResult: each parameter the mean weighted by the legs' own variances; the sigma holds
+    what is shared once. A spread beyond the sigmas widens them (LEGS_DISAGREE).
+
+    """
+    if len(results) == 1:
+        return results[0]
+    parameters = results[0].parameters
+    reasons: tuple[Reason, ...] = ()
+    estimates: dict[str, Estimate] = {}
+    sources: dict[str, list] = {}
+    for i, parameter in enumerate(parameters):
+        have = [r for r in results if r.estimates[parameter].value is not None]
+        unit = results[0].estimates[parameter].unit
+        if not have:
+            estimates[parameter] = Estimate(None, None, unit)
+            continue
+        value, own, shared, why = _combine(parameter, i, have)
+        reasons += why
+        relative = value if parameter.startswith('scale_factor') else 1.0
+        sigma = abs(relative) * float(np.sqrt(own + sum(v @ v for v in shared.values())))
+        estimates[parameter] = Estimate(value, sigma, unit)
+        for source, effect in (shared | {'legs': np.array([np.sqrt(own)])}).items():
+            sources.setdefault(source, []).append((i, effect))
+    estimates |= _ratio(results, estimates)
+    return MethodResult(name, reasons, estimates, parameters, _stacked(sources, len(parameters)),
+                        {'legs_used': len(results)})
+
+
+def _combine(parameter, i, have):
+    """Return value, own variance, shared effects by source, reasons of one parameter."""
+    relative = parameter.startswith('scale_factor')
+    x = np.array([r.estimates[parameter].value for r in have])
+    y = np.log(x) if relative else x
+    own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
+                    for r in have])
+    own = np.maximum(own, 1e-18)
+    weight = (1 / own) / (1 / own).sum()
+    mean = weight @ y
+    names = {s.name for r in have for s in r.sources if s.shared}
+    by_leg = {n: np.stack([_effect(r, n, i) for r in have]) for n in sorted(names)}
+    shared = {n: weight @ g for n, g in by_leg.items()}
+    variance = 1 / (1 / own).sum()
+    # what legs may differ by: their own errors, and shared ones that act differently
+    apart = own + sum(((g - shared[n])**2).sum(axis=1) for n, g in by_leg.items())
+    freedom = len(y) - 1
+    chi2 = float(((y - mean)**2 / apart).sum()) if freedom else 0.0
+    reasons: tuple[Reason, ...] = ()
+    if freedom and chi2 > _chi2_95(freedom):
+        factor = np.sqrt(chi2 / freedom)
+        variance *= factor**2
+        reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter} differs between the {len(y)} legs '
+                          f'{factor:.1f} times more than their sigmas allow'),)
+    return float(np.exp(mean) if relative else mean), float(variance), shared, reasons
+
+
+def _effect(result, name, i):
+    source = next((s for s in result.sources if s.shared and s.name == name), None)
+    width = max((s.effects.shape[1] for s in result.sources if s.name == name), default=1)
+    return np.zeros(width) if source is None else source.effects[i]
+
+
+def _chi2_95(freedom):
+    """Return the 95 % point of chi-square (Wilson and Hilferty 1931; within 1 % from 2 on)."""
+    a = 2 / (9 * freedom)
+    return freedom * (1 - a + Z95 * np.sqrt(a))**3
+
+
+def _ratio(results, estimates):
+    """Return the combined scale_ratio, from the first leg's K0."""
+    first, scale = results[0].estimates, estimates['scale_factor']
+    ratio = first['scale_ratio'].value
+    if ratio is None or scale.value is None:
+        return {'scale_ratio': Estimate(None, None, '1')}
+    nominal = first['scale_factor'].value / ratio
+    return {'scale_ratio': Estimate(scale.value / nominal, scale.sigma / nominal, '1')}
+
+
+def _stacked(sources, p):
+    out = []
+    for name, rows in sources.items():
+        width = max(len(e) for _, e in rows)
+        effects = np.zeros((p, width if name != 'legs' else len(rows)))
+        for k, (i, e) in enumerate(rows):
+            if name == 'legs':
+                effects[i, k] = e[0]
+            else:
+                effects[i, :len(e)] = e
+        out.append(Source(name, effects, name != 'legs'))
+    return tuple(out)

@@ -1,0 +1,157 @@
+"""
+Reference positions at the marks: fixes averaged over a standstill, or fitted around a mark.
+
+How far fixes average down depends on how long their errors stay alike. The covariance that comes
+with them states the whole error; their scatter shows what part of it changes from fix to fix. Only
+that part averages down, unless the data show that the slow part moved on within the window too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+OUTLIER = 5.0        # robust sigmas from the median
+ENOUGH = 10          # fixes below which nothing is judged about their correlation
+
+
+@dataclass(frozen=True, eq=False)
+class MarkFix:
+    """
+    Antenna position at a mark.
+
+    t : s, time it holds for.      position_n : (3,) m.       covariance_n : (3, 3) m^2.
+    standing : averaged at rest.   used, dropped : fixes.     surveyed : from settings.
+    height_known : False where no fix states a height.
+    """
+
+    t: float
+    position_n: NDArray[np.float64]
+    covariance_n: NDArray[np.float64]
+    standing: bool
+    used: int
+    dropped: int
+    height_known: bool = True
+    surveyed: bool = False
+
+
+def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
+    """
+    Average fixes of one place.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Times, s.
+    position_n : (n, 3) array
+        Fixes, m, motion taken out.
+    covariance_n : (n, 3, 3) array
+        As stated, m^2.
+    correlation_time : float
+        s; 0: white; NaN: judged from the data.
+
+    Returns
+    -------
+    mean : (3,) m.   covariance : (3, 3) of the mean, m^2.   used, dropped : int.
+
+    """
+    middle = np.median(position_n, axis=0)
+    off = np.hypot(*(position_n - middle)[:, :2].T)
+    stated = np.sqrt(np.median(np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2) / 2))
+    spread = max(np.median(off) / 1.1774, 0.2 * stated)    # median of a Rayleigh law: 1.1774 sigma
+    keep = off <= OUTLIER * spread
+    t, position_n, covariance_n = t[keep], position_n[keep], covariance_n[keep]
+    weight = 1 / np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2)
+    weight = weight / weight.sum()
+    mean = weight @ position_n
+    whole = np.einsum('n,nij->ij', weight, covariance_n)
+    share = _share(t, position_n - mean, whole, weight, correlation_time)
+    return mean, whole * share, int(keep.sum()), int((~keep).sum())
+
+
+def _share(t, residual, whole, weight, correlation_time):
+    """Return which part of a single fix's variance is left in the mean."""
+    n = len(t)
+    white = float(weight @ weight)          # 1/n for equal weights
+    if n == 1 or correlation_time == 0:
+        return white
+    if not np.isnan(correlation_time):
+        return _left(t, weight, correlation_time)
+    if n < ENOUGH:
+        return 1.0
+    sigma = np.sqrt(np.diag(whole))
+    z = residual[:, :2] / sigma[:2]
+    scatter = (z**2).sum() / (2 * (n - 1))
+    step = (np.diff(z, axis=0)**2).mean() / 2
+    # white fixes: scatter and half the squared steps are both 1, within 3 sigma of their own noise
+    slack = 3 * np.sqrt(1 / n)
+    if scatter > 1 - slack and step > scatter * (1 - slack):
+        return max(white, white * scatter)
+    fast = min(step, 1.0)
+    slow = max(1.0, scatter) - fast
+    return fast * white + slow * _left(t, weight, _correlation_time(t, z, fast, slow))
+
+
+def _left(t, weight, tau):
+    """Return the variance share of a mean of first-order Gauss-Markov errors of time tau, s."""
+    if tau == np.inf:
+        return 1.0
+    pick = np.unique(np.linspace(0, len(t) - 1, min(len(t), 400)).round().astype(int))
+    w = weight[pick] / weight[pick].sum()
+    alike = np.exp(-np.abs(t[pick][:, None] - t[pick]) / tau)
+    return float(max(w @ alike @ w, weight @ weight))
+
+
+def _correlation_time(t, z, fast, slow):
+    """Return how fast the slow part moves, from the structure function at a quarter window."""
+    lag = max(1, len(t) // 4)
+    grown = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast
+    moved = np.clip(grown / slow, 0.0, 0.95) if slow > 0 else 0.95
+    if moved <= 0:
+        return np.inf
+    return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-moved))
+
+
+def standing_at(t_mark, spans, slack=0.5):
+    """Return the standstill (begin, end) that contains or touches a mark, or None."""
+    for begin, end in spans:
+        if begin - slack <= t_mark <= end + slack:
+            return float(begin), float(end)
+    return None
+
+
+def fix_at(t_mark, span, fixes, displacement_n, correlation_time, window) -> MarkFix | None:
+    """
+    Return the antenna position at a mark.
+
+    Parameters
+    ----------
+    t_mark : float
+        s.
+    span : (begin, end) or None
+        The standstill at the mark, s; None in motion.
+    fixes : (t, position_n, covariance_n)
+        Fixes of the leg.
+    displacement_n : callable
+        (n,) times to the (n, 3) motion of the antenna from the mark, m, dead reckoned.
+    correlation_time : float
+        As in mean_fix.
+    window : float
+        Seconds each side of a mark in motion.
+
+    """
+    t, position_n, covariance_n = fixes
+    low, high = span if span else (t_mark - window, t_mark + window)
+    pick = np.flatnonzero((t >= low) & (t <= high))
+    if not len(pick):
+        if not len(t) or span is None:
+            return None
+        nearest = np.argmin(np.abs(t - t_mark))
+        if abs(t[nearest] - t_mark) > window:
+            return None
+        pick = np.array([nearest])
+    p = position_n[pick] - displacement_n(t[pick])
+    height_known = bool(np.isfinite(p[:, 2]).all())
+    p = np.where(np.isfinite(p), p, 0.0)
+    mean, covariance, used, dropped = mean_fix(t[pick], p, covariance_n[pick], correlation_time)
+    return MarkFix(t_mark, mean, covariance, span is not None, used, dropped, height_known)

@@ -1,0 +1,54 @@
+"""What an Imu at rest or on average tells of its own units and axes."""
+
+import numpy as np
+
+from odocal_ros.reasons import Code, Reason
+
+G = 9.80665
+AXES = 'xyz'
+MAX_RATE = 8.0       # rad/s: no road vehicle turns so fast
+TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up
+
+
+def imu_sanity(f_b, w_b, C_bi):
+    """
+    Judge units and axes of an Imu.
+
+    Parameters
+    ----------
+    f_b, w_b : (n, 3) arrays
+        Specific force, m/s^2, and turn rate, rad/s, in the configured body frame.
+    C_bi : (3, 3)
+        Nominal rotation configured.
+
+    Returns
+    -------
+    reasons, and whether the body frame must be turned over (z down) to be used.
+
+    """
+    mean = np.median(f_b, axis=0)
+    size = float(np.linalg.norm(mean))
+    fast = float(np.percentile(np.linalg.norm(w_b - np.median(w_b, axis=0), axis=1), 99.9))
+    reasons = []
+    if not 0.85 * G < size < 1.15 * G:
+        if 0.85 < size < 1.15:
+            what = f'the Imu shows {size:.3f} at rest, as g would: set imu.accel_scale to 9.80665'
+        else:
+            what = f'the Imu shows a gravity of {size:.3g} m/s^2 instead of 9.8'
+        reasons.append(Reason(Code.IMU_UNITS, what))
+    if fast > MAX_RATE:
+        reasons.append(Reason(Code.IMU_UNITS, f'the gyro shows {fast:.3g} rad/s, faster than a '
+                              'vehicle turns, as deg/s would: set imu.gyro_scale to '
+                              '0.017453292519943295'))
+    if size < 1e-3:
+        return tuple(reasons), False
+    up = mean / size
+    if up[2] > np.cos(TILT):
+        return tuple(reasons), False
+    axis = int(np.argmax(np.abs(up)))
+    seen = f'gravity shows on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
+    if up[2] < -np.cos(TILT) and np.allclose(C_bi, np.eye(3)):
+        reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{seen}: taken as forward-right-down'))
+        return tuple(reasons), True
+    reasons.append(Reason(Code.IMU_AXES, f'{seen}: the body frame is not forward-left-up'))
+    return tuple(reasons), False

@@ -1,0 +1,238 @@
+"""
+The two-point method: scale, yaw and pitch from where a leg ended, by track and by fix.
+
+Source A (Shi et al. 2015) takes the ratio of two chords in a plane and the angle between them,
+eq. (6)-(10). The same similarity is solved here in the Earth-fixed Cartesian frame n, where track
+and truth are similar to the last digit: with M the attitude summed over travel and c the chord
+between the reference positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at
+once. The plane and the geodesic of the source are the cross-check.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.budget import budget, budget_table, PARAMETERS, total_covariance
+from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
+from odocal_ros.nav.projection import geodesic_chord, plane_chord
+from odocal_ros.reasons import Code, Reason
+
+CHORD_SHARE = 0.2        # of the path: under it, the chord is no measure of the path
+PITCH_PRIOR = 0.05       # rad, what is believed of the pitch where heights say nothing
+PITCH_LIMIT = 0.26       # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
+PLANE_LIMIT = 3e-5       # relative: a plane about the leg keeps ratios of chords far better
+
+
+@dataclass(frozen=True, eq=False)
+class Chord:
+    """What the two-point method is solved on."""
+
+    track: Track
+    origin: Origin
+    start: MarkFix
+    end: MarkFix
+    lever_b: NDArray[np.float64]     # (3,) antenna from the odometer's point, m, in v
+    velocity_change: NDArray[np.float64]  # (3, 3) end less start: times f gives m/s in n
+    alignment: Alignment
+
+    @property
+    def M(self) -> NDArray[np.float64]:
+        """Return attitude summed over travel between the marks, (3, 3)."""
+        return self.track.at(self.end.t) - self.track.at(self.start.t)
+
+
+def solve(chord: Chord, up_scale=1.0):
+    """
+    Solve M f = c for f = K forward_b.
+
+    up_scale : factor on the stated height sigmas; np.inf leaves heights out.
+
+    Returns
+    -------
+    f : (3,) m per unit of travel, in b.
+    vertical_known : False where heights say nothing and the pitch was taken as zero.
+
+    """
+    M = chord.M
+    turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
+    antenna = chord.end.position_n - chord.start.position_n
+    sigma = np.sqrt(chord.start.covariance_n[2, 2] + chord.end.covariance_n[2, 2])
+    vertical_known = bool(chord.start.height_known and chord.end.height_known
+                          and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
+    f = np.array([1.0, 0.0, 0.0])
+    for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
+        yaw, pitch = mounting_from_forward(f / np.linalg.norm(f))
+        c = antenna - turn @ _C_bv(yaw, pitch) @ chord.lever_b
+        if vertical_known:
+            f = np.linalg.solve(M, c)
+            if abs(np.arctan2(f[2], np.hypot(f[0], f[1]))) > PITCH_LIMIT:
+                return solve(chord, np.inf)
+        else:
+            f = np.append(np.linalg.solve(M[:2, :2], c[:2]), 0.0)
+    return f, vertical_known
+
+
+def _C_bv(yaw, pitch):
+    """Return the rotation that takes v to b for mounting angles, roll 0."""
+    x = forward_b(yaw, pitch)
+    y = np.array([np.cos(pitch) * np.sin(yaw), np.cos(yaw), np.sin(pitch) * np.sin(yaw)])
+    return np.stack([x, y, np.cross(x, y)], -1)
+
+
+def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
+    """Return why the leg's chord cannot carry the method, empty if it can."""
+    between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
+    path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
+    length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])
+    if length < CHORD_SHARE * path or length == 0.0:
+        return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end is {length:.1f} m, '
+                       f'under a fifth of the {path:.1f} m driven'),)
+    return ()
+
+
+def unsolved(reasons, scale_unit) -> MethodResult:
+    """Return the result of a leg that the method refuses: every value unknown."""
+    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+             'pitch_mounting_angle': 'rad'}
+    return MethodResult('two_point', tuple(reasons),
+                        {name: Estimate(None, None, unit) for name, unit in units.items()},
+                        PARAMETERS)
+
+
+def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> MethodResult:
+    """
+    Return scale, yaw and pitch of one leg with their sigmas and the error budget.
+
+    Parameters
+    ----------
+    chord : Chord
+        Track, marks and alignment of the leg.
+    nominal_scale : float
+        K0, 0 where unknown.
+    scale_unit : str
+        Unit of the scale factor.
+    quantum : float
+        Size of a count in scale units, 0 for speeds.
+    fix_scale : (3,) array
+        Factor on the stated fix sigmas, east, north, up.
+    config : Config
+        Limits.
+
+    """
+    f, vertical_known = solve(chord, fix_scale[2])
+    sources = _sources(chord, f, vertical_known, quantum, fix_scale, config)
+    covariance = total_covariance(sources)
+    sigma = np.sqrt(np.diag(covariance))
+    K = float(np.linalg.norm(f))
+    yaw, pitch = (float(a) for a in mounting_from_forward(f / K))
+    reasons = _judge_angles(chord.alignment, yaw, pitch, sources, vertical_known, config)
+    separable = Code.YAW_NOT_SEPARABLE not in {r.code for r in reasons}
+    estimates = {
+        'scale_factor': Estimate(K, K * float(sigma[0]), scale_unit),
+        'scale_ratio': Estimate(K / nominal_scale, K / nominal_scale * float(sigma[0]), '1')
+        if nominal_scale else Estimate(None, None, '1'),
+        'yaw_mounting_angle': Estimate(yaw, float(sigma[1]), 'rad') if separable
+        else Estimate(None, None, 'rad'),
+        'pitch_mounting_angle': Estimate(pitch, float(sigma[2]), 'rad') if vertical_known
+        else Estimate(None, None, 'rad')}
+    details = {'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
+               'correlation': _correlations(covariance),
+               'cross_check': _cross_check(chord, f, nominal_scale or K, config),
+               'heading_source': chord.alignment.heading_source}
+    reasons += _planes_agree(details['cross_check'], K, sigma[0])
+    return MethodResult('two_point', reasons, estimates, PARAMETERS, sources,
+                        details | {'f': f})
+
+
+def _sources(chord, f, vertical_known, quantum, fix_scale, config):
+    track = chord.track
+    keep = (track.t >= chord.start.t) & (track.t <= chord.end.t)
+    P = track.P[keep] - track.at(chord.start.t)
+    start, end, M = chord.start, chord.end, chord.M
+    if not vertical_known:
+        start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
+    C_nb = chord.track.C_nb_at(track.t[keep])
+    K = float(np.linalg.norm(f))
+    return budget(f, M, start, end, track.t[keep], P @ f, C_nb, chord.alignment,
+                  quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
+                  velocity_change=chord.velocity_change @ f,
+                  lever_arm_sigma=config.gnss.lever_arm_sigma)
+
+
+def _blind_height(mark, sigma=0.0):
+    """Return the mark with its height replaced by a belief of sigma, m."""
+    covariance = mark.covariance_n.copy()
+    covariance[2, :] = covariance[:, 2] = 0.0
+    covariance[2, 2] = sigma**2
+    return MarkFix(mark.t, mark.position_n, covariance, mark.standing, mark.used, mark.dropped)
+
+
+def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
+    asked = config.verdict.max_yaw_sigma
+    by_heading = next(s for s in sources if s.name == 'initial_heading')
+    share = float(np.linalg.norm(by_heading.effects[1]))
+    reasons: tuple[Reason, ...] = ()
+    if not alignment.heading_separable:
+        reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, '
+                           'which holds the mounting angle: end points see but the sum of both'),)
+    elif share > asked:
+        reasons += (Reason(Code.YAW_NOT_SEPARABLE, f'the heading ({alignment.heading_source}) is '
+                           f'known to {np.rad2deg(share):.3f} deg, the yaw is asked to '
+                           f'{np.rad2deg(asked):.3f} deg: end points see but their sum'),)
+    nominal = config.imu.nominal_yaw
+    far = abs(float(wrap(yaw - (0.0 if np.isnan(nominal) else nominal))))
+    if not reasons and far > np.pi / 2:
+        reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
+                           f'counts mean backwards, or the Imu faces backwards (yaw '
+                           f'{np.rad2deg(yaw):+.1f} deg)'),)
+    elif not reasons and far > np.deg2rad(20.0):
+        reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.2f} deg '
+                           f'is {np.rad2deg(far):.1f} deg from the nominal one'),)
+    if not vertical_known:
+        reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height good enough for '
+                           f'the pitch; taken as 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg'),)
+    return reasons
+
+
+def _correlations(covariance):
+    sigma = np.sqrt(np.diag(covariance))
+    rho = covariance / np.outer(sigma, sigma)
+    return {f'{PARAMETERS[i]},{PARAMETERS[j]}': float(rho[i, j])
+            for i in range(3) for j in range(i + 1, 3)}
+
+
+def _cross_check(chord, f, nominal_scale, config):
+    """
+    Return K and yaw by eq. (6)-(10) in the plane and by the geodesic, S1 / S2 and bearings.
+
+    The track is taken with K0, yaw 0 and the pitch found, moved to the start position.
+    """
+    from odocal_ros.nav.projection import plane_for
+    K = np.linalg.norm(f)
+    yaw, pitch = mounting_from_forward(f / K)
+    turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
+    start_n = chord.start.position_n
+    end_n = chord.end.position_n - turn @ _C_bv(yaw, pitch) @ chord.lever_b
+    reckoned_n = start_n + nominal_scale * chord.M @ forward_b(0.0, pitch)
+    o, b, b_dr = (chord.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
+    plane = plane_for(config.projection, (o[1] + b[1]) / 2)
+    results = {}
+    for name, length in (('plane', lambda p, q: plane_chord(plane, p, q)),
+                         ('geodesic', geodesic_chord)):
+        (s1, bearing), (s2, bearing_dr) = length(o, b), length(o, b_dr)
+        results[name] = {'S1': s1, 'S2': s2, 'scale_factor': float(nominal_scale * s1 / s2),
+                         'alpha_psi': float(wrap(bearing - bearing_dr))}
+    return results
+
+
+def _planes_agree(check, K, sigma_relative):
+    worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
+    if worst > PLANE_LIMIT + 0.2 * sigma_relative:
+        return (Reason(Code.PLANES_DISAGREE, f'the scale by plane or geodesic differs by '
+                       f'{worst * 1e6:.0f} ppm from that in space'),)
+    return ()

@@ -1,0 +1,124 @@
+"""
+Dead reckoning: attitude and odometer travel to a track in n, linear in scale and forward axis.
+
+``P`` is the sum of attitude over travel: the track of a vehicle whose forward axis in b is d and
+whose scale is K is P @ (K d). All of scale, yaw and pitch stay outside, so that they can be solved
+for, or tried by the thousand, without another pass. n is Cartesian and fixed to the Earth, so the
+track is exact on the ellipsoid: converting it back to latitude, longitude and height is all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import matrix_from_quat
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Where n is fixed: geodetic position, rad, rad, m."""
+
+    latitude: float
+    longitude: float
+    height: float
+
+    def to_n(self, geodetic):
+        """Return positions in n, m, of (..., 3) latitude, longitude (rad), height (m)."""
+        r_e = ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
+        own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        return (r_e - own_e) @ C_en(self.latitude, self.longitude)
+
+    def to_geodetic(self, position_n):
+        """Return (..., 3) latitude, longitude (rad), height (m) of positions in n, m."""
+        own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
+        r_e = own_e + position_n @ C_en(self.latitude, self.longitude).T
+        return np.stack(geodetic_from_ecef(r_e), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """
+    A dead-reckoned leg, before scale and forward axis are chosen.
+
+    t : (m,) s, epochs.            q_nb : (m, 4) attitude there.
+    s : (m,) travel, scale units.  P : (m, 3, 3) sum of C_nb over travel from the first epoch.
+    """
+
+    t: NDArray[np.float64]
+    q_nb: NDArray[np.float64]
+    s: NDArray[np.float64]
+    P: NDArray[np.float64]
+
+    def at(self, t):
+        """Return P at times t, linear between epochs: (...) to (..., 3, 3)."""
+        k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, len(self.t) - 2)
+        x = np.clip((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0, 1.0)[..., None, None]
+        return self.P[k] * (1 - x) + self.P[k + 1] * x
+
+    def C_nb_at(self, t):
+        """Return attitude at the epoch nearest to t: (...) to (..., 3, 3)."""
+        k = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
+        k = np.where(np.abs(self.t[k - 1] - t) < np.abs(self.t[k] - t), k - 1, k)
+        return matrix_from_quat(self.q_nb[k])
+
+
+def dead_reckon(t, q_nb, travel: Travel) -> Track:
+    """
+    Sum attitude over travel.
+
+    Parameters
+    ----------
+    t, q_nb : (m,), (m, 4) arrays
+        Epochs, s, and attitude at them.
+    travel : Travel
+        Odometer travel, interpolated to the epochs.
+
+    Returns
+    -------
+    Track; trapezoid rule, of second order in the turn per epoch.
+
+    """
+    s = travel.at(t)
+    C_nb = matrix_from_quat(q_nb)
+    P = np.zeros_like(C_nb)
+    np.cumsum((C_nb[:-1] + C_nb[1:]) * (np.diff(s) / 2)[:, None, None], axis=0, out=P[1:])
+    return Track(t, q_nb, s, P)
+
+
+def forward_b(yaw, pitch):
+    """Return the vehicle's forward axis in b for mounting angles, rad (roll 0): (..., 3)."""
+    return np.stack([np.cos(pitch) * np.cos(yaw), -np.sin(yaw) * np.ones_like(pitch),
+                     np.sin(pitch) * np.cos(yaw)], -1)
+
+
+def mounting_from_forward(d_b):
+    """Return yaw and pitch mounting angle, rad, of a forward axis in b: inverse of forward_b."""
+    return (np.arctan2(-d_b[..., 1], np.hypot(d_b[..., 0], d_b[..., 2])),
+            np.arctan2(d_b[..., 2], d_b[..., 0]))
+
+
+def rough_scale(travel: Travel, t_fix, fixes_n, sigma):
+    """
+    Return metres per unit of travel from distances between fixes, None where nothing moves.
+
+    The median over stretches at least 20 m and eight sigmas long: good to a per cent or so, for
+    thresholds and for scales that have no nominal value.
+    """
+    need = max(20.0, 8 * sigma)
+    s = travel.at(t_fix)
+    inside = np.flatnonzero((t_fix >= travel.t[0]) & (t_fix <= travel.t[-1])) \
+        if len(travel.t) else []
+    ratios, last = [], None
+    for k in inside:
+        if last is None:
+            last = k
+            continue
+        chord = np.hypot(*(fixes_n[k, :2] - fixes_n[last, :2]))
+        if chord >= need:
+            if s[k] != s[last]:
+                ratios.append(chord / abs(s[k] - s[last]))
+            last = k
+    return float(np.median(ratios)) if ratios else None

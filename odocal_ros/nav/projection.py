@@ -1,0 +1,64 @@
+"""Plane coordinates (leg-centred, Gauss-Krueger, UTM) and geodesics, by pyproj."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# semi-major axis m, inverse flattening
+ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
+              'Krassovsky': (6378245.0, 298.3)}
+SCALE = {'leg': 1.0, 'gauss_krueger': 1.0, 'utm': 0.9996}
+ZONE_WIDTH = 6.0       # deg
+
+
+@dataclass(frozen=True)
+class Plane:
+    """
+    A transverse Mercator plane.
+
+    central_meridian : deg.   scale : on it.   ellipsoid : a name of ELLIPSOIDS.
+    """
+
+    central_meridian: float
+    scale: float = 1.0
+    ellipsoid: str = 'WGS84'
+    false_easting: float = 500000.0
+
+    def forward(self, latitude, longitude):
+        """Return northing, easting, m (eq. 1-5 of source A), of rad: (...)."""
+        from pyproj import Proj
+        a, rf = ELLIPSOIDS[self.ellipsoid]
+        proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,
+                    x_0=self.false_easting, y_0=0, a=a, rf=rf)
+        easting, northing = proj(np.rad2deg(longitude), np.rad2deg(latitude))
+        return np.asarray(northing), np.asarray(easting)
+
+
+def plane_for(projection, longitude) -> Plane:
+    """Return the plane the projection settings ask for about a longitude, rad."""
+    degrees = float(np.rad2deg(longitude))
+    meridian = projection.central_meridian
+    if np.isnan(meridian):
+        zone = ZONE_WIDTH * np.floor(degrees / ZONE_WIDTH) + ZONE_WIDTH / 2
+        meridian = degrees if projection.kind == 'leg' else zone
+    return Plane(float(meridian), SCALE[projection.kind], projection.ellipsoid)
+
+
+def plane_chord(plane: Plane, start, end):
+    """
+    Return length, m, and bearing from grid north, rad, of a chord in the plane (eq. 6, 7, 10).
+
+    start, end : (2 or 3,) latitude, longitude, rad.
+    """
+    (n0, n1), (e0, e1) = plane.forward(np.array([start[0], end[0]]), np.array([start[1], end[1]]))
+    return float(np.hypot(n1 - n0, e1 - e0)), float(np.arctan2(e1 - e0, n1 - n0))
+
+
+def geodesic_chord(start, end):
+    """Return length at the mean height, m, and azimuth, rad, of the WGS 84 geodesic."""
+    from pyproj import Geod
+    geod = Geod(ellps='WGS84')
+    azimuth, _, length = geod.inv(np.rad2deg(start[1]), np.rad2deg(start[0]),
+                                  np.rad2deg(end[1]), np.rad2deg(end[0]))
+    height = (start[2] + end[2]) / 2
+    return float(length * (1 + height / 6371008.8)), float(np.deg2rad(azimuth))

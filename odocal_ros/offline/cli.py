@@ -1,0 +1,81 @@
+"""The odocal command: one door for all subcommands, one place where errors become a line."""
+
+import argparse
+import importlib
+import os
+import sys
+import tempfile
+
+from odocal_ros import __version__
+from odocal_ros.errors import OdocalError
+
+COMMANDS = {
+    'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
+    'inspect': ('odocal_ros.offline.inspect_bag', 'tell what a bag holds and what it lacks'),
+    'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
+}
+OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line instead of a page of usage."""
+
+    def error(self, message):
+        """Raise what the door turns into one line and exit code 2."""
+        raise _Usage(f'{self.prog}: {message} (see {self.prog} --help)')
+
+
+class _Usage(OdocalError):
+    """The command line does not parse."""
+
+
+def _parser(names) -> argparse.ArgumentParser:
+    parser = _Parser(prog='odocal', description='Calibrate a vehicle\'s odometer against IMU '
+                     'and GNSS: scale factor and yaw mounting angle, with honest sigmas.')
+    parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
+    for name, (module, help_line) in COMMANDS.items():
+        sub = commands.add_parser(name, help=help_line, description=help_line)
+        if name in names:      # only the asked command is imported: --help stays quick
+            command = importlib.import_module(module)
+            command.add_arguments(sub)
+            sub.set_defaults(run=command.run)
+    return parser
+
+
+def main(argv=None) -> int:
+    """Run a command line; return its exit code (design.md section 1)."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    try:
+        parser = _parser({a for a in argv[:1] if a in COMMANDS})
+        args = parser.parse_args(argv)
+        if args.command is None:
+            parser.print_help()
+            return WRONG_USE
+        return args.run(args)
+    except OdocalError as error:
+        print(f'odocal: {error}' if not isinstance(error, _Usage) else error, file=sys.stderr)
+        return WRONG_USE
+    except KeyboardInterrupt:
+        print('odocal: interrupted, nothing written', file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
+        return _internal(error)
+
+
+def _internal(error) -> int:
+    import traceback
+    with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt',
+                                     delete=False) as f:
+        f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n')
+        traceback.print_exception(error, file=f)
+    print(f'odocal: internal error ({type(error).__name__}: {str(error).splitlines()[0:1]}); '
+          f'please report it with {f.name}', file=sys.stderr)
+    return INTERNAL
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,207 @@
+"""Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.screen import screen
+
+EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
+EACH_STOP = 'each-stop'
+OPENING = 0.2                 # of the distance: a first stop later than this splits no leg
+STATUS_NAME = 'calibrator: calibration'
+STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+
+
+@dataclass(frozen=True)
+class LegSpan:
+    """A leg as asked for; None: open on that side."""
+
+    start_ns: int | None
+    stop_ns: int | None
+    relative: tuple[bool, bool] = (False, False)   # against the bag's first message
+
+
+def parse_leg(text: str) -> LegSpan:
+    """
+    Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
+
+    Raises
+    ------
+    BadUsage
+        Not of that form, or B not after A.
+
+    """
+    separator = '/' if '/' in text else ':'
+    parts = text.split(separator)
+    if len(parts) != 2:
+        raise BadUsage(f'--leg {text}: want A:B in seconds, or A/B for ISO 8601 dates')
+    (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
+    if start is not None and stop is not None and rel_a == rel_b and stop <= start:
+        raise BadUsage(f'--leg {text}: the end is not after the start')
+    return LegSpan(start, stop, (rel_a, rel_b))
+
+
+def _edge(text, whole):
+    """Return nanoseconds and whether they are against the bag's first message."""
+    if not text:
+        return None, False
+    try:
+        seconds = Decimal(text)
+        if seconds.is_finite():
+            return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
+    except InvalidOperation:
+        pass
+    try:
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+    except ValueError:
+        raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
+                       'for seconds, A/B for dates') from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    since = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    return (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000, False
+
+
+def marked_legs(bag) -> list[tuple[int, int]]:
+    """Return the legs that a node marked in the bag by its status; cancelled ones are left out."""
+    last: dict[str, dict] = {}
+    for topic in bag.topics.values():
+        if topic.msgtype != STATUS_TYPE:
+            continue
+        for _, message in bag.messages(topic.name):
+            for status in message.status:
+                if status.name.endswith(STATUS_NAME):
+                    values = {kv.key: kv.value for kv in status.values}
+                    _remember(last, values)
+    legs = []
+    for values in last.values():
+        start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
+        if values.get('leg_event') not in ('cancelled', 'undone') and start > 0:
+            legs.append((start, stop))
+    return sorted(legs)
+
+
+def _remember(last, values):
+    leg_id = values.get('leg_id', '')
+    if not leg_id or leg_id == '0':
+        return
+    before = last.get(leg_id, {})
+    try:
+        int(values['leg_start_ns']), int(values['leg_stop_ns'])
+    except (KeyError, ValueError):
+        return
+    if before.get('leg_event') in ('cancelled', 'undone'):
+        return
+    event = values.get('leg_event') or before.get('leg_event', '')
+    last[leg_id] = values | {'leg_event': event}
+
+
+def find_legs(recorder, bag, asked, marks, config) -> list[tuple[int, int]]:
+    """
+    Return (start, stop) stamps of the legs of one bag.
+
+    Parameters
+    ----------
+    recorder : LegRecorder
+        Fed with the whole bag.
+    bag : Bag
+        For its time span.
+    asked : list of LegSpan or 'each-stop'
+        Empty: marks if there are any, else one leg from standstill to standstill.
+    marks : list of (start, stop)
+        As the node marked them.
+
+    Raises
+    ------
+    BadUsage
+        An asked leg lies outside the bag.
+
+    """
+    first, last = _common(recorder)
+    legs = [_placed(a, bag, first, last) for a in asked if a != EACH_STOP]
+    if EACH_STOP in asked:
+        legs += _each_stop(recorder, first, last, config)
+    if legs:
+        return legs
+    if marks:
+        return [(a, b or last) for a, b in marks]
+    return [_by_standstill(recorder, first, last, config)]
+
+
+def _common(recorder):
+    """Return the first and the last stamp at which all of Imu, odometer and fix are there."""
+    stamps = [recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')]
+    stamps = [s[s > 0] for s in stamps]
+    stamps = [s for s in stamps if len(s)]
+    if not stamps:
+        return 0, 1
+    # percentiles of order, not extremes: one wild stamp must not move the leg
+    first = max(int(np.median(s[:5])) if len(s) > 20 else int(s.min()) for s in stamps)
+    last = min(int(np.median(s[-5:])) if len(s) > 20 else int(s.max()) for s in stamps)
+    return first, max(last, first + 1)
+
+
+def _placed(span, bag, first, last):
+    start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
+    stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
+    if stop <= start or stop < bag.start_ns - 10**10 or start > bag.end_ns + 10**10:
+        length = (bag.end_ns - bag.start_ns) * 1e-9
+        raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} holds nothing; the '
+                       f'bag runs from 0 to {length:.1f} s')
+    return start, stop
+
+
+def _s(stamp, bag):
+    return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
+
+
+def _stops(recorder, first, last, config):
+    """Return standstills of the whole recording, stamps, and metres driven before each time."""
+    whole = recorder.close(first, last, preroll=0.0)
+    inputs, _ = screen(whole, config)
+    if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
+        return np.empty((0, 2), np.int64), None
+    geodetic = np.nan_to_num(inputs.geodetic)
+    fixes_n = Origin(*(float(x) for x in geodetic[0])).to_n(geodetic)
+    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma)
+    scale = scale or config.odometer.nominal_scale or 1.0
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
+    metres = np.interp(spans, inputs.travel.t, way) if len(spans) else np.empty((0, 2))
+    return first + np.round(spans * 1e9).astype(np.int64), (metres, float(way[-1]))
+
+
+def _by_standstill(recorder, first, last, config):
+    """Return one leg, from the first standstill to the last; intermediate stops never split."""
+    stops, driven = _stops(recorder, first, last, config)
+    if not len(stops):
+        return first, last
+    metres, whole = driven
+    start, stop = first, last
+    opening = 0
+    if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
+        start, opening = int(stops[0, 1]), 1
+    after = np.flatnonzero(np.arange(len(stops)) >= opening)
+    if len(after) and whole - metres[after[-1], 1] < 0.02 * whole + 1.0:
+        stop = int(stops[after[-1], 1])
+    return start, stop
+
+
+def _each_stop(recorder, first, last, config):
+    """Return a leg from each standstill to the next that is long enough."""
+    stops, driven = _stops(recorder, first, last, config)
+    legs, lengths = [], []
+    if driven is None:
+        return legs
+    metres, _ = driven
+    for i in range(len(stops) - 1):
+        legs.append((int(stops[i, 1]), int(stops[i + 1, 1])))
+        lengths.append(metres[i + 1, 0] - metres[i, 1])
+    long = [leg for leg, m in zip(legs, lengths, strict=True) if m >= config.leg.min_distance]
+    return long or legs

@@ -1,0 +1,150 @@
+"""odocal replay: the node's pipeline over recorded bags."""
+
+from datetime import datetime, timezone
+import json
+from pathlib import Path
+import sys
+
+from odocal_ros.errors import BadUsage
+
+HELP = 'calibrate from recorded bags'
+LATER = ('wheels', 'smoother')
+
+
+def add_arguments(parser) -> None:
+    """Declare the options of design.md section 1."""
+    add = parser.add_argument
+    add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
+    add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')
+    add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
+        help='any setting by its parameter name; repeatable')
+    for slot, name in (('imu', 'imu'), ('odometer', 'odometer'), ('fix', 'fix'),
+                       ('heading', 'heading'), ('odometer_right', 'odometer-right'),
+                       ('fix_velocity', 'fix-velocity')):
+        add(f'--{name}-topic', metavar='TOPIC', dest=f'{slot}_topic',
+            help=f'topic of the {name.replace("-", " ")}; found by its type where there is one')
+    add('--leg', action='append', default=[], metavar='A:B',
+        help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
+        'each-stop; repeatable')
+    add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all'),
+        help='method whose figures are the result')
+    add('--holdout', action='store_true', help='keep the last fifth of each leg back and check '
+        'the correction on it')
+    add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
+    add('--force', action='store_true', help='replace an existing calibration.json')
+    add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
+    add('--quiet', action='store_true', help='print nothing but errors')
+
+
+def run(args) -> int:
+    """Replay bags; return 0 accepted or caution, 1 rejected."""
+    from odocal_ros.offline.legs import EACH_STOP, parse_leg
+    config = _config(args)
+    asked = [text if text == EACH_STOP else parse_leg(text) for text in args.leg]
+    output = Path(args.output) if args.output else Path(f'odocal_{Path(args.bags[0]).stem}')
+    if (output / 'calibration.json').exists() and not args.force:
+        raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
+                       'or another --output')
+    from odocal_ros.pipeline import combine
+    legs, inputs = [], []
+    for path in args.bags:
+        new, described = _legs_of(Path(path), args, asked, config)
+        legs += new
+        inputs.append(described)
+    calibration = combine(legs, config)
+    return _report(calibration, config, inputs, output, args)
+
+
+def _config(args):
+    """Return defaults < --config < --set, each checked."""
+    from odocal_ros.config import Config, with_settings
+    from odocal_ros.config_file import parse_set, read_config_file
+    config = Config()
+    if args.config:
+        config = with_settings(config, read_config_file(Path(args.config)))
+    config = with_settings(config, dict(parse_set(text) for text in args.settings))
+    if args.method in LATER:
+        raise BadUsage(f'--method {args.method}: not in this version; use auto or two_point')
+    return with_settings(config, {'method': args.method}) if args.method else config
+
+
+def _legs_of(path, args, asked, config):
+    """Return the results of a bag's legs and its entry for calibration.json."""
+    from odocal_ros.bagio.read import bag_sha256, open_bag
+    from odocal_ros.leg import LegRecorder
+    from odocal_ros.messages import make_reader
+    from odocal_ros.offline.legs import find_legs, marked_legs
+    from odocal_ros.offline.topics import choose_topics
+    with open_bag(path) as bag:
+        overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
+            'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
+        overrides = {slot: topic for slot, topic in overrides.items() if topic}
+        topics = choose_topics(bag.topics, config, overrides)
+        readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
+                   for slot, topic in topics.items()}
+        recorder = LegRecorder()
+        with _progress(f'reading {bag.name}', args) as progress:
+            bag.read(readers, recorder.feed, progress)
+        odometer = readers[topics['odometer']]
+        recorder.form = odometer.form
+        marks = [] if asked else marked_legs(bag)
+        spans = find_legs(recorder, bag, asked, marks, config)
+        notes = tuple(n for n in bag.notes if not isinstance(n, str))
+        for note in bag.notes:
+            if isinstance(note, str) and not args.quiet:
+                print(f'odocal: {note}', file=sys.stderr)
+        results = _calibrated(recorder, spans, config, notes, bag.name, args)
+        described = {'bag': bag.name, 'sha256': bag_sha256(bag), 'topics': topics}
+    return results, described
+
+
+def _calibrated(recorder, spans, config, notes, name, args):
+    from dataclasses import replace
+
+    from odocal_ros.pipeline import calibrate
+    results = []
+    with _progress('calibrating', args) as progress:
+        for number, (start_ns, stop_ns) in enumerate(spans, 1):
+            leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
+            results.append(replace(calibrate(leg, config, notes=notes), bag=name))
+            progress(number / len(spans))
+    return results
+
+
+class _progress:
+    """A bar on a terminal, nothing anywhere else; called with the share done."""
+
+    def __init__(self, title, args):
+        self._title = title
+        self._shown = sys.stderr.isatty() and not (args.quiet or args.json)
+
+    def __enter__(self):
+        if self._shown:
+            from tqdm import tqdm
+            self._bar = tqdm(total=1.0, desc=self._title, leave=False, file=sys.stderr,
+                             bar_format='{desc} {percentage:3.0f}%|{bar}| {elapsed}')
+        return self
+
+    def __call__(self, share):
+        if self._shown:
+            self._bar.update(min(share, 1.0) - self._bar.n)
+
+    def __exit__(self, *_):
+        if self._shown:
+            self._bar.close()
+
+
+def _report(calibration, config, inputs, output, args) -> int:
+    from odocal_ros.offline.cli import OK, REJECTED
+    from odocal_ros.output.files import as_json, write_results
+    from odocal_ros.output.summary import screen
+    from odocal_ros.reasons import Verdict
+    created = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    written = write_results(calibration, config, output, inputs, created, force=args.force)
+    if args.json:
+        json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
+        print()
+    elif not args.quiet:
+        print(screen(calibration))
+        print(f'\nwritten: {output}/ ({", ".join(p.name for p in written)})')
+    return REJECTED if calibration.verdict is Verdict.REJECTED else OK

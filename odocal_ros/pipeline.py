@@ -1,0 +1,62 @@
+"""
+The pipeline: one pure function from a leg to its result, one from results to a calibration.
+
+No state, no clock, no files: the live node and the replay call these and nothing else.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.sanity import imu_sanity
+from odocal_ros.combination import combine
+from odocal_ros.config import Config
+from odocal_ros.leg import Leg
+from odocal_ros.leg_run import leg_result, LegRun
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screen import Inputs, screen
+
+__all__ = ['calibrate', 'combine']
+
+
+def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
+              notes: tuple[Reason, ...] = ()) -> LegResult:
+    """
+    Take one leg from samples to result.
+
+    Parameters
+    ----------
+    leg : Leg
+        Raw samples between two marks, with pre-roll.
+    config : Config
+        Settings in force.
+    alignment : Alignment, optional
+        Used instead of the leg's own (a simulation puts errors in it).
+    notes : tuple of Reason
+        What the door knows of the data already (a truncated bag).
+
+    Returns
+    -------
+    LegResult; a leg that cannot be calibrated says why in its reasons.
+
+    """
+    inputs, found = screen(leg, config)
+    reasons = [*notes, *found]
+    if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
+        return leg_result(leg, inputs, reasons)
+    sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
+    reasons += sanity
+    if z_down:
+        inputs = _turned_over(inputs)
+    if Code.IMU_AXES in {r.code for r in sanity}:
+        return leg_result(leg, inputs, reasons)
+    return LegRun(leg, inputs, config, reasons, alignment).result()
+
+
+def _turned_over(inputs: Inputs) -> Inputs:
+    """Return inputs with a forward-right-down Imu read as what it is."""
+    C = matrix_from_rpy([np.pi, 0.0, 0.0])
+    return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
