@@ -1,0 +1,177 @@
+"""A calibration in words: one screen for a terminal, one sentence for an answer."""
+
+from datetime import datetime, timezone
+import math
+import textwrap
+
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
+from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.reasons import Reason, Verdict
+
+WIDTH = 98
+PPM = 1e6
+DEG = math.degrees(1.0)
+ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
+MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
+           Verdict.REJECTED: 'do not use these values'}
+ORDER = list(Verdict)
+NONE = Estimate(None, None, '')
+
+
+def screen(calibration: Calibration) -> str:
+    """Return everything a person needs to judge a calibration, as plain text."""
+    parts = [_head(calibration), _values(calibration), _leg_table(calibration.legs),
+             _check(calibration.legs), _reasons(calibration.reasons)]
+    return '\n\n'.join('\n'.join(part) for part in parts if part)
+
+
+def sentence(calibration: Calibration) -> str:
+    """Return the result as one line: verdict, values with sigma, legs."""
+    estimates = calibration.estimates
+    scale = estimates.get('scale_factor', NONE)
+    parts = []
+    if scale.value is None:
+        parts.append('scale factor not determined')
+    else:
+        counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
+        parts.append(f'scale factor {with_sigma(scale.value, scale.sigma)} '
+                     f'{_unit(scale.unit)}{counts}')
+    for name, word in ANGLES.items():
+        angle = estimates.get(name, NONE)
+        parts.append(f'{word} mounting ' + (
+            'not determined' if angle.value is None else
+            f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
+    used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
+    legs = f'{used} of {len(calibration.legs)} leg{"s" * (len(calibration.legs) != 1)} good'
+    return f'{calibration.verdict.value}: {", ".join(parts)}; {legs}'
+
+
+def inverse(scale: Estimate) -> str:
+    """Return a scale the other way round: pulses (or rad) per metre with sigma."""
+    if not scale.value:
+        return ''
+    sigma = None if scale.sigma is None else scale.sigma / scale.value**2
+    return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
+
+
+def _unit(unit):
+    return '' if unit == '1' else unit
+
+
+def _head(calibration):
+    legs = calibration.legs
+    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
+    return [f'{calibration.verdict.value.upper()}: {MEANING[calibration.verdict]}',
+            f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
+            f'{time_span(duration)}']
+
+
+def _values(calibration):
+    estimates = calibration.estimates
+    scale, ratio = (estimates.get(n, NONE) for n in ('scale_factor', 'scale_ratio'))
+    lines = [_line('scale factor', _scale_text(scale))]
+    if scale.value and scale.unit in COUNTS:
+        lines.append(_line('', inverse(scale)))
+    if ratio.value is not None:
+        ppm = with_sigma(ratio.value - 1, ratio.sigma, PPM, signed=True)
+        lines.append(_line('  against nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
+                           f'({ppm} ppm)'))
+    for name, word in ANGLES.items():
+        lines.append(_line(f'{word} mounting', _angle_text(estimates.get(name, NONE))))
+    for name, estimate in estimates.items():
+        if name not in ('scale_factor', 'scale_ratio', *ANGLES) and estimate.value is not None:
+            lines.append(_line(name.replace('_', ' '),
+                               f'{with_sigma(estimate.value, estimate.sigma)} {estimate.unit}'))
+    if calibration.imu_rotation_rpy is not None:
+        rpy = ', '.join(f'{angle * DEG:.3f}' for angle in calibration.imu_rotation_rpy)
+        lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
+    return lines
+
+
+def _line(label, text):
+    return f'  {label:<20}{text}'.rstrip()
+
+
+def _scale_text(scale):
+    if scale.value is None:
+        return 'not determined'
+    relative = '' if not (scale.sigma and scale.value) else (
+        f'   ({scale.sigma / abs(scale.value) * PPM:.0f} ppm)')
+    return f'{with_sigma(scale.value, scale.sigma)} {_unit(scale.unit)}{relative}'
+
+
+def _angle_text(angle):
+    if angle.value is None:
+        return 'not determined'
+    return (f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg   '
+            f'({with_sigma(angle.value, angle.sigma, signed=True)} rad)')
+
+
+def _leg_table(legs):
+    rows = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes', 'scale factor', 'yaw, deg',
+             'verdict')]
+    rows += [(str(number), *_leg_row(leg)) for number, leg in enumerate(legs, 1)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ['  ' + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+                             ).rstrip() for row in rows] if legs else []
+
+
+def _leg_row(leg: LegResult):
+    method = min(leg.methods.values(), key=lambda m: ORDER.index(m.verdict), default=None)
+    estimates = {} if method is None else method.estimates
+    scale, yaw = (estimates.get(n, NONE) for n in ('scale_factor', 'yaw_mounting_angle'))
+    started = datetime.fromtimestamp(leg.start_ns // 10**9, timezone.utc)
+    minutes, seconds = divmod(round(leg.duration), 60)
+    return (f'{started:%m-%d %H:%M:%S}', length(leg.distance), f'{minutes}:{seconds:02d}',
+            str(leg.fixes),
+            '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
+            '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True),
+            leg.verdict.value)
+
+
+def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
+    """
+    Return one check for many legs, each (check, fixes), None if there is none.
+
+    rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
+    """
+    have = [(check, n) for check, n in checks if check is not None and n]
+    if not have:
+        return None
+    total = sum(n for _, n in have)
+    return TrackCheck(
+        rms=math.sqrt(sum(n * check.rms**2 for check, n in have) / total),
+        mean=sum(n * check.mean for check, n in have) / total,
+        **{name: max(getattr(check, name) for check, _ in have)
+           for name in ('max', 'end', 'percent_of_distance')})
+
+
+def _check(legs):
+    rows = []
+    for label, name in (('as configured', 'before'), ('as calibrated', 'after')):
+        check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
+        if check is not None:
+            cells = (length(check.rms), length(check.mean), length(check.max), length(check.end),
+                     f'{check.percent_of_distance:.3f} %')
+            rows.append(f'  {label:<20}' + ''.join(f'{cell:>12}' for cell in cells))
+    head = ('rms', 'mean', 'max', 'at the end', 'of distance')
+    return [f'  {"track against fixes":<20}' + ''.join(f'{word:>12}' for word in head), *rows] \
+        if rows else []
+
+
+def _reasons(reasons: tuple[Reason, ...]):
+    lines = []
+    for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'take care'),
+                           (Verdict.ACCEPTED, 'notes')):
+        for reason in (r for r in reasons if r.code.gravity is verdict):
+            lines += [f'  {title}'] if title else []
+            title = ''
+            lines += _wrapped(f'{reason.code.name}: {reason.text}', '    ')
+            lines += _wrapped(f'-> {reason.remedy}', '      ')
+    return lines
+
+
+def _wrapped(text, indent):
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + '   ',
+                         break_long_words=False, break_on_hyphens=False)
