@@ -80,8 +80,8 @@ class Code(Enum):
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
                                       'at both marks), or combine more legs.')
-    YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of their '
-                                    'own.')
+    YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of '
+                                    'their own.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
