@@ -40,8 +40,10 @@ def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
 class LegRun:
     """One leg on its way through the pipeline; nothing of it outlives the call."""
 
-    def __init__(self, leg, inputs, config, reasons, alignment):
+    def __init__(self, leg, inputs, config, reasons, alignment, holdout=False):
         self.leg, self.inputs, self.config, self.reasons = leg, inputs, config, reasons
+        self.t_fit = inputs.t_stop
+        self.holdout = holdout
         near = int(np.argmin(np.abs(inputs.t_fix)))
         lat, lon, height = inputs.geodetic[near]
         self.origin = Origin(float(lat), float(lon), float(np.nan_to_num(height)))
@@ -72,6 +74,8 @@ class LegRun:
         self.reasons += imu_gap(self.inputs, self.alignment.t, self.config.leg.max_gap)
         self.track = self._reckon()
         distance = self._judge_drive()
+        if self.holdout:
+            self.t_fit = self._four_fifths()
         chord = self._chord()
         if chord is None:
             return leg_result(self.leg, self.inputs, self.reasons, distance=distance)
@@ -121,10 +125,17 @@ class LegRun:
                       f'turns above {leg.max_yaw_rate:g} rad/s')
         return distance
 
+    def _four_fifths(self):
+        """Return when four fifths of the distance are driven, s."""
+        inside = (self.track.t >= 0) & (self.track.t <= self.inputs.t_stop)
+        s = self.track.s[inside]
+        way = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
+        return float(self.track.t[inside][np.searchsorted(way, 0.8 * way[-1])])
+
     def _chord(self):
         """Return the chord between the marks, or None and say why."""
         inputs, config = self.inputs, self.config
-        ends = (max(0.0, float(self.track.t[0])), min(inputs.t_stop, float(self.track.t[-1])))
+        ends = (max(0.0, float(self.track.t[0])), min(self.t_fit, float(self.track.t[-1])))
         forward = np.array([self.rough, 0.0, 0.0])
         lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
         marks = [self._mark(t, forward, lever_b, getattr(config.reference, name))
@@ -199,6 +210,8 @@ class LegRun:
             f, _ = solve(chord, factor[2])
             more = {'before': track_check(strays(before), distance),
                     'after': track_check(strays(f), distance)}
+            if self.holdout:
+                more |= self._held_out(chord, before, f)
             self._judge_track(chord, f, fixes, more['after'], factor[0], drift, distance)
         method = fit(chord, self.nominal, inputs.scale_unit, inputs.travel.quantum, factor,
                      config)
@@ -215,6 +228,22 @@ class LegRun:
                  'reference_n': fixes[1],
                  'origin': (self.origin.latitude, self.origin.longitude, self.origin.height)}
         return method, more
+
+    def _held_out(self, chord, before, f):
+        """Return the check on the last fifth, from a fix at its begin, not used in the fit."""
+        inputs = self.inputs
+        late = (inputs.t_fix > self.t_fit) & (inputs.t_fix <= inputs.t_stop)
+        if late.sum() < 3:
+            return {}
+        fixes = inputs.t_fix[late], self.fixes_n[late]
+        begin = chord.end
+        way = np.abs(np.diff(self.track.s[self.track.t >= begin.t])).sum() * self.rough
+
+        def antenna_n(times):
+            return (self.track.C_nb_at(times) - self.track.C_nb_at(begin.t)) @ chord.lever_b
+
+        return {name: track_check(residuals(self.track, g, begin, fixes, antenna_n), way)
+                for name, g in (('before', before), ('after', f))}
 
     def _drift(self, chord, f):
         """Return how far the gyros may bend a track that is pinned at both ends, 1 sigma, m."""

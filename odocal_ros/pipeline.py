@@ -23,7 +23,7 @@ __all__ = ['calibrate', 'combine']
 
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
-              notes: tuple[Reason, ...] = ()) -> LegResult:
+              notes: tuple[Reason, ...] = (), holdout: bool = False) -> LegResult:
     """
     Take one leg from samples to result.
 
@@ -37,6 +37,8 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         Used instead of the leg's own (a simulation puts errors in it).
     notes : tuple of Reason
         What the door knows of the data already (a truncated bag).
+    holdout : bool
+        Keep the last fifth of the distance back from the fit and check the correction on it.
 
     Returns
     -------
@@ -53,7 +55,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         inputs = _turned_over(inputs)
     if Code.IMU_AXES in {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
-    return LegRun(leg, inputs, config, reasons, alignment).result()
+    return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
 
 
 def _turned_over(inputs: Inputs) -> Inputs:

@@ -106,7 +106,8 @@ def _calibrated(recorder, spans, config, notes, name, args):
     with _progress('calibrating', args) as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            results.append(replace(calibrate(leg, config, notes=notes), bag=name))
+            results.append(replace(calibrate(leg, config, notes=notes, holdout=args.holdout),
+                                   bag=name))
             progress(number / len(spans))
     return results
 
