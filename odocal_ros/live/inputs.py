@@ -1,0 +1,237 @@
+"""The node's inputs: subscriptions of raw messages, decoded in blocks by the readers of bags."""
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+import importlib
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.serialization import deserialize_message
+
+from odocal_ros.config import Config
+from odocal_ros.errors import BadConfig, BadData, OdocalError
+from odocal_ros.live.health import Health
+from odocal_ros.messages import make_reader
+
+IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
+VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
+TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
+          'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
+# five seconds of the highest rate believed: a queue that runs over is what loses messages
+DEPTH = {'imu': 5000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
+         'fix': 500, 'fix_velocity': 500}
+LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+          'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
+QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
+
+
+def message_class(msgtype: str):
+    """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
+    try:
+        package, folder, name = msgtype.split('/')
+        return getattr(importlib.import_module(f'{package}.{folder}'), name)
+    except (ValueError, ImportError, AttributeError):
+        raise BadConfig(
+            f'message type {msgtype!r} cannot be imported here: install its package or source '
+            f"its workspace ('ros2 interface show {msgtype}' must work), or correct the type"
+        ) from None
+
+
+class Input:
+    """
+    One topic, from the wire to blocks of samples.
+
+    ``allowed`` are the message types it takes; empty: any that ``make_reader`` can read.
+    """
+
+    def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
+        self.slot, self.allowed = slot, allowed
+        self.name = TOPICS[slot]
+        self.topic = node.resolve_topic_name(self.name)
+        self.msgtype = ''
+        self.reader = None
+        self.health = Health()
+        self.trouble = ''
+        self.publishers: list = []
+        self._node = node
+        self._pending: deque = deque()
+        self._deserialize: Callable | None = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.sim_time = node.get_clock().ros_time_is_active
+
+    def check(self, config: Config) -> None:
+        """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
+        if len(self.allowed) == 1:
+            message_class(self.allowed[0])
+            make_reader(self.slot, self.allowed[0], config)
+
+    def find(self, config: Config) -> None:
+        """Look at who publishes the topic, and subscribe once the type is known."""
+        self.publishers = self._node.get_publishers_info_by_topic(self.topic)
+        if self.reader is not None:
+            return
+        try:
+            if len(self.allowed) == 1:
+                self.subscribe(self.allowed[0], config)
+            elif self.publishers:
+                self.subscribe(self.publishers[0].topic_type, config)
+        except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
+            trouble = ' '.join(str(error).split())
+            if trouble != self.trouble:
+                self._node.get_logger().error(trouble)
+            self.trouble = trouble
+
+    def subscribe(self, msgtype: str, config: Config) -> None:
+        """Create the reader and the subscription, or raise what is wrong."""
+        if self.allowed and msgtype not in self.allowed:
+            raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
+                          f'remap {self.name} to another topic')
+        kind = message_class(msgtype)
+        reader = make_reader(self.slot, msgtype, config)
+        # increments want the QoS on offer; a heading is optional, an idle subscription is not free
+        if not self.publishers and (self.slot == 'heading' or self._counts_increments(reader)):
+            return
+        offered = {p.qos_profile.reliability for p in self.publishers}
+        reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
+        qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=DEPTH[self.slot],
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
+        self._deserialize = partial(deserialize_message, message_type=kind)
+        self._node.create_subscription(
+            kind, self.name, self._receive, qos, raw=True,
+            # each event handler costs time in every turn of the executor; find() sees as much
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self.reader, self.msgtype, self.trouble = reader, msgtype, ''
+        self._node.get_logger().info(
+            f'{self.slot}: {msgtype} on {self.topic}, '
+            f'{"reliable" if reliable else "best effort"}')
+
+    @staticmethod
+    def _counts_increments(reader) -> bool:
+        # a lost increment is travel lost for good, so such a sender is asked to repeat itself
+        return reader.form is not None and reader.form.quantity == 'increment'
+
+    def _receive(self, raw: bytes, info: dict) -> None:
+        """Remember one message; called a thousand times a second, so it does nothing else."""
+        if self.sim_time:
+            info['source_timestamp'] = self._node.get_clock().now().nanoseconds
+        self._pending.append((raw, info))
+
+    def take(self) -> tuple[list[bytes], list[int]]:
+        """Return the messages that came since the last call, and when they were sent, ns."""
+        pending, self._pending = self._pending, deque()
+        if pending:
+            self.health.arrived([i['publication_sequence_number'] for _, i in pending],
+                                self._steady_ns())
+        return ([raw for raw, _ in pending],
+                [i['source_timestamp'] or i['received_timestamp'] for _, i in pending])
+
+    def decode(self, raws: list[bytes], received_ns: list[int], max_gap_s: float | None) -> list:
+        """Return (slot, block) pairs of messages; those that cannot be read are counted."""
+        try:
+            pairs = self.reader.rows(raws, received_ns, self._deserialize)
+        except Exception as error:  # whatever a foreign message does, the node lives on
+            self.health.unusable += len(raws)
+            self.trouble = f'{self.topic}: {" ".join(str(error).split())}'
+            return []
+        for slot, block in pairs:
+            if slot == self.slot:
+                self.health.decoded(block, max_gap_s)
+        return pairs
+
+    def flowing(self) -> bool:
+        """Return whether usable messages are coming."""
+        return self.health.flowing(self._steady_ns())
+
+    def why(self) -> str:
+        """Return why nothing usable comes, for people; empty if it does."""
+        silent = self.health.silent_s(self._steady_ns())
+        if self.flowing():
+            return ''
+        if self.trouble:
+            return self.trouble
+        if self.health.heard_ns and not self.health.newest_ns:
+            return f'{self.topic}: all header stamps are zero; mend the driver'
+        if not self.publishers:
+            return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'
+                    + (f', silent for {silent:.0f} s' if self.health.heard_ns else
+                       '; start the driver or remap ' + self.name))
+        foreign = {p.topic_type for p in self.publishers} - {self.msgtype}
+        if self.msgtype and foreign and not self.health.heard_ns:
+            return (f'{self.topic} is published as {", ".join(sorted(foreign))}, want '
+                    f'{self.msgtype}')
+        offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
+                                   for p in self.publishers}))
+        many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
+        if not self.health.heard_ns:
+            return f'{self.topic}: {many} found ({offers}) but no message yet'
+        return f'no {LABELS[self.slot]} on {self.topic} for {silent:.0f} s: {many} found'
+
+    def _steady_ns(self) -> int:
+        return self._steady.now().nanoseconds
+
+
+class Inputs:
+    """All topics of the node, those that a configuration asks for."""
+
+    def __init__(self, node: Node, config: Config) -> None:
+        self._node = node
+        self.by_slot: dict[str, Input] = {}
+        for slot, allowed in _wanted(config).items():
+            one = self.by_slot[slot] = Input(node, slot, allowed)
+            one.check(config)
+        for one in self.by_slot.values():
+            if len(one.allowed) == 1:  # what is wrong with it is wrong from the start: raise
+                one.subscribe(one.allowed[0], config)
+
+    def update(self, config: Config) -> None:
+        """Add the topics that the configuration asks for, and look for publishers."""
+        for slot, allowed in _wanted(config).items():
+            if slot not in self.by_slot:
+                self.by_slot[slot] = Input(self._node, slot, allowed)
+        for one in self.by_slot.values():
+            if not one.flowing():
+                one.find(config)
+
+    def required(self, config: Config) -> list[Input]:
+        """Return the topics without which no leg can be started."""
+        surveyed = config.reference.start and config.reference.end
+        slots = ['imu', 'odometer'] + ['odometer_right'] * (config.odometer.right == 'topic')
+        slots += [] if surveyed else ['fix']
+        slots += ['heading'] * (config.alignment.heading_source == 'heading_topic')
+        return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
+
+    def missing(self, config: Config) -> list[str]:
+        """Return why a leg cannot be started, one line for each topic that lacks."""
+        return [one.why() for one in self.required(config) if not one.flowing()]
+
+    @property
+    def form(self):
+        """Return the form of the odometer's values, None until its type is known."""
+        reader = self.by_slot['odometer'].reader
+        return reader.form if reader else None
+
+    def set_sim_time(self, active: bool) -> None:
+        """Stamp arrivals with the node clock (sim time) or the sender's (else)."""
+        for one in self.by_slot.values():
+            one.sim_time = active
+
+
+def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
+    """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
+    odometer = () if config.odometer.type == 'auto' else (config.odometer.type,)
+    wanted = {'imu': (IMU,), 'odometer': odometer, 'fix': (FIX,)}
+    if config.odometer.right == 'topic':
+        wanted['odometer_right'] = odometer
+    if config.gnss.use_velocity:
+        wanted['fix_velocity'] = VELOCITY
+    if config.alignment.heading_source in ('auto', 'heading_topic'):
+        wanted['heading'] = (IMU,)
+    return wanted

@@ -1,0 +1,200 @@
+"""The live node: declares settings, records, computes on a mark, publishes."""
+
+from functools import partial
+import os
+import signal
+import sys
+import tempfile
+import threading
+
+from rcl_interfaces.msg import SetParametersResult
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from odocal_ros.errors import BadConfig, OdocalError
+from odocal_ros.live import params
+from odocal_ros.live.answers import one_line
+from odocal_ros.live.operation import Operation
+from odocal_ros.live.outlets import Outlets
+from odocal_ros.live.recording import Recording
+
+TICK_S = 0.05
+LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
+SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
+
+
+class Calibrator(Node):
+    """
+    Calibrates an odometer over legs that the operator marks by service.
+
+    Works in any executor; SingleThreadedExecutor is meant. ``Session`` remembers legs,
+    ``Recording`` samples; the node itself only joins them.
+    """
+
+    def __init__(self, node_name: str = 'calibrator', **kwargs) -> None:
+        super().__init__(node_name, **kwargs)
+        try:
+            self._build()
+        except (ParameterException, InvalidQosOverridesError) as error:
+            self.destroy_node()
+            text = ' '.join(str(error).split())
+            raise BadConfig(f'{text}; correct the parameter and start again') from None
+        except Exception:
+            self.destroy_node()
+            raise
+
+    def _build(self) -> None:
+        self.config = params.declare(self)
+        params.declare_results(self)
+        self.outlets = Outlets(self)
+        self.recording = Recording(self, self.config, self._remember)
+        self.operation = Operation(self, self.recording, self.outlets, lambda: self.config)
+        self._lock = threading.RLock()  # for executors with several threads
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._due_ns = dict.fromkeys(('look', 'diagnostics', 'status'), 0)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+        group = ReentrantCallbackGroup()  # an answer that waits must not keep callbacks waiting
+        for name in SERVICES:
+            act = getattr(self.operation, name)
+            self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
+                                callback_group=group)
+        # on the steady clock: a paused or missing /clock must not silence the status
+        self.create_timer(TICK_S, self._tick, clock=self._steady)
+
+    def destroy_node(self) -> None:
+        """End worker and clock callbacks with the node."""
+        for part in ('operation', 'recording'):
+            if hasattr(self, part):
+                getattr(self, part).close()
+        super().destroy_node()
+
+    # parameters
+
+    def _check_parameters(self, parameters) -> SetParametersResult:
+        """Refuse what may not be set; changes nothing."""
+        if self.outlets.setting_results:
+            return SetParametersResult(successful=True)
+        ours = [p.name for p in parameters if p.name in params.RESULTS]
+        if ours:
+            return SetParametersResult(successful=False, reason=(
+                f'{ours[0]} is set by the node after each leg; give it as an override at start-up '
+                'to restore a result'))
+        session = self.operation.session
+        if session.busy:
+            return SetParametersResult(successful=False, reason=(
+                f'leg {session.leg_id} is {session.state.value}: its configuration is '
+                'frozen; end it with ~/stop_leg or ~/cancel_leg, then set'))
+        try:
+            params.changed(self.config, parameters)
+        except OdocalError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, parameters) -> None:
+        self.config = params.changed(self.config, parameters)
+
+    # what happens twenty times a second
+
+    def _tick(self) -> None:
+        with self._lock:
+            self.operation.tick()
+            if self._due('look', LOOK_S):
+                self.recording.look_around(self.config)
+                if not self.operation.session.open_leg:
+                    self.recording.forget(self.config.leg.preroll)
+            if self._due('diagnostics', self.config.diagnostic_updater.period):
+                self.outlets.show_diagnostics(self.recording,
+                                              self.config.diagnostic_updater.use_fqn)
+            if self._due('status', 1 / self.config.publish.rate):
+                self.operation.show_status()
+
+    def _due(self, task: str, period_s: float) -> bool:
+        now_ns, period_ns = self._steady.now().nanoseconds, round(period_s * 1e9)
+        if now_ns < self._due_ns[task]:
+            return False
+        # from the time it was due, so that the mean rate is right; but never make up for a pause
+        on_time = self._due_ns[task] + period_ns
+        self._due_ns[task] = on_time if on_time > now_ns else now_ns + period_ns
+        return True
+
+    def _remember(self, source, raws: list[bytes], sent_ns: list[int]) -> None:
+        """Take every raw message in order of arrival: the journal's place."""
+
+    async def _serve(self, act, _request, response):
+        """Answer a Trigger with what ``act`` returns, or the future it returns brings."""
+        try:
+            with self._lock:
+                answer = act()
+            response.success, response.message = (
+                await answer if isinstance(answer, Future) else answer)
+        except OdocalError as refused:
+            response.success, response.message = False, str(refused)
+        return response
+
+
+def main(args=None) -> int:
+    """
+    Run the node until it is told to end.
+
+    Returns 0 after SIGINT, SIGTERM or a shutdown of the context; 1 when it cannot start, with
+    one line that says why.
+    """
+    # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        _init(args)
+    except Exception as error:
+        text = ' '.join(str(error).split()).split(', at /')[0]
+        return _complain(f'{text}; write parameters as --ros-args -p name:=value, remaps as -r '
+                         'from:=to')
+    executor, node, code = SingleThreadedExecutor(), None, 0
+    try:
+        node = Calibrator()
+        executor.add_node(node)
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except OdocalError as error:
+        code = _complain(str(error))
+    except Exception as error:
+        # a callback caught in the middle of a shutdown may find its publisher gone
+        code = _complain(one_line(error)) if rclpy.ok() else 0
+    finally:
+        executor.shutdown()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+def _init(args) -> None:
+    """Start rclpy; of an error only the exception is left, not rcl's own line on stderr."""
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            rclpy.init(args=args)
+            held.seek(0)
+            os.write(stderr, held.read())
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+def _complain(text: str) -> int:
+    print(f'calibrator: {text}', file=sys.stderr)
+    return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,85 @@
+"""The side of the node that speaks: status, diagnostics, paths, result parameters."""
+
+from functools import partial
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Path as PathMessage
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from odocal_ros.live import outputs, params
+from odocal_ros.live.recording import Recording
+from odocal_ros.live.status import calibration_status, input_status, Situation
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
+
+
+class Outlets:
+    """Publishers and result parameters of a node."""
+
+    def __init__(self, node: Node) -> None:
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        publish = partial(node.create_publisher, event_callbacks=quiet)
+        self._node = node
+        self._status = publish(DiagnosticArray, '~/status', LATCHED)
+        self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
+        self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
+                       for name in ('dead_reckoning', 'reference')]
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._setting = False
+
+    @property
+    def setting_results(self) -> bool:
+        """Return whether it is the node itself that sets ``result.*`` just now."""
+        return self._setting
+
+    def results(self) -> dict:
+        """Return the ``result.*`` parameters in force."""
+        return {name: self._node.get_parameter(name).value for name in params.RESULTS}
+
+    def scale_factor(self) -> float:
+        """Return the scale factor in force, NaN where none is."""
+        return self._node.get_parameter('result.scale_factor').value
+
+    def set_results(self, calibration) -> None:
+        """Set all ``result.*`` at once: one event, never half a result."""
+        stamp = outputs.iso(self._node.get_clock().now().nanoseconds)
+        self._setting = True
+        try:
+            self._node.set_parameters_atomically(params.result_parameters(calibration, stamp))
+        finally:
+            self._setting = False
+
+    def show_paths(self, messages) -> None:
+        """Publish dead reckoning and reference of a leg."""
+        for publisher, message in zip(self._paths, messages, strict=True):
+            publisher.publish(message)
+
+    def show_status(self, recording: Recording, **known) -> None:
+        """Publish ``~/status``; ``known`` are further fields of ``Situation``."""
+        config, progress = known['config'], recording.progress
+        situation = Situation(
+            missing=recording.inputs.missing(config), clocks=progress.clocks.differing(config),
+            rates_hz=recording.rates_hz(), results=self.results(),
+            max_speed=progress.max_speed, still_s=progress.still_s(),
+            heard=recording.heard(), **known)
+        self._status.publish(self._array([calibration_status(situation)]))
+
+    def show_diagnostics(self, recording: Recording, use_fqn: bool) -> None:
+        """Publish the health of each input."""
+        node = self._node.get_fully_qualified_name() if use_fqn else self._node.get_name()
+        now_ns = self._steady.now().nanoseconds
+        self._diagnostics.publish(self._array([
+            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(), now_ns)
+            for slot, one in recording.inputs.by_slot.items()
+            if slot != 'heading' or one.reader is not None]))
+
+    def _array(self, statuses) -> DiagnosticArray:
+        array = DiagnosticArray(status=statuses)
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        return array

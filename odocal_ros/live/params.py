@@ -1,0 +1,137 @@
+"""Settings as ROS parameters, and the result as parameters that only the node may set."""
+
+import math
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.config import Config, Setting, SETTINGS, with_settings
+from odocal_ros.errors import BadConfig
+from odocal_ros.reasons import Verdict
+
+ESTIMATES = {'scale_factor': 'm/pulse, m/rad or 1', 'scale_ratio': '1',
+             'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
+PREFIX = 'result.'
+
+
+def _result_defaults() -> dict:
+    numbers = {PREFIX + name + end: math.nan for name in ESTIMATES for end in ('', '_sigma')}
+    return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': ''}
+
+
+RESULTS = _result_defaults()
+
+
+def descriptor(setting: Setting) -> ParameterDescriptor:
+    """
+    Return the descriptor of a setting.
+
+    rclpy refuses NaN where a range is declared, checks no array and knows no choices: there the
+    range stands in the text only, and the on-set callback checks it. Lists that may be empty are
+    typed dynamically, since an empty list in YAML has no type.
+    """
+    about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
+    result = ParameterDescriptor(description=about, read_only=setting.read_only)
+    result.dynamic_typing = setting.kind in ('floats', 'strs') and not setting.read_only
+    limits = []
+    if setting.choices:
+        limits.append('one of ' + ', '.join(setting.choices))
+    if setting.low is not None:
+        limits.append(f'{setting.low:g} to {setting.high:g}')
+        if setting.kind == 'int':
+            result.integer_range = [IntegerRange(from_value=setting.low, to_value=setting.high)]
+        elif setting.kind == 'float' and not math.isnan(setting.default):
+            result.floating_point_range = [FloatingPointRange(
+                from_value=float(setting.low), to_value=float(setting.high))]
+    if setting.kind == 'floats':
+        limits.append('0 or 4 values' if not setting.default else f'{len(setting.default)} values')
+    result.additional_constraints = '; '.join(limits)
+    return result
+
+
+def declare(node: Node) -> Config:
+    """
+    Declare every setting as a parameter and return the configuration they make.
+
+    Raises
+    ------
+    BadConfig
+        An override has the wrong type or is out of range.
+
+    """
+    values = {}
+    for name, setting in SETTINGS.items():
+        try:
+            value = node.declare_parameter(name, _as_ros(setting), descriptor(setting)).value
+            if value is None:
+                empty = Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])
+                node.set_parameters([empty])
+        except ParameterException as error:
+            raise BadConfig(_refusal(name, setting, error)) from None
+        values[name] = setting.default if value is None else _plain(value)
+    return with_settings(Config(), values)
+
+
+def changed(config: Config, parameters: list[Parameter]) -> Config:
+    """Return config with the settings among some parameters taken over, checked."""
+    return with_settings(config, {
+        p.name: _plain(p.value) for p in parameters if p.name in SETTINGS})
+
+
+def declare_results(node: Node) -> None:
+    """Declare ``result.*``; a saved result may come back as overrides at start-up."""
+    for name, default in RESULTS.items():
+        unit = ESTIMATES.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
+        about = ParameterDescriptor(dynamic_typing=True, description=(
+            'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
+        value = node.declare_parameter(name, default, about).value
+        kind = type(default)
+        whole = kind is float and type(value) is int
+        if type(value) is not kind and not whole:
+            raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; take the file '
+                            'that ~/save wrote')
+        if whole:
+            node.set_parameters([Parameter(name, value=float(value))])
+
+
+def result_parameters(calibration: Calibration | None, stamp: str) -> list[Parameter]:
+    """Return the ``result.*`` parameters of a calibration; None gives those of a fresh start."""
+    values = dict(RESULTS)
+    if calibration is not None:
+        for name in ESTIMATES:
+            estimate = calibration.estimates.get(name) or Estimate(None, None, '')
+            values[PREFIX + name] = _number(estimate.value)
+            values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
+        values[PREFIX + 'legs'] = len(calibration.legs)
+        values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
+        values[PREFIX + 'stamp'] = stamp
+    return [Parameter(name, value=value) for name, value in values.items()]
+
+
+def _number(value) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _as_ros(setting: Setting):
+    """Return a default rclpy can type: None for an empty list, which it takes for bytes."""
+    if setting.kind in ('floats', 'strs'):
+        return list(setting.default) or None
+    return setting.default
+
+
+def _plain(value):
+    """Return a parameter's value as config.py knows it: no numpy, no array, no bytes."""
+    if isinstance(value, (bool, int, float, str)) or value is None:
+        return value
+    return tuple(value)
+
+
+def _refusal(name: str, setting: Setting, error: Exception) -> str:
+    """Return one line that says what rclpy refused and what to write instead."""
+    text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
+    if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
+        return f'{text}; write it as a decimal number, such as 3.0'
+    return f'{text}; correct the parameter and start again'

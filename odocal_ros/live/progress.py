@@ -1,0 +1,194 @@
+"""
+What the operator wants to know while driving: distance, speed, standing or not, clocks.
+
+Light estimates from the blocks as they come; nothing here enters a result.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from odocal_ros.config import Config
+from odocal_ros.nav.earth import radii
+from odocal_ros.samples import OdometerForm
+
+STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
+FASTEST = 100.0        # m/s: what goes faster is a counter reset
+CLOCK_LIMIT = 0.5      # s
+CLOCK_ROWS = 10
+
+
+def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+    """Return m per unit of the odometer as well as it is known, 0 where it is not."""
+    if np.isfinite(found) and found > 0:
+        return float(found)
+    if config.odometer.nominal_scale > 0:
+        return config.odometer.nominal_scale
+    if form is None or form.scale_unit == '1':
+        return 1.0 if form else 0.0
+    turn = config.wheels.radius
+    if form.scale_unit == 'm/rad':
+        return turn
+    pulses = config.wheels.pulses_per_revolution
+    return 2 * np.pi * turn / pulses if pulses else 0.0
+
+
+class Travel:
+    """Distance, speed and standstill from odometer blocks, in odometer units."""
+
+    def __init__(self, form: OdometerForm) -> None:
+        self.form = form
+        self.total = 0.0
+        self.moved_ns = 0        # stamp of the last motion
+        self.newest_ns = 0
+        self._last: tuple | None = None
+        self._anchor = 0.0
+
+    def feed(self, block, scale: float) -> float:
+        """Take a block, return the highest speed in it, m/s (0 where the scale is unknown)."""
+        steps, stamps, seconds = self._steps(block)
+        if not len(steps):
+            return 0.0
+        if scale > 0:
+            steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
+        path = self.total + np.cumsum(np.abs(steps))
+        for total, stamp in zip(path, stamps, strict=True):
+            if total - self._anchor > STILL.get(self.form.scale_unit, 0.02):
+                self._anchor, self.moved_ns = total, int(stamp)
+        self.moved_ns = self.moved_ns or int(stamps[0])
+        self.newest_ns = int(stamps[-1])
+        gone, self.total = path[-1] - self.total, float(path[-1])
+        return gone * scale / seconds.sum() if seconds.sum() > 0 else 0.0
+
+    def _steps(self, block):
+        """Return the travel of each row since the row before, its stamp and its duration, s."""
+        stamps, values = block.stamp_ns, block.value
+        if self._last is not None:
+            stamps = np.r_[self._last[0], stamps]
+            values = np.r_[self._last[1], values]
+        self._last = (block.stamp_ns[-1:], block.value[-1:])
+        seconds = np.diff(stamps) * 1e-9
+        if self.form.quantity == 'increment':
+            steps = values[1:]
+        elif self.form.quantity == 'rate':
+            steps = values[1:] * seconds
+        else:
+            steps = np.diff(values)
+            if 0 < self.form.modulus < 2**63:
+                half = self.form.modulus // 2
+                steps = (steps + half) % self.form.modulus - half
+        return np.asarray(steps, dtype=np.float64), stamps[1:], seconds
+
+    def still_s(self) -> float:
+        """Return how long the vehicle has stood."""
+        return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
+
+
+class FixPath:
+    """Distance along the fixes; steps below the noise do not count."""
+
+    def __init__(self) -> None:
+        self.total = 0.0
+        self._anchor: tuple | None = None
+
+    def feed(self, block, min_status: int) -> float:
+        """Take a block of fixes, return the highest speed in it, m/s."""
+        fastest = 0.0
+        for lat, lon, stamp, variance, status in zip(
+                block.latitude, block.longitude, block.stamp_ns,
+                block.covariance_n[:, 0, 0], block.status, strict=True):
+            if status < min_status or not np.isfinite([lat, lon]).all():
+                continue
+            if self._anchor is None:
+                self._anchor = (lat, lon, stamp)
+                continue
+            meridian, normal = radii(lat)
+            step = np.hypot((lat - self._anchor[0]) * meridian,
+                            (lon - self._anchor[1]) * normal * np.cos(lat))
+            if step > max(3.0, 3 * np.sqrt(variance) if variance > 0 else 0.0):
+                seconds = (stamp - self._anchor[2]) * 1e-9
+                self.total += float(step)
+                if seconds > 0:
+                    fastest = max(fastest, float(step / seconds))
+                self._anchor = (lat, lon, stamp)
+        return fastest
+
+
+class Clocks:
+    """Compares the stamps of rows that arrived together: whose clock differs from the Imu's."""
+
+    def __init__(self) -> None:
+        self._imu: deque = deque(maxlen=40)
+        self._ahead_s: dict[str, deque] = {}
+
+    def feed(self, slot: str, block) -> None:
+        """Take a block; the Imu's must be fed before those that arrived with it."""
+        if slot == 'imu':
+            self._imu.append((block.received_ns, block.stamp_ns))
+        elif self._imu:
+            received = np.concatenate([r for r, _ in self._imu])
+            row = int(block.received_ns[-1])
+            if received.min() <= row <= received.max():
+                stamps = np.concatenate([s for _, s in self._imu])
+                # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+                imu_ns = np.interp(row - received[0], received - received[0], stamps - stamps[0])
+                ahead = (int(block.stamp_ns[-1]) - int(stamps[0]) - imu_ns) * 1e-9
+                self._ahead_s.setdefault(slot, deque(maxlen=CLOCK_ROWS)).append(ahead)
+
+    def differing(self, config: Config) -> list[tuple[str, float]]:
+        """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
+        offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
+                   'odometer_right': config.odometer.time_offset,
+                   'fix_velocity': config.gnss.time_offset}
+        result = []
+        for slot, ahead in self._ahead_s.items():
+            # the freshest of the last rows: latency on the way makes a row look older, never newer
+            value = max(ahead) + offsets.get(slot, 0.0) - config.imu.time_offset
+            if abs(value) > CLOCK_LIMIT:
+                result.append((slot, value))
+        return result
+
+
+class Progress:
+    """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
+
+    def __init__(self) -> None:
+        self.clocks = Clocks()
+        self.max_speed = 0.0
+        self._travel: dict[str, Travel] = {}
+        self._path = FixPath()
+        self._zero = 0.0
+        self._scale = 0.0
+
+    def feed(self, slot: str, block, config: Config, form, found_scale: float) -> None:
+        """Take a block as it went into the recorder."""
+        if not len(block.stamp_ns):
+            return
+        self.clocks.feed(slot, block)
+        if slot == 'odometer' and form is not None:
+            self._scale = nominal_scale(config, form, found_scale)
+            travel = self._travel.setdefault(slot, Travel(form))
+            self.max_speed = max(self.max_speed, travel.feed(block, self._scale))
+        elif slot == 'fix':
+            speed = self._path.feed(block, config.gnss.min_status)
+            if not self._scale:
+                self.max_speed = max(self.max_speed, speed)
+
+    def begin_leg(self) -> None:
+        """Count distance and speed from here."""
+        self.max_speed = 0.0
+        self._path = FixPath()
+        travel = self._travel.get('odometer')
+        self._zero = travel.total if travel else 0.0
+
+    def distance_m(self) -> float:
+        """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return (travel.total - self._zero) * self._scale
+        return self._path.total
+
+    def still_s(self) -> float:
+        """Return how long the vehicle has stood by the odometer."""
+        travel = self._travel.get('odometer')
+        return travel.still_s() if travel else 0.0

@@ -1,0 +1,110 @@
+"""The side of the node that listens: inputs, recorder, and what is seen while driving."""
+
+from collections.abc import Callable
+
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+
+from odocal_ros.config import Config
+from odocal_ros.leg import LegRecorder, SLOTS
+from odocal_ros.live.inputs import Input, Inputs
+from odocal_ros.live.progress import Progress
+
+BACKWARD_S = 0.1   # a clock that steps back by more has jumped
+MARGIN_S = 1.0     # kept beyond the pre-roll, since forgetting goes by whole blocks
+
+
+class Recording:
+    """
+    Samples so far, as they came.
+
+    ``remember(input, raws, sent_ns)`` is called with every batch of raw messages, in order of
+    arrival: the journal's door.
+    """
+
+    def __init__(self, node: Node, config: Config,
+                 remember: Callable[[Input, list[bytes], list[int]], None]) -> None:
+        self.inputs = Inputs(node, config)
+        self.recorder, self.progress = LegRecorder(), Progress()
+        self._remember = remember
+        self._clock = node.get_clock()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._clock_jumped = False
+        self._jumps = self._clock.create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(seconds=-BACKWARD_S)),
+            post_callback=self._note_jump)
+
+    def pump(self, config: Config, found_scale: float) -> None:
+        """Decode what has come since the last call, in blocks."""
+        for source in self.inputs.by_slot.values():
+            raws, sent_ns = source.take()
+            if not raws:
+                continue
+            self._remember(source, raws, sent_ns)
+            max_gap_s = config.leg.max_gap if source.slot == 'imu' else None
+            for slot, block in source.decode(raws, sent_ns, max_gap_s):
+                self.recorder.feed(slot, block)
+                self.progress.feed(slot, block, config, self.inputs.form, found_scale)
+
+    def look_around(self, config: Config) -> None:
+        """Look for publishers of topics that are silent."""
+        self.inputs.update(config)
+        self.inputs.set_sim_time(self._clock.ros_time_is_active)
+
+    def forget(self, preroll_s: float) -> None:
+        """Bound the memory of what came before the pre-roll."""
+        # by each topic's own stamps: one on a foreign clock must not grow without bound
+        for slot in SLOTS:
+            newest_ns = self.recorder.newest_ns(slot)
+            if newest_ns > 0:
+                self.recorder.forget_before(
+                    newest_ns - round((preroll_s + MARGIN_S) * 1e9), (slot,))
+
+    @property
+    def newest_imu_ns(self) -> int:
+        """Return the stamp of the newest Imu sample decoded, 0 before the first."""
+        return self.inputs.by_slot['imu'].health.newest_ns
+
+    def passed(self, mark_ns: int) -> bool:
+        """Return whether every topic that ever spoke has passed a mark."""
+        newest = [one.health.newest_ns for one in self.inputs.by_slot.values()]
+        return not any(0 < stamp_ns <= mark_ns for stamp_ns in newest)
+
+    def snapshot(self) -> LegRecorder:
+        """Return the samples so far, for another thread."""
+        copy = self.recorder.snapshot()
+        if self.inputs.form is not None:
+            copy.form = self.inputs.form
+        return copy
+
+    @property
+    def time_jumped(self) -> bool:
+        """Return whether the clock or the Imu's stamps went back."""
+        return self._clock_jumped or self.inputs.by_slot['imu'].health.jumped_back
+
+    def start_anew(self) -> None:
+        """Drop everything, as after a jump of time."""
+        self._clock_jumped = False
+        self.recorder.clear()
+        self.progress = Progress()
+        for source in self.inputs.by_slot.values():
+            source.take()
+            source.health.forget()
+
+    def rates_hz(self) -> dict[str, float]:
+        """Return the rate of each topic by its stamps."""
+        now_ns = self._steady.now().nanoseconds
+        return {slot: one.health.rate_hz(now_ns) for slot, one in self.inputs.by_slot.items()}
+
+    def heard(self) -> bool:
+        """Return whether any message has come on any topic."""
+        return any(one.health.heard_ns for one in self.inputs.by_slot.values())
+
+    def close(self) -> None:
+        """Let go of the clock."""
+        self._jumps.unregister()
+
+    def _note_jump(self, _jump) -> None:
+        self._clock_jumped = True  # called from within the clock: only a note is safe

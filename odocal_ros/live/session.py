@@ -1,0 +1,157 @@
+"""
+The operator's session: which leg is open, which are kept, what has come of them.
+
+A state machine without ROS, clock or thread; a wrong call raises ``Refused`` with the remedy.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.config import Config
+from odocal_ros.errors import OdocalError
+from odocal_ros.reasons import Verdict
+
+
+class Refused(OdocalError):
+    """A service was called in the wrong state: the text says what to do instead."""
+
+
+class State(Enum):
+    """What the node is at; ``waiting`` is idle with an input missing and not kept here."""
+
+    IDLE = 'idle'
+    RECORDING = 'recording'
+    COMPUTING = 'computing'
+    CALIBRATED = 'calibrated'
+    REJECTED = 'rejected'
+    FAILED = 'failed'
+
+
+@dataclass(frozen=True, eq=False)
+class KeptLeg:
+    """A leg that counts."""
+
+    leg_id: int
+    start_ns: int
+    stop_ns: int
+    result: LegResult
+
+
+class Session:
+    """
+    Legs and their outcome.
+
+    ``leg_id``, ``start_ns``, ``stop_ns`` (0: open) and ``event`` are those of the leg last
+    touched: they go out with every status, and replay finds the marks by them.
+    """
+
+    def __init__(self) -> None:
+        self.state = State.IDLE
+        self.leg_id = 0
+        self.start_ns = self.stop_ns = 0
+        self.event = ''
+        self.config = Config()
+        self.legs: list[KeptLeg] = []
+        self.calibration: Calibration | None = None
+        self.trouble = ''
+        self._last_id = 0
+
+    @property
+    def busy(self) -> bool:
+        """Return whether a leg runs or is computed: no setting may change then."""
+        return self.state in (State.RECORDING, State.COMPUTING)
+
+    @property
+    def open_leg(self) -> bool:
+        """Return whether there is a leg that is neither kept nor dropped."""
+        closed = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
+        return self.state is State.RECORDING or closed
+
+    def start(self, mark_ns: int, config: Config) -> None:
+        """Open a leg at a mark, under the configuration in force."""
+        if self.state is State.COMPUTING:
+            raise Refused(f'leg {self.leg_id} is being computed: call again when ~/stop_leg has '
+                          'answered, or drop it with ~/cancel_leg')
+        if self.open_leg:
+            raise Refused(f'leg {self.leg_id} failed and is kept: call ~/stop_leg to compute it '
+                          'again, or drop it with ~/cancel_leg')
+        self._last_id += 1
+        self.leg_id, self.start_ns, self.stop_ns = self._last_id, mark_ns, 0
+        self.config = config
+        self.state, self.event, self.trouble = State.RECORDING, 'started', ''
+
+    def stop(self, mark_ns: int) -> None:
+        """End the open leg at a mark; it is computed next."""
+        if self.state is not State.RECORDING:
+            raise Refused('no leg is running: call ~/start_leg first')
+        self.stop_ns = mark_ns
+        self.state, self.event = State.COMPUTING, 'stopped'
+
+    def retry(self, config: Config) -> None:
+        """Compute a failed leg again, under the configuration now in force."""
+        self.config = config
+        self.state, self.trouble = State.COMPUTING, ''
+
+    def finish(self, result: LegResult, calibration: Calibration) -> None:
+        """Keep the computed leg."""
+        self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, result))
+        self._settle(calibration)
+
+    def fail(self, trouble: str) -> None:
+        """Note that the computation failed; the leg stays open."""
+        self.state, self.trouble = State.FAILED, trouble
+
+    def cancel(self) -> None:
+        """Drop the open leg."""
+        if not self.open_leg:
+            raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept')
+        self.event = 'cancelled'
+        self._settle(self.calibration)
+
+    def begin_undo(self) -> list[KeptLeg]:
+        """Drop the last kept leg and return those left, which are to be combined anew."""
+        if self.open_leg:
+            raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
+                          'before undoing an earlier one')
+        if not self.legs:
+            raise Refused('no leg to undo: none is kept')
+        dropped = self.legs.pop()
+        self._touch(dropped, 'undone')
+        self.state = State.COMPUTING if self.legs else State.IDLE
+        self.calibration = None
+        return self.legs
+
+    def finish_undo(self, calibration: Calibration) -> None:
+        """Take the combination of the legs left."""
+        self._settle(calibration)
+
+    def begin_reset(self) -> list[KeptLeg]:
+        """Drop everything and return the legs that were kept."""
+        if self.busy:
+            raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
+                          'before ~/reset')
+        dropped, self.legs = self.legs, []
+        self.calibration, self.state, self.trouble = None, State.IDLE, ''
+        return dropped
+
+    def dropped(self, leg: KeptLeg) -> None:
+        """Show a leg as undone."""
+        self._touch(leg, 'undone')
+
+    def verdict(self) -> str:
+        """Return the verdict in force, empty before the first."""
+        return self.calibration.verdict.value if self.calibration else ''
+
+    def _touch(self, leg: KeptLeg, event: str) -> None:
+        self.leg_id, self.start_ns, self.stop_ns = leg.leg_id, leg.start_ns, leg.stop_ns
+        self.event = event
+
+    def _settle(self, calibration: Calibration | None) -> None:
+        self.calibration, self.trouble = calibration, ''
+        if calibration is None:
+            self.state = State.IDLE
+        elif calibration.verdict is Verdict.REJECTED:
+            self.state = State.REJECTED
+        else:
+            self.state = State.CALIBRATED

@@ -1,0 +1,43 @@
+"""One thread for the heavy work, so that callbacks stay short."""
+
+from collections.abc import Callable
+import queue
+import threading
+
+
+class Worker:
+    """
+    Runs jobs one after the other in a thread of its own.
+
+    ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
+    the job itself ever runs beside the callbacks. The thread is a daemon: a node told to end does
+    not wait for a computation.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._done: queue.SimpleQueue = queue.SimpleQueue()
+        threading.Thread(target=self._run, name='odocal_worker', daemon=True).start()
+
+    def submit(self, job: Callable[[], object],
+               then: Callable[[object, Exception | None], None]) -> None:
+        """Run ``job()``; ``poll`` will call ``then(result, error)`` with one of them None."""
+        self._jobs.put((job, then))
+
+    def poll(self) -> None:
+        """Call what was to follow each job that has ended."""
+        while not self._done.empty():
+            then, result, error = self._done.get()
+            then(result, error)
+
+    def close(self) -> None:
+        """Let the thread end after the job it is at."""
+        self._jobs.put(None)
+
+    def _run(self) -> None:
+        while (entry := self._jobs.get()) is not None:
+            job, then = entry
+            try:
+                self._done.put((then, job(), None))
+            except Exception as error:  # every failure of a job is an answer to the operator
+                self._done.put((then, None, error))

@@ -1,0 +1,70 @@
+"""A small rclpy player: publishes serialised messages by their stamps, N times real time."""
+
+from dataclasses import dataclass
+import importlib
+import time
+
+import numpy as np
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from odocal_ros.bagio import encode
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One message: when (ns on the sensors' clock), where, what."""
+
+    stamp_ns: int
+    slot: str
+    raw: bytes
+
+
+def sent_of(slot: str, topic: encode.Topic) -> list[Sent]:
+    """Return the messages of a topic, serialised."""
+    packed = topic.pack(slice(0, len(topic.time_ns)))
+    return [Sent(int(t), slot, row.tobytes()) for t, row in zip(topic.time_ns, packed,
+                                                                strict=True)]
+
+
+def messages_of(drive) -> tuple[dict[str, str], list[Sent]]:
+    """Return slot -> message type and all messages of a drive with a speed odometer, in order."""
+    topics = {'imu': encode.imu('imu/data', drive.imu),
+              'odometer': encode.twist('odometer', drive.odometer),
+              'fix': encode.fix('fix', drive.fix)}
+    sent = [one for slot, topic in topics.items() for one in sent_of(slot, topic)]
+    return ({slot: topic.msgtype for slot, topic in topics.items()},
+            sorted(sent, key=lambda one: one.stamp_ns))
+
+
+class Player:
+    """Publishes; ``play`` returns when the last message asked for is out."""
+
+    def __init__(self, node, types: dict[str, str], names: dict[str, str] | None = None) -> None:
+        names = {'imu': 'imu/data', 'odometer': 'odometer', 'fix': 'fix'} | (names or {})
+        qos = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+        self.publishers = {}
+        for slot, msgtype in types.items():
+            package, folder, name = msgtype.split('/')
+            kind = getattr(importlib.import_module(f'{package}.{folder}'), name)
+            self.publishers[slot] = node.create_publisher(kind, names[slot], qos)
+
+    def matched(self) -> bool:
+        """Return whether every topic has a subscriber."""
+        return all(p.get_subscription_count() for p in self.publishers.values())
+
+    def play(self, messages: list[Sent], speed: float) -> None:
+        """Publish messages in the rhythm of their stamps, ``speed`` times real time."""
+        if not messages:
+            return
+        begin, first_ns = time.monotonic(), messages[0].stamp_ns
+        for one in messages:
+            ahead = (one.stamp_ns - first_ns) * 1e-9 / speed - (time.monotonic() - begin)
+            if ahead > 0.001:
+                time.sleep(ahead)
+            self.publishers[one.slot].publish(one.raw)
+
+
+def part(messages: list[Sent], first_s: float, last_s: float) -> list[Sent]:
+    """Return the messages between two times, seconds from the first message."""
+    times = (np.array([one.stamp_ns for one in messages]) - messages[0].stamp_ns) * 1e-9
+    return [one for one, t in zip(messages, times, strict=True) if first_s <= t < last_s]

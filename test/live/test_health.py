@@ -1,0 +1,160 @@
+"""Health of an input, and what is seen while driving: figures from made-up arrivals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odocal_ros.config import Config, with_settings
+from odocal_ros.live.health import Health
+from odocal_ros.live.progress import Clocks, FixPath, nominal_scale, Travel
+from odocal_ros.samples import FixSamples, OdometerForm, OdometerSamples
+
+SECOND = 1_000_000_000
+COUNTER = OdometerForm('cumulative', 2**16, 'm/pulse')
+
+
+def rows(stamps_s, values=None, received_s=None):
+    stamps = np.round(np.asarray(stamps_s, float) * SECOND).astype(np.int64)
+    received = stamps if received_s is None else np.round(np.asarray(received_s) * SECOND)
+    values = np.zeros(len(stamps)) if values is None else values
+    return OdometerSamples(stamps, received.astype(np.int64), np.asarray(values))
+
+
+def test_rate_is_by_stamps_and_zero_when_silent():
+    health = Health()
+    for begin in range(0, 100, 10):  # 50 Hz, blocks of ten
+        health.arrived([None] * 10, now_ns=5 * SECOND)
+        health.decoded(rows(100 + (begin + np.arange(10)) * 0.02))
+    assert health.rate_hz(5 * SECOND) == pytest.approx(50.0)
+    assert health.rate_hz(7 * SECOND + 1) == 0.0  # 2 s of silence at 50 Hz is the end
+
+
+def test_slow_topics_are_allowed_longer_silence():
+    health = Health()
+    health.arrived([None] * 3, now_ns=SECOND)
+    health.decoded(rows([0.5, 1.5, 2.5]))
+    assert health.flowing(SECOND + 4 * SECOND)       # 5 intervals of 1 s
+    assert not health.flowing(SECOND + 6 * SECOND)
+
+
+def test_losses_are_counted_by_sequence_numbers_across_batches():
+    health = Health()
+    health.arrived([5, 6, 9], now_ns=1)   # 7 and 8
+    health.arrived([10, 12], now_ns=2)    # 11
+    assert health.lost == 3
+
+
+def test_two_publishers_or_a_restart_are_no_loss():
+    health = Health()
+    health.arrived([5, 900, 6, 901], now_ns=1)
+    health.arrived([1, 2], now_ns=2)
+    assert health.lost == 0
+
+
+def test_gaps_by_limit_and_by_median():
+    health = Health()
+    health.decoded(rows([1.0, 1.01, 1.6]), max_gap_s=0.5)
+    assert health.gaps == 1
+    other = Health()
+    other.decoded(rows(np.arange(1, 2, 0.1)))
+    other.decoded(rows([2.0, 2.45, 2.99]))  # 0.54 s is more than 5 of 0.1 s, 0.45 s is not
+    assert other.gaps == 1
+
+
+def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
+    health = Health()
+    health.decoded(rows([10.0, 10.1]))
+    health.decoded(rows([3.0, 10.2]))
+    assert not health.jumped_back
+    health.decoded(rows([2.0, 2.1]))
+    assert health.jumped_back
+    health.forget()
+    health.decoded(rows([2.2]))
+    assert (health.jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
+
+
+def test_zero_stamps_do_not_count_as_flowing():
+    health = Health()
+    health.arrived([1], now_ns=SECOND)
+    health.decoded(rows([0.0]))
+    assert not health.flowing(SECOND)
+
+
+def test_distance_survives_a_rollover_however_blocks_are_cut():
+    counts = np.array([65000, 65300, 64, 364, 664]) # 300 counts each, over 65536
+    for cut in range(1, 5):
+        travel = Travel(COUNTER)
+        travel.feed(rows(np.arange(cut), counts[:cut]), 0.02)
+        travel.feed(rows(np.arange(cut, 5), counts[cut:]), 0.02)
+        assert travel.total == 1200
+
+
+def test_a_counter_reset_is_not_distance():
+    travel = Travel(OdometerForm('cumulative', 2**64, 'm/pulse'))
+    travel.feed(rows([0, 1, 2, 3], np.array([900000, 900100, 0, 100])), 0.02)
+    assert travel.total == 200  # 18 km in a second is a reset
+
+
+@pytest.mark.parametrize(('quantity', 'unit', 'values', 'metres'), [
+    ('increment', 'm/pulse', np.array([7, 10, 10]), 0.4),   # the first row's belongs to before
+    ('rate', '1', np.array([2.0, 2.0, 3.0]), 5.0),
+    ('cumulative', 'm/rad', np.array([1.0, 2.0, 4.0]), 0.9),
+])
+def test_every_quantity_gives_metres(quantity, unit, values, metres):
+    scale = {'m/pulse': 0.02, '1': 1.0, 'm/rad': 0.3}[unit]
+    travel = Travel(OdometerForm(quantity, 0, unit))
+    travel.feed(rows([0, 1, 2], values), scale)
+    assert travel.total * scale == pytest.approx(metres)
+
+
+def test_standing_is_told_from_moving_and_a_flickering_count_is_standing():
+    travel = Travel(COUNTER)
+    travel.feed(rows([0, 1, 2, 3, 4, 5], np.array([0, 100, 200, 200, 201, 201])), 0.02)
+    assert travel.still_s() == pytest.approx(3.0)
+    travel.feed(rows([6], np.array([301])), 0.02)
+    assert travel.still_s() == 0.0
+
+
+def test_fix_path_counts_steps_not_noise():
+    north = 1e-7 * np.array([0.0, 1.0, 0.0, 1.0, 0.0])     # 0.6 m of jitter
+    drive = np.concatenate([north, 10e-7 * np.arange(1, 11)])  # then 63.7 m in 6.4 m steps
+    n = len(drive)
+    block = FixSamples(np.arange(n) * SECOND, np.arange(n) * SECOND, 0.7 + drive, np.full(n, 0.1),
+                       np.zeros(n), np.tile(np.eye(3) * 0.25, (n, 1, 1)), np.full(n, 2),
+                       np.zeros(n))
+    path = FixPath()
+    speed = path.feed(block, 0)
+    assert path.total == pytest.approx(63.6, abs=0.7)   # the jitter may shift the first anchor
+    assert speed == pytest.approx(6.36, abs=0.7)
+    nothing = FixPath()
+    nothing.feed(replace(block, status=np.full(n, -1)), 0)
+    assert nothing.total == 0.0
+
+
+def test_clocks_are_compared_between_rows_that_arrived_together():
+    clocks, config = Clocks(), Config()
+    for i in range(5):
+        arrival = 1000.0 + i + np.arange(10) * 0.1
+        # played ten times faster than real time, on a foreign clock: no difference between topics
+        clocks.feed('imu', rows((arrival - 1000) * 10 + 50, received_s=arrival))
+        clocks.feed('fix', rows([(arrival[4] - 1000) * 10 + 50 - 0.3], received_s=[arrival[4]]))
+        clocks.feed('odometer', rows([(arrival[4] - 1000) * 10 + 50.7], received_s=[arrival[4]]))
+    (slot, ahead), = clocks.differing(config)
+    assert (slot, ahead) == ('odometer', pytest.approx(0.7, abs=1e-6))
+    mended = with_settings(config, {'odometer.time_offset': -0.7})
+    assert clocks.differing(mended) == []
+    assert [s for s, _ in clocks.differing(with_settings(mended, {'imu.time_offset': 0.9}))] == [
+        'fix', 'odometer']
+
+
+def test_scale_for_the_hint_comes_from_what_is_known_best():
+    config = with_settings(Config(), {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
+    angle, speed = OdometerForm('cumulative', 0, 'm/rad'), OdometerForm('rate', 0, '1')
+    assert nominal_scale(Config(), COUNTER) == 0.0
+    assert nominal_scale(config, COUNTER) == pytest.approx(2 * np.pi * 0.003)
+    assert nominal_scale(config, angle) == 0.3
+    assert nominal_scale(config, speed) == 1.0
+    named = with_settings(config, {'odometer.nominal_scale': 0.019})
+    assert nominal_scale(named, COUNTER) == 0.019
+    assert nominal_scale(named, COUNTER, found=0.0188) == 0.0188

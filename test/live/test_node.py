@@ -1,0 +1,268 @@
+"""The node as a process, driven over real DDS: one drive, marked and calibrated."""
+
+import json
+import math
+from types import SimpleNamespace
+
+from conftest import answer_of, wait_for
+from player import messages_of, part, Player
+import pytest
+
+from odocal_ros.config import Config, with_settings
+from odocal_ros.leg import LegRecorder
+from odocal_ros.messages import make_reader
+from odocal_ros.output.files import as_json
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.reasons import Verdict
+from odocal_ros.sim.scenarios import simulate, SimOptions
+
+SPEED = 30.0            # times real time: 2400 messages a second
+HEADING = 0.7           # rad, a heading of its own makes the yaw separable
+SETTINGS = {'alignment.heading_source': 'fixed', 'alignment.heading_sigma': 0.002}
+KEYS = ('state leg_id leg_start_ns leg_stop_ns leg_event distance_m duration_s imu_rate_hz '
+        'odometer_rate_hz fix_rate_hz scale_factor scale_factor_sigma yaw_mounting_angle_rad '
+        'yaw_mounting_angle_sigma_rad verdict hint').split()
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """A straight drive with stamped messages only: 60 s of rest, 60 s of driving, 60 s of rest."""
+    simulated = simulate(SimOptions(
+        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
+        fix_noise='rtk', imu_grade='tactical', heading=HEADING))
+    types, sent = messages_of(simulated)
+    heading = simulated.truth.heading
+    return SimpleNamespace(simulated=simulated, types=types, sent=sent, heading=heading)
+
+
+@pytest.fixture(scope='module')
+def session(drive, tmp_path_factory, module_domain):
+    """Drive two legs through one node and keep everything it said; the tests then look."""
+    from conftest import Client, NodeProcess
+    folder = tmp_path_factory.mktemp('results')
+    settings = [x for name, value in SETTINGS.items() for x in ('-p', f'{name}:={value}')]
+    node = NodeProcess('-p', f'output.directory:={folder}', '-p',
+                       f'alignment.heading:={drive.heading!r}', *settings)
+    client = Client()
+    seen = SimpleNamespace(node=node, client=client, folder=folder)
+    try:
+        _early(seen, client)
+        player = Player(client.node, drive.types)
+        wait_for(player.matched, 'subscriptions of the node')
+        _first_leg(seen, client, player, drive.sent)
+        _second_leg(seen, client, player, drive.sent)
+        _undone(seen, client)
+        yield seen
+    finally:
+        seen.code = node.end()
+        client.close()
+
+
+def _early(seen, client):
+    """Call everything before there is anything."""
+    seen.waiting = client.until(state='waiting')
+    seen.early = {name: client.call(name) for name in
+                  ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'save', 'reset')}
+
+
+def _first_leg(seen, client, player, sent):
+    player.play(part(sent, 45, 60), SPEED)
+    seen.idle = client.until(state='idle')
+    client.events.clear()
+    seen.start = client.call('start_leg')
+    seen.again = client.call('start_leg')
+    seen.undo_in_leg = client.call('undo_leg')
+    seen.set_in_leg = client.set(leg__min_distance=50.0)
+    player.play(part(sent, 60, 115), SPEED)
+    seen.recording = client.until(state='recording')
+    stopping = client.ask('stop_leg')
+    client.until(state='computing')
+    player.play(part(sent, 115, 117), SPEED)
+    seen.stop = answer_of(stopping)
+    seen.calibrated = client.until(state='calibrated')
+    seen.saved = client.until(state='calibrated', saved=wait_for(
+        lambda: client.status['saved'], 'the saved folder'))
+    seen.results = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
+    wait_for(lambda: len(client.paths) == 2 and client.paths['reference'].poses, 'paths')
+    seen.paths = dict(client.paths)
+    seen.result_events = [e for e in client.events if any(
+        p.name.startswith('result.') for p in e.changed_parameters)]
+    seen.idle_stop = client.call('stop_leg')
+    seen.set_result = client.set(result__scale_factor=2.0)
+    seen.set_between = client.set(leg__min_distance=50.0)
+
+
+def _second_leg(seen, client, player, sent):
+    seen.second_start = client.call('start_leg')
+    seen.cancel = client.call('cancel_leg')
+    seen.cancelled = client.until(leg_event='cancelled')
+    client.call('start_leg')
+    player.play(part(sent, 117, 125), SPEED)
+    stopping = client.ask('stop_leg')
+    player.play(part(sent, 125, 127), SPEED)
+    seen.second = answer_of(stopping)
+    seen.two_legs = client.until(leg_id='3', leg_event='stopped', legs='2')
+
+
+def _undone(seen, client):
+    seen.undo = client.call('undo_leg')
+    seen.after_undo = client.until(leg_event='undone', legs='1')
+    seen.results_after_undo = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
+    seen.save = client.call('save')
+    seen.reset = client.call('reset')
+    seen.after_reset = client.until(legs='0')
+    seen.results_after_reset = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
+
+
+RESULTS = ['result.' + name for name in (
+    'scale_factor scale_factor_sigma scale_ratio scale_ratio_sigma yaw_mounting_angle '
+    'yaw_mounting_angle_sigma pitch_mounting_angle pitch_mounting_angle_sigma legs valid stamp'
+).split()]
+
+
+def replayed(drive, status):
+    """Compute the leg that a status marks from the recorded messages, read as one block each."""
+    config = with_settings(Config(), SETTINGS | {'alignment.heading': drive.heading})
+    recorder = LegRecorder()
+    heard = part(drive.sent, 45, 117)
+    for slot, msgtype in drive.types.items():
+        reader = make_reader(slot, msgtype, config)
+        mine = [one for one in heard if one.slot == slot]
+        for name, block in reader.rows([one.raw for one in mine], [one.stamp_ns for one in mine],
+                                       None):
+            recorder.feed(name, block)
+        recorder.form = reader.form or recorder.form
+    leg = recorder.close(int(status['leg_start_ns']), int(status['leg_stop_ns']),
+                         config.leg.preroll)
+    return combine([calibrate(leg, config)], config), config
+
+
+def test_live_and_recorded_agree_in_every_digit(session, drive):
+    calibration, config = replayed(drive, session.calibrated)
+    assert calibration.verdict is not Verdict.REJECTED
+    results = session.results
+    for name in ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle'):
+        estimate = calibration.estimates[name]
+        for key, value in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
+            live = results[f'result.{key}']
+            assert live == value or math.isnan(live) and value is None, key
+    written = json.loads((session.folder / 'latest' / 'calibration.json').read_text())
+    offline = json.loads(json.dumps(as_json(calibration, config, [], '')))
+    for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
+        assert written[part_of] == offline[part_of], part_of
+
+
+def test_the_result_is_the_truth(session, drive):
+    truth, results = drive.simulated.truth, session.results
+    for name, true in (('scale_factor', truth.scale), ('yaw_mounting_angle', truth.yaw)):
+        sigma = results[f'result.{name}_sigma']
+        assert abs(results[f'result.{name}'] - true) < 4 * sigma  # 1 in 16000 by chance
+
+
+def test_nothing_was_lost(session, drive):
+    heard = part(drive.sent, 45, 127)
+    for slot, name in (('imu', 'imu'), ('odometer', 'odometer'), ('fix', 'gnss')):
+        count = str(sum(one.slot == slot for one in heard))
+
+        def complete(name=name, count=count):
+            health = session.client.health.get(f'calibrator: {name}', {})
+            return health if health.get('messages') == count else None
+        health = wait_for(complete, f'{count} messages of {name}')
+        assert (health['dropped'], health['unreadable']) == ('0', '0')
+
+
+def test_before_anything_came_every_command_says_what_to_do(session):
+    words = {'start_leg': 'no Imu on /imu/data: 0 publishers found', 'stop_leg': '~/start_leg',
+             'cancel_leg': 'no leg is running', 'undo_leg': 'no leg to undo',
+             'save': 'nothing to save'}
+    for name, text in words.items():
+        assert not session.early[name].success
+        assert text in session.early[name].message, name
+    assert session.early['reset'].success
+    assert session.waiting['level'] == b'\x03'  # STALE: nothing has ever come
+    assert 'imu/data' in session.waiting['hint']
+
+
+def test_start_and_stop_answer(session):
+    assert session.start.success
+    assert session.again.success
+    assert session.again.message.startswith('recording since 2025-06-15T')
+    assert session.stop.success
+    for words in ('scale factor', 'yaw mounting', 'deg', '1 of 1 leg good',
+                  session.calibrated['verdict']):
+        assert words in session.stop.message
+    assert session.idle_stop.success
+    assert session.idle_stop.message.endswith(session.stop.message)
+
+
+def test_status_has_every_key_and_bare_numbers(session):
+    for status in (session.waiting, session.recording, session.calibrated):
+        assert status['name'] == 'calibrator: calibration'
+        assert set(KEYS) <= set(status)
+        for key in KEYS:
+            if key not in ('state', 'leg_event', 'verdict', 'hint'):
+                float(status[key])
+    assert session.idle['hint'] == 'call ~/start_leg'
+    assert session.recording['leg_stop_ns'] == '0'
+    assert session.calibrated['leg_event'] == 'stopped'
+    # 55 s after a mark set at the start of the drive; the player is 1.5 Imu rows ahead at most
+    assert float(session.calibrated['duration_s']) == pytest.approx(55, abs=1)
+    assert float(session.recording['imu_rate_hz']) == pytest.approx(50, rel=0.01)
+    assert float(session.recording['odometer_rate_hz']) == pytest.approx(25, rel=0.02)
+    assert float(session.recording['fix_rate_hz']) == pytest.approx(5, rel=0.07)
+
+
+def test_live_distance_is_near_the_computed_one(session):
+    live, final = (float(s['distance_m']) for s in (session.recording, session.calibrated))
+    # nominal scale 2 % low, and the last status up to half a second old at 30 times 12 m/s
+    assert final * 0.97 - 190 < live < final * 0.99
+
+
+def test_parameters_are_frozen_during_a_leg(session):
+    assert not session.set_in_leg.successful
+    assert 'frozen' in session.set_in_leg.reason
+    assert not session.set_result.successful
+    assert 'set by the node' in session.set_result.reason
+    assert session.set_between.successful
+
+
+def test_results_are_set_in_one_event(session):
+    event, = session.result_events
+    assert sorted(p.name for p in event.changed_parameters) == sorted(RESULTS)
+    assert session.results['result.valid'] is True
+    assert session.results['result.legs'] == 1
+    assert session.results['result.stamp'].endswith('Z')
+
+
+def test_paths_are_latched_and_decimated(session, connect):
+    for path in session.paths.values():
+        assert path.header.frame_id == 'odocal_enu'
+        assert 100 < len(path.poses) <= 2000
+    end = session.paths['dead_reckoning'].poses[-1].pose.position
+    length = math.hypot(end.x, end.y)
+    assert length == pytest.approx(float(session.calibrated['distance_m']), rel=0.02)
+
+
+def test_cancelled_and_undone_legs_are_marked(session):
+    assert session.cancel.success
+    assert session.cancelled['leg_id'] == '2'
+    assert session.two_legs['leg_ids'] == '1,3'
+    assert 'leg 3, ' in session.second.message
+    assert session.undo.success
+    assert session.after_undo['leg_id'] == '3'
+    # the stamp says when it was set; all else is as after the first leg, to the last digit
+    before, after = ({k: v for k, v in r.items() if k != 'result.stamp'}
+                     for r in (session.results, session.results_after_undo))
+    assert after == before
+
+
+def test_save_and_reset(session):
+    assert session.save.success
+    folders = sorted(p for p in session.folder.iterdir() if not p.is_symlink())
+    assert len(folders) >= 2                 # autosave of each good leg, and ~/save
+    saved = session.save.message.removeprefix('saved to ')
+    assert (session.folder / 'latest').resolve() == type(session.folder)(saved).resolve()
+    assert session.reset.message == 'reset: 1 leg dropped'
+    assert session.after_reset['leg_event'] == 'undone'
+    assert session.results_after_reset['result.valid'] is False
+    assert math.isnan(session.results_after_reset['result.scale_factor'])

@@ -1,0 +1,118 @@
+"""The operator's session: every command in every state."""
+
+import pytest
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.config import Config
+from odocal_ros.live.session import Refused, Session, State
+from odocal_ros.reasons import Code, Reason
+
+CONFIG = Config()
+
+
+def result(start_ns=1, stop_ns=2):
+    return LegResult(start_ns=start_ns, stop_ns=stop_ns, distance=1.0, duration=1.0,
+                     imu_samples=0, pulses=0, fixes=0, rejected_fixes=0, reasons=(), methods={})
+
+
+def calibration(*codes):
+    return Calibration(tuple(Reason(c, 'seen') for c in codes), {}, {}, ())
+
+
+def with_legs(count):
+    session = Session()
+    for leg in range(count):
+        session.start(10 * leg + 1, CONFIG)
+        session.stop(10 * leg + 5)
+        session.finish(result(), calibration())
+    return session
+
+
+def test_a_leg_goes_from_mark_to_mark():
+    session = Session()
+    session.start(100, CONFIG)
+    assert (session.state, session.event, session.leg_id) == (State.RECORDING, 'started', 1)
+    assert (session.start_ns, session.stop_ns) == (100, 0)
+    session.stop(200)
+    assert (session.state, session.event, session.stop_ns) == (State.COMPUTING, 'stopped', 200)
+    session.finish(result(), calibration())
+    assert session.state is State.CALIBRATED
+    assert session.verdict() == 'accepted'
+
+
+def test_a_rejecting_reason_makes_the_state_rejected_and_keeps_the_leg():
+    session = Session()
+    session.start(1, CONFIG)
+    session.stop(2)
+    session.finish(result(), calibration(Code.LEG_TOO_SHORT))
+    assert session.state is State.REJECTED
+    assert len(session.legs) == 1
+
+
+def test_a_failed_leg_stays_until_retried_or_cancelled():
+    session = with_legs(1)
+    session.start(50, CONFIG)
+    session.stop(60)
+    session.fail('no memory')
+    assert (session.state, session.open_leg, session.busy) == (State.FAILED, True, False)
+    with pytest.raises(Refused, match='leg 2 failed and is kept.*~/stop_leg.*~/cancel_leg'):
+        session.start(70, CONFIG)
+    session.retry(CONFIG)
+    assert session.state is State.COMPUTING
+    session.fail('no memory')
+    session.cancel()
+    assert (session.state, session.event, len(session.legs)) == (State.CALIBRATED, 'cancelled', 1)
+
+
+def test_cancel_gives_back_the_state_before_the_leg():
+    session = Session()
+    session.start(1, CONFIG)
+    session.cancel()
+    assert (session.state, session.event, session.legs) == (State.IDLE, 'cancelled', [])
+    session.start(2, CONFIG)
+    assert session.leg_id == 2  # ids are never used twice: replay would mix the legs up
+
+
+def test_undo_takes_the_last_leg_and_shows_its_marks():
+    session = with_legs(2)
+    left = session.begin_undo()
+    assert [leg.leg_id for leg in left] == [1]
+    assert (session.leg_id, session.start_ns, session.stop_ns) == (2, 11, 15)
+    assert (session.event, session.state) == ('undone', State.COMPUTING)
+    session.finish_undo(calibration(Code.LEG_TOO_SHORT))
+    assert session.state is State.REJECTED
+    assert session.begin_undo() == []
+    assert (session.state, session.calibration) == (State.IDLE, None)
+
+
+def test_reset_drops_all_legs():
+    session = with_legs(3)
+    assert [leg.leg_id for leg in session.begin_reset()] == [1, 2, 3]
+    assert (session.legs, session.calibration, session.state) == ([], None, State.IDLE)
+
+
+@pytest.mark.parametrize(('command', 'words'), [
+    (lambda s: s.stop(1), 'no leg is running: call ~/start_leg first'),
+    (lambda s: s.cancel(), 'no leg is running'),
+    (lambda s: s.begin_undo(), 'no leg to undo'),
+])
+def test_an_idle_session_refuses(command, words):
+    with pytest.raises(Refused, match=words):
+        command(Session())
+
+
+@pytest.mark.parametrize('command', [Session.begin_undo, Session.begin_reset])
+def test_an_open_leg_must_be_ended_first(command):
+    session = with_legs(1)
+    session.start(50, CONFIG)
+    with pytest.raises(Refused, match='leg 2 is open: end it with ~/stop_leg or ~/cancel_leg'):
+        command(session)
+
+
+def test_no_start_and_no_cancel_while_an_undo_is_computed():
+    session = with_legs(2)
+    session.begin_undo()
+    with pytest.raises(Refused, match='is being computed'):
+        session.start(90, CONFIG)
+    with pytest.raises(Refused, match='no leg is running'):
+        session.cancel()
