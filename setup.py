@@ -51,7 +51,6 @@ setup(
             'pytest>=7.4',
             'ruff>=0.6',
             'scipy>=1.11',
-            'types-PyYAML',
         ],
     },
     entry_points={'console_scripts': [

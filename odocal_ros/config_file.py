@@ -19,7 +19,7 @@ WANTED = "'/**', '/**/calibrator', '/calibrator' or 'calibrator'"
 NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_description_service)$')
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
-WHOLE = re.compile(r'[-+]?(0[xX][0-9a-fA-F]+|\d+)')
+WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
 DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
 
@@ -156,11 +156,8 @@ def scalar(text: str) -> bool | int | float | str:
     """Return a plain scalar as rcl types it (measured on rcl 9.2)."""
     if text in TRUE or text in FALSE:
         return text in TRUE
-    if WHOLE.fullmatch(text):
-        digits = text.lstrip('+-')
-        base = 16 if digits[:2] in ('0x', '0X') else 8 if digits[0] == '0' and set(
-            digits) <= set('01234567') else 10
-        return int(text, base)
+    if whole := WHOLE.fullmatch(text):
+        return int(text, 16 if whole[1] else 8 if whole[2] else 10)
     dotted = DOTTED.fullmatch(text)
     try:
         return float(dotted[1] + dotted[2] if dotted else text) if '_' not in text else text

@@ -69,7 +69,7 @@ def settings_table() -> str:
     rows = ['| parameter | type | default | unit, values | meaning |', '|---|---|---|---|---|']
     for name, setting in SETTINGS.items():
         fixed = ' (ro)' if setting.read_only else ''
-        default = scalar_text(setting.default).replace("''", '`\'\'`')
+        default = scalar_text(setting.default).replace("''", "`''`")
         rows.append(f'| `{name}` | {TYPES[setting.kind]}{fixed} | {default} | {limits(setting)} | '
                     f'{setting.about} |')
     return '\n'.join(rows)

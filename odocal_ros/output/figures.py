@@ -10,7 +10,8 @@ def decimals(sigma: float) -> int:
     return max(0, min(12, 1 - math.floor(math.log10(sigma))))
 
 
-def with_sigma(value: float, sigma: float | None, factor: float = 1.0, signed: bool = False) -> str:
+def with_sigma(value: float, sigma: float | None, factor: float = 1.0,
+               signed: bool = False) -> str:
     """Return 'value ± sigma', both times ``factor``, with the digits that the sigma leaves."""
     if not math.isfinite(value):
         return 'unknown'

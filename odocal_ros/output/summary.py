@@ -1,6 +1,6 @@
 """A calibration in words: one screen for a terminal, one sentence for an answer."""
 
-from datetime import datetime, timezone
+from datetime import datetime, UTC
 import math
 import textwrap
 
@@ -121,7 +121,7 @@ def _leg_row(leg: LegResult):
     method = min(leg.methods.values(), key=lambda m: ORDER.index(m.verdict), default=None)
     estimates = {} if method is None else method.estimates
     scale, yaw = (estimates.get(n, NONE) for n in ('scale_factor', 'yaw_mounting_angle'))
-    started = datetime.fromtimestamp(leg.start_ns // 10**9, timezone.utc)
+    started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)
     return (f'{started:%m-%d %H:%M:%S}', length(leg.distance), f'{minutes}:{seconds:02d}',
             str(leg.fixes),

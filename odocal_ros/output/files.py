@@ -1,0 +1,153 @@
+"""
+Result files: calibration.json (schema 1) and what other programs load.
+
+A file is written whole or not at all: into a temporary one beside it, then renamed.
+"""
+
+import json
+import math
+import os
+from pathlib import Path
+import uuid
+
+import numpy as np
+
+from odocal_ros import __version__
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, TrackCheck
+from odocal_ros.config import Config, flat
+from odocal_ros.errors import BadUsage
+from odocal_ros.output import ros_files
+from odocal_ros.output.summary import overall
+
+SCHEMA = 1
+MAIN = 'calibration.json'
+# what every result names, determined or not; a scale's unit is known only with its data
+ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+          'pitch_mounting_angle': 'rad'}
+
+
+def as_json(calibration: Calibration, config: Config, inputs: list[dict], created: str) -> dict:
+    """
+    Return the content of calibration.json.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The combination of all legs.
+    config : Config
+        Settings it was made with.
+    inputs : list of dict
+        One a bag: its name, sha256 and topics.
+    created : str
+        ISO 8601 date and time.
+
+    Returns
+    -------
+    Plain dicts and lists, no NaN: a number that does not exist is None.
+
+    """
+    result: dict = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
+                    for name, unit in ALWAYS.items()}
+    result |= {name: e.as_dict() | {'method': e.method or None}
+               for name, e in calibration.estimates.items()}
+    result['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
+                              'rpy': calibration.imu_rotation_rpy}
+    checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
+              for name in ('before', 'after')}
+    return _plain({
+        'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
+        'verdict': calibration.verdict.value,
+        'reasons': [r.as_dict() for r in calibration.reasons],
+        'result': result,
+        'methods': {name: _method(m) for name, m in calibration.methods.items()},
+        'legs': [_leg(leg) for leg in calibration.legs],
+        'check': {name: _check(check) for name, check in checks.items()},
+        'inputs': inputs,
+        'config': flat(config)})
+
+
+def _method(method: MethodResult) -> dict:
+    # arrays among the details are for code, not for readers
+    more = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
+    return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
+            'estimates': {n: _estimate(e) for n, e in method.estimates.items()},
+            'correlation': {}, 'budget': {}} | more
+
+
+def _estimate(estimate: Estimate) -> dict:
+    return {'value': estimate.value, 'sigma': estimate.sigma, 'unit': estimate.unit}
+
+
+def _check(check: TrackCheck | None) -> dict | None:
+    if check is None:
+        return None
+    return {name: getattr(check, name)
+            for name in ('rms', 'max', 'mean', 'end', 'percent_of_distance')}
+
+
+def _leg(leg: LegResult) -> dict:
+    return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
+            'distance': leg.distance, 'duration': leg.duration, 'imu_samples': leg.imu_samples,
+            'pulses': leg.pulses, 'fixes': leg.fixes, 'rejected_fixes': leg.rejected_fixes,
+            'verdict': leg.verdict.value, 'reasons': [r.as_dict() for r in leg.reasons],
+            'methods': {name: _method(m) for name, m in leg.methods.items()},
+            'check': {'before': _check(leg.before), 'after': _check(leg.after)}}
+
+
+def _plain(value):
+    """Return a value as JSON knows it: no numpy, no tuples, None for what is not finite."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_results(calibration: Calibration, config: Config, directory: Path, inputs: list[dict],
+                  created: str, force: bool = False) -> list[Path]:
+    """
+    Write the result files and return their paths, calibration.json first.
+
+    Files of formats that this result does not give are removed, so that a folder never holds
+    parts of two calibrations.
+
+    Raises
+    ------
+    BadUsage
+        There is a calibration.json and no ``force``, or the folder cannot be written.
+
+    """
+    directory = Path(directory)
+    if (directory / MAIN).exists() and not force:
+        raise BadUsage(f'{directory / MAIN} exists; give another folder with --output, or '
+                       '--force to replace it')
+    content = as_json(calibration, config, inputs, created)
+    texts = {MAIN: json.dumps(content, indent=2, allow_nan=False) + '\n'}
+    texts |= ros_files.texts(calibration, config, content)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for name in ros_files.NAMES - set(texts):
+            (directory / name).unlink(missing_ok=True)
+        for name in sorted(texts, key=MAIN.__eq__):     # the main file last: it vouches for all
+            write_whole(directory / name, texts[name])
+    except OSError as error:
+        raise BadUsage(f'{directory}: results cannot be written ({error.strerror}); choose a '
+                       'folder that can (--output, or output.directory of the node)') from None
+    return [directory / name for name in texts]
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    temporary = path.with_name(f'.{path.name}.{uuid.uuid4().hex}')
+    try:
+        with temporary.open('x', encoding='utf-8') as f:
+            f.write(text)
+            f.flush()
+            os.fsync(f.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,45 @@
+"""What all tests share: real drives, and a ROS domain that no other process is in."""
+
+import os
+from pathlib import Path
+import random
+import socket
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get('ODOCAL_DATA') or ROOT.parent / 'shared' / 'data')
+
+
+def _own_domain():
+    """Take a ROS domain that no other test run holds; a bound port is the lock."""
+    for domain in random.SystemRandom().sample(range(1, 101), 100):
+        lock = socket.socket()
+        try:
+            lock.bind(('127.0.0.1', 22119 + domain))    # the ports that domain_coordinator uses
+        except OSError:
+            lock.close()
+            continue
+        return domain, lock
+    raise RuntimeError('all ROS domains are taken by other test runs')
+
+
+# at import, since rclpy and every process started by a test read them once
+DOMAIN, _lock = _own_domain()
+os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it would win
+
+
+def pytest_report_header() -> list[str]:
+    """Say at the top what the tests of real drives will find."""
+    found = DATA if DATA.is_dir() else f'MISSING at {DATA}: tests of real drives are skipped'
+    return [f'ROS domain: {DOMAIN}', f'real drives: {found}']
+
+
+@pytest.fixture(scope='session')
+def data_dir() -> Path:
+    """Return the folder of real recordings, or skip and say so."""
+    if not DATA.is_dir():
+        pytest.skip(f'NO REAL DATA at {DATA}: set ODOCAL_DATA to the folder of recordings')
+    return DATA
