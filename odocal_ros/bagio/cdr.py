@@ -1,0 +1,241 @@
+"""
+Decode many serialised messages at once with numpy, without a ROS or rosbags import.
+
+Messages whose variable parts (strings, lists) have the same lengths have their fields at the
+same bytes: one message tells the layout, the others are read as columns of one table. What has
+no such layout (big endian, unknown type, damaged) is left to the caller.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+import re
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_LAYOUTS = 16   # per call; a stream with more is odd enough to be read message by message
+KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
+         'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
+INDEXED = re.compile(r'(.+)\[(\d+)\]')
+
+
+def _each(kind: str, prefix: str, names: str) -> tuple[str, ...]:
+    return tuple(f'{kind} {prefix}.{name}' for name in names)
+
+
+def _twist(prefix: str) -> tuple[str, ...]:
+    return (_each('float64', f'{prefix}.linear', 'xyz')
+            + _each('float64', f'{prefix}.angular', 'xyz'))
+
+
+_HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
+_LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
+_DIM = ('string label', 'uint32 size', 'uint32 stride')
+
+# 'kind path', in order; kind[n] is an array, kind[] a list
+SCHEMAS: dict[str, tuple[str, ...]] = {
+    'sensor_msgs/msg/Imu': (
+        *_HEADER, *_each('float64', 'orientation', 'xyzw'), 'float64[9] orientation_covariance',
+        *_each('float64', 'angular_velocity', 'xyz'), 'float64[9] angular_velocity_covariance',
+        *_each('float64', 'linear_acceleration', 'xyz'),
+        'float64[9] linear_acceleration_covariance'),
+    'sensor_msgs/msg/NavSatFix': (
+        *_HEADER, 'int8 status.status', 'uint16 status.service', 'float64 latitude',
+        'float64 longitude', 'float64 altitude', 'float64[9] position_covariance',
+        'uint8 position_covariance_type'),
+    'sensor_msgs/msg/JointState': (
+        *_HEADER, 'string[] name', 'float64[] position', 'float64[] velocity', 'float64[] effort'),
+    'geometry_msgs/msg/Twist': (
+        *_each('float64', 'linear', 'xyz'), *_each('float64', 'angular', 'xyz')),
+    'geometry_msgs/msg/TwistStamped': (*_HEADER, *_twist('twist')),
+    'geometry_msgs/msg/TwistWithCovarianceStamped': (
+        *_HEADER, *_twist('twist.twist'), 'float64[36] twist.covariance'),
+    'nav_msgs/msg/Odometry': (
+        *_HEADER, 'string child_frame_id', *_each('float64', 'pose.pose.position', 'xyz'),
+        *_each('float64', 'pose.pose.orientation', 'xyzw'), 'float64[36] pose.covariance',
+        *_twist('twist.twist'), 'float64[36] twist.covariance'),
+    'std_msgs/msg/Int32MultiArray': (*_LAYOUT, 'int32[] data'),
+    'std_msgs/msg/Int64MultiArray': (*_LAYOUT, 'int64[] data'),
+} | {f'std_msgs/msg/{name}': (f'{name.lower()} data',) for name in (
+    'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
+
+
+@dataclass
+class Layout:
+    """Where the fields of one message lie, and which bytes all messages like it share."""
+
+    places: dict[str, tuple[int, str]] = field(default_factory=dict)       # offset, dtype
+    lists: dict[str, tuple[int, str, int]] = field(default_factory=dict)   # and how many values
+    texts: dict[str, list[str]] = field(default_factory=dict)              # lists of strings
+    fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
+    size: int = 4
+
+    @property
+    def names(self) -> list[str]:
+        """Return the list ``name`` (of joints), empty where there is none."""
+        return self.texts.get('name', [])
+
+    def count(self, path: str) -> int:
+        """Return how many values a list has, 0 if it is not there."""
+        return self.lists[path][2] if path in self.lists else 0
+
+    def find(self, path: str) -> tuple[int, str] | None:
+        """Return offset and dtype of a value, ``path[i]`` in a list; None if it is not there."""
+        if path in self.places:
+            return self.places[path]
+        match = INDEXED.fullmatch(path)
+        if match and int(match[2]) < self.count(match[1]):
+            offset, dtype, _ = self.lists[match[1]]
+            return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
+        return None
+
+
+def layout_of(msgtype: str, raw: bytes) -> Layout | None:
+    """Return the layout of one message; None where it cannot be read as columns."""
+    if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
+        return None
+    walk = _Walk(raw)
+    layout = walk.layout
+    try:
+        walk.fields(SCHEMAS[msgtype], '')
+    except (struct.error, ValueError):
+        return None
+    # longer is common: rclpy's serialize_message leaves whatever lay behind the message
+    return layout if layout.size <= len(raw) else None
+
+
+class _Walk:
+    """Walks over one message and notes where everything lies."""
+
+    def __init__(self, raw: bytes) -> None:
+        self.raw = raw
+        self.layout = Layout()
+
+    def fields(self, schema: Sequence[str], prefix: str) -> None:
+        for line in schema:
+            kind, path = line.split()
+            base, _, size = kind.partition('[')
+            if not size:
+                self.value(base, prefix + path, 1)
+            elif size == ']':
+                self.value(base, prefix + path, self.length(), listed=True)
+            else:
+                self.value(base, prefix + path, int(size[:-1]), listed=True)
+
+    def value(self, kind: str, path: str, count: int, listed: bool = False) -> None:
+        layout = self.layout
+        if kind == 'string':
+            texts = [self.text(listed) for _ in range(count)]
+            if listed:
+                layout.texts[path] = texts
+        elif kind == 'dim':
+            for i in range(count):
+                self.fields(_DIM, f'{path}[{i}].')
+        else:
+            size = np.dtype(KINDS[kind]).itemsize
+            if count:
+                self.align(size)
+            if listed:
+                layout.lists[path] = (layout.size, KINDS[kind], count)
+            else:
+                layout.places[path] = (layout.size, KINDS[kind])
+            layout.size += size * count
+            if layout.size > len(self.raw):
+                raise ValueError(path)
+
+    def align(self, size: int) -> None:
+        self.layout.size += (4 - self.layout.size) % size   # counted from after the four bytes
+
+    def length(self) -> int:
+        self.align(4)
+        at = self.layout.size
+        (length,) = struct.unpack_from('<I', self.raw, at)
+        if length > len(self.raw):
+            raise ValueError('length')
+        self.layout.fixed.append((at, at + 4))
+        self.layout.size += 4
+        return length
+
+    def text(self, keep: bool) -> str:
+        """Pass a string; ``keep``: it is part of what all messages of this layout share."""
+        length = self.length()
+        at = self.layout.size
+        self.layout.size += length
+        if self.layout.size > len(self.raw):
+            raise ValueError('string')
+        if keep:
+            self.layout.fixed.append((at, at + length))
+        return self.raw[at:at + length - 1].decode() if keep and length else ''
+
+
+Rows = NDArray[np.intp]
+Table = NDArray[np.uint8]
+
+
+def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None, Rows, Table]]:
+    """
+    Sort messages by layout.
+
+    Yields
+    ------
+    Layout, row numbers (n,) and the messages' bytes (n, size); the rows that have no layout come
+    last, with None and an empty table.
+
+    """
+    lengths = np.fromiter(map(len, raws), np.intp, len(raws))
+    odd: list[Rows] = []
+    for size in dict.fromkeys(lengths.tolist()):
+        rows = np.flatnonzero(lengths == size)
+        all_alike = len(rows) == len(raws)
+        joined = b''.join(raws if all_alike else [raws[i] for i in rows.tolist()])
+        table = np.frombuffer(joined, np.uint8).reshape(len(rows), size)
+        for _ in range(MAX_LAYOUTS):
+            layout = layout_of(msgtype, table[0].tobytes())
+            alike = _alike(table, layout.fixed if layout else [(0, size)])
+            if alike.all():
+                yield from _either(layout, rows, table, odd)
+                break
+            yield from _either(layout, rows[alike], table[alike], odd)
+            rows, table = rows[~alike], table[~alike]
+        else:
+            odd.append(rows)
+    if odd:
+        yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
+
+
+def _either(layout, rows, table, odd):
+    if layout is None:
+        odd.append(rows)
+    else:
+        yield layout, rows, table
+
+
+def _alike(table: Table, fixed) -> NDArray[np.bool_]:
+    """Tell which rows equal the first one in the bytes that make a layout."""
+    alike = np.ones(len(table), bool)
+    for start, stop in fixed:
+        alike &= (table[:, start:stop] == table[0, start:stop]).all(axis=1)
+    return alike
+
+
+def columns(layout: Layout, table: Table, paths: Sequence[str]) -> NDArray | None:
+    """
+    Return the values at some paths.
+
+    Returns
+    -------
+    (n, len(paths)) array of the first path's dtype (a view where the values lie side by side);
+    None where a path is not in the layout.
+
+    """
+    places = [place for place in map(layout.find, paths) if place]
+    if len(places) < len(paths):
+        return None
+    offset, dtype = places[0]
+    item = np.dtype(dtype).itemsize
+    n, size = table.shape
+    if places == [(offset + i * item, dtype) for i in range(len(paths))]:
+        return np.ndarray((n, len(paths)), dtype, table.data, offset, (size, item))
+    return np.concatenate([np.ndarray((n, 1), dtype, table.data, offset, (size, item))
+                           for offset, dtype in places], axis=1)

@@ -1,0 +1,122 @@
+"""Messages for tests, made with rosbags' own types: random ones and the sensors of a drive."""
+
+from functools import lru_cache
+
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+
+
+@lru_cache
+def store():
+    """Return the Jazzy message types."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def kind(msgtype):
+    """Return the class of a message type."""
+    return store().types[msgtype]
+
+
+def cdr(message, little_endian=True):
+    """Return a message serialised."""
+    return bytes(store().serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+
+
+def deserializer(msgtype):
+    """Return the function that readers want, for one type."""
+    return lambda raw: store().deserialize_cdr(raw, msgtype)
+
+
+def header(stamp_ns=0, frame='imu_link'):
+    """Return a std_msgs/Header."""
+    time = kind('builtin_interfaces/msg/Time')(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return kind('std_msgs/msg/Header')(stamp=time, frame_id=frame)
+
+
+def vector(x=0.0, y=0.0, z=0.0):
+    """Return a geometry_msgs/Vector3."""
+    return kind('geometry_msgs/msg/Vector3')(x=float(x), y=float(y), z=float(z))
+
+
+def quaternion(x=0.0, y=0.0, z=0.0, w=1.0):
+    """Return a geometry_msgs/Quaternion."""
+    return kind('geometry_msgs/msg/Quaternion')(x=float(x), y=float(y), z=float(z), w=float(w))
+
+
+def imu(stamp_ns, w=(0, 0, 0), f=(0, 0, 9.81), q=(0, 0, 0, 1), covariance=None, frame='imu_link'):
+    """Return a sensor_msgs/Imu; covariance None: no orientation, as REP-145 has it."""
+    none = np.zeros(9)
+    first = np.array([-1.0] + [0.0] * 8) if covariance is None else np.array(covariance, float)
+    return kind('sensor_msgs/msg/Imu')(
+        header=header(stamp_ns, frame), orientation=quaternion(*q), orientation_covariance=first,
+        angular_velocity=vector(*w), angular_velocity_covariance=none,
+        linear_acceleration=vector(*f), linear_acceleration_covariance=none)
+
+
+def fix(stamp_ns, latitude, longitude, altitude=0.0, sigma=1.0, status=0, known=2):
+    """Return a sensor_msgs/NavSatFix, angles in degrees."""
+    return kind('sensor_msgs/msg/NavSatFix')(
+        header=header(stamp_ns, 'gps'),
+        status=kind('sensor_msgs/msg/NavSatStatus')(status=status, service=1),
+        latitude=float(latitude), longitude=float(longitude), altitude=float(altitude),
+        position_covariance=np.diag([sigma**2, sigma**2, 4 * sigma**2]).reshape(9),
+        position_covariance_type=known)
+
+
+def whole(value, name='Int64'):
+    """Return a std_msgs integer."""
+    return kind(f'std_msgs/msg/{name}')(data=value)
+
+
+def real(value, name='Float64'):
+    """Return a std_msgs float."""
+    return kind(f'std_msgs/msg/{name}')(data=float(value))
+
+
+def whole_array(values, name='Int32', labels=()):
+    """Return an Int32MultiArray or Int64MultiArray."""
+    dims = [kind('std_msgs/msg/MultiArrayDimension')(label=text, size=1, stride=1)
+            for text in labels]
+    layout = kind('std_msgs/msg/MultiArrayLayout')(dim=dims, data_offset=0)
+    return kind(f'std_msgs/msg/{name}MultiArray')(
+        layout=layout, data=np.array(values, np.int32 if name == 'Int32' else np.int64))
+
+
+def joints(stamp_ns, names, position=(), velocity=(), effort=(), frame=''):
+    """Return a sensor_msgs/JointState."""
+    return kind('sensor_msgs/msg/JointState')(
+        header=header(stamp_ns, frame), name=list(names), position=np.array(position, float),
+        velocity=np.array(velocity, float), effort=np.array(effort, float))
+
+
+def twist(x, y=0.0, z=0.0):
+    """Return a geometry_msgs/Twist."""
+    return kind('geometry_msgs/msg/Twist')(linear=vector(x, y, z), angular=vector(0, 0, 0.5))
+
+
+def twist_stamped(stamp_ns, x, y=0.0, z=0.0, frame='base_link'):
+    """Return a geometry_msgs/TwistStamped."""
+    return kind('geometry_msgs/msg/TwistStamped')(header=header(stamp_ns, frame),
+                                                  twist=twist(x, y, z))
+
+
+def twist_covariance(stamp_ns, x, y=0.0, z=0.0, variances=(0.0, 0.0, 0.0), frame='base_link'):
+    """Return a geometry_msgs/TwistWithCovarianceStamped."""
+    covariance = np.zeros((6, 6))
+    covariance[[0, 1, 2], [0, 1, 2]] = variances
+    inner = kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x, y, z),
+                                                          covariance=covariance.reshape(36))
+    return kind('geometry_msgs/msg/TwistWithCovarianceStamped')(header=header(stamp_ns, frame),
+                                                                twist=inner)
+
+
+def odometry(stamp_ns, x, child='base_link', frame='odom'):
+    """Return a nav_msgs/Odometry with a forward speed."""
+    point = kind('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)
+    pose = kind('geometry_msgs/msg/PoseWithCovariance')(
+        pose=kind('geometry_msgs/msg/Pose')(position=point, orientation=quaternion()),
+        covariance=np.arange(36.0))
+    return kind('nav_msgs/msg/Odometry')(
+        header=header(stamp_ns, frame), child_frame_id=child, pose=pose,
+        twist=kind('geometry_msgs/msg/TwistWithCovariance')(twist=twist(x),
+                                                            covariance=np.zeros(36)))
