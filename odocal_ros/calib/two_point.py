@@ -154,7 +154,8 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
     keep = (track.t >= chord.start.t) & (track.t <= chord.end.t)
     P = track.P[keep] - track.at(chord.start.t)
     start, end, M = chord.start, chord.end, chord.M
-    if not vertical_known:
+    if not vertical_known:       # the belief in the pitch stands in for the heights
+        fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
     C_nb = chord.track.C_nb_at(track.t[keep])
     K = float(np.linalg.norm(f))
