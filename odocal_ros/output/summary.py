@@ -29,22 +29,29 @@ def screen(calibration: Calibration) -> str:
 def sentence(calibration: Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
     estimates = calibration.estimates
-    scale = estimates.get('scale_factor', NONE)
+    scale = known(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
         parts.append('scale factor not determined')
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
-        parts.append(f'scale factor {with_sigma(scale.value, scale.sigma)} '
-                     f'{_unit(scale.unit)}{counts}')
+        parts.append(f'scale factor {_with_unit(scale)}{counts}')
     for name, word in ANGLES.items():
-        angle = estimates.get(name, NONE)
+        angle = known(estimates, name)
         parts.append(f'{word} mounting ' + (
             'not determined' if angle.value is None else
             f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
     used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
     legs = f'{used} of {len(calibration.legs)} leg{"s" * (len(calibration.legs) != 1)} good'
     return f'{calibration.verdict.value}: {", ".join(parts)}; {legs}'
+
+
+def known(estimates: dict[str, Estimate], name: str) -> Estimate:
+    """Return an estimate by name, with None in place of what is missing or no number."""
+    found = estimates.get(name, NONE)
+    value, sigma = (x if x is not None and math.isfinite(x) else None
+                    for x in (found.value, found.sigma))
+    return Estimate(value, sigma, found.unit)
 
 
 def inverse(scale: Estimate) -> str:
@@ -55,8 +62,9 @@ def inverse(scale: Estimate) -> str:
     return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
 
 
-def _unit(unit):
-    return '' if unit == '1' else unit
+def _with_unit(estimate):
+    unit = '' if estimate.unit == '1' else f' {estimate.unit}'
+    return with_sigma(estimate.value, estimate.sigma) + unit
 
 
 def _head(calibration):
@@ -69,7 +77,7 @@ def _head(calibration):
 
 def _values(calibration):
     estimates = calibration.estimates
-    scale, ratio = (estimates.get(n, NONE) for n in ('scale_factor', 'scale_ratio'))
+    scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in COUNTS:
         lines.append(_line('', inverse(scale)))
@@ -78,11 +86,11 @@ def _values(calibration):
         lines.append(_line('  against nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({ppm} ppm)'))
     for name, word in ANGLES.items():
-        lines.append(_line(f'{word} mounting', _angle_text(estimates.get(name, NONE))))
-    for name, estimate in estimates.items():
+        lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name))))
+    for name in estimates:
+        estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', *ANGLES) and estimate.value is not None:
-            lines.append(_line(name.replace('_', ' '),
-                               f'{with_sigma(estimate.value, estimate.sigma)} {estimate.unit}'))
+            lines.append(_line(name.replace('_', ' '), _with_unit(estimate)))
     if calibration.imu_rotation_rpy is not None:
         rpy = ', '.join(f'{angle * DEG:.3f}' for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
@@ -98,7 +106,7 @@ def _scale_text(scale):
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
         f'   ({scale.sigma / abs(scale.value) * PPM:.0f} ppm)')
-    return f'{with_sigma(scale.value, scale.sigma)} {_unit(scale.unit)}{relative}'
+    return _with_unit(scale) + relative
 
 
 def _angle_text(angle):
@@ -120,7 +128,7 @@ def _leg_table(legs):
 def _leg_row(leg: LegResult):
     method = min(leg.methods.values(), key=lambda m: ORDER.index(m.verdict), default=None)
     estimates = {} if method is None else method.estimates
-    scale, yaw = (estimates.get(n, NONE) for n in ('scale_factor', 'yaw_mounting_angle'))
+    scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)
     return (f'{started:%m-%d %H:%M:%S}', length(leg.distance), f'{minutes}:{seconds:02d}',

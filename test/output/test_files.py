@@ -1,0 +1,141 @@
+"""calibration.json and how files come to the disk."""
+
+import json
+
+import numpy as np
+import pytest
+
+from odocal_ros import __version__
+from odocal_ros.config import Config, SETTINGS, with_settings
+from odocal_ros.errors import BadUsage
+from odocal_ros.output import files
+from odocal_ros.output.files import as_json, write_results, write_whole
+
+CREATED = '2026-01-02T03:04:05+00:00'
+INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
+
+
+def test_json_has_the_fixed_shape(good):
+    content = as_json(good, Config(), INPUTS, CREATED)
+    assert list(content) == ['schema', 'software', 'created', 'verdict', 'reasons', 'result',
+                             'methods', 'legs', 'check', 'inputs', 'config']
+    assert content['schema'] == 1
+    assert content['software'] == f'odocal_ros {__version__}'
+    assert content['verdict'] == 'accepted'
+    assert content['reasons'][1] == {
+        'code': 'PITCH_NOT_DETERMINED', 'text': 'the fixes give no height',
+        'remedy': 'Use a receiver that gives ellipsoidal height.'}
+    assert content['result']['scale_factor'] == {
+        'value': 0.05, 'sigma': 1.2e-6, 'unit': 'm/pulse', 'method': 'two_point'}
+    assert content['result']['imu_rotation'] == {
+        'quaternion_xyzw': [0.0, 0.0, -0.0087, 0.99996], 'rpy': [0.0, 0.0, -0.0174533]}
+    assert content['inputs'] == INPUTS
+    assert list(content['config']) == list(SETTINGS)
+
+
+def test_json_of_a_method_and_a_leg(good):
+    content = as_json(good, Config(), INPUTS, CREATED)
+    method = content['methods']['two_point']
+    assert method['verdict'] == 'accepted'
+    assert method['correlation'] == {'scale_factor,yaw_mounting_angle': 0.25}
+    assert method['budget'] == {'fixes': {'scale_factor': 1e-6}}
+    assert method['estimates']['yaw_mounting_angle'] == {
+        'value': -0.0174533, 'sigma': 5e-5, 'unit': 'rad'}
+    assert 'f' not in method
+    leg, = content['legs']
+    assert leg['methods'] == content['methods']
+    assert {k: leg[k] for k in ('bag', 'start', 'stop', 'distance', 'duration', 'imu_samples',
+                                'pulses', 'fixes', 'rejected_fixes', 'verdict')} == {
+        'bag': 'drive', 'start': 1_533_200_000.5, 'stop': 1_533_200_600.5, 'distance': 11200.3,
+        'duration': 600.0, 'imu_samples': 120_000, 'pulses': 30_000, 'fixes': 3000,
+        'rejected_fixes': 4, 'verdict': 'accepted'}
+    assert leg['reasons'][0]['code'] == 'TOPIC_GAP'
+    assert content['check']['after'] == {'rms': 0.1, 'max': 0.3, 'mean': 0.09, 'end': 0.02,
+                                         'percent_of_distance': 1.8e-4}
+
+
+def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing):
+    content = as_json(good, Config(), [], CREATED)
+    assert content['result']['pitch_mounting_angle']['value'] is None
+    assert content['methods']['two_point']['odd'] is None
+    assert content['config']['imu.nominal_yaw'] is None
+    json.dumps(content, allow_nan=False)
+    empty = as_json(nothing, Config(), [], CREATED)
+    assert empty['verdict'] == 'rejected'
+    assert empty['result']['scale_factor'] == {'value': None, 'sigma': None, 'unit': None,
+                                               'method': None}
+    assert empty['check'] == {'before': None, 'after': None}
+    json.dumps(empty, allow_nan=False)
+
+
+def test_a_rejected_result_keeps_its_values(rejected):
+    content = as_json(rejected, Config(), [], CREATED)
+    assert content['verdict'] == 'rejected'
+    assert content['result']['scale_factor']['value'] == 0.05
+
+
+def test_numpy_arrays_in_inputs_and_details_become_lists():
+    assert files._plain({'a': np.arange(2), 'b': (np.float64(1.5), np.int64(2), np.inf)}) == {
+        'a': [0, 1], 'b': [1.5, 2, None]}
+
+
+def test_write_returns_what_lies_there(good, tmp_path):
+    written = write_results(good, Config(), tmp_path / 'deep' / 'out', INPUTS, CREATED)
+    assert written[0].name == 'calibration.json'
+    assert sorted(written) == sorted((tmp_path / 'deep' / 'out').iterdir())
+    assert json.loads(written[0].read_text()) == as_json(good, Config(), INPUTS, CREATED)
+
+
+def test_an_existing_result_is_kept_without_force(good, rejected, tmp_path):
+    write_results(good, Config(), tmp_path, INPUTS, CREATED)
+    before = (tmp_path / 'calibration.json').read_text()
+    with pytest.raises(BadUsage, match='calibration.json exists; give another folder'):
+        write_results(rejected, Config(), tmp_path, INPUTS, CREATED)
+    assert (tmp_path / 'calibration.json').read_text() == before
+    write_results(rejected, Config(), tmp_path, INPUTS, CREATED, force=True)
+    assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
+
+
+def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path):
+    (tmp_path / 'mine.txt').write_text('keep')
+    write_results(good, Config(), tmp_path, INPUTS, CREATED)
+    assert (tmp_path / 'imu_transform.urdf').exists()
+    write_results(nothing, Config(), tmp_path, INPUTS, CREATED, force=True)
+    assert {p.name for p in tmp_path.iterdir()} == {'calibration.json', 'calibration.yaml',
+                                                    'mine.txt'}
+
+
+def test_only_the_asked_formats_are_written(good, tmp_path):
+    config = with_settings(Config(), {'output.formats': ()})
+    written = write_results(good, config, tmp_path, INPUTS, CREATED)
+    assert [p.name for p in written] == ['calibration.json']
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(good, tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(BadUsage, match='results cannot be written'):
+        write_results(good, Config(), tmp_path / 'file' / 'out', INPUTS, CREATED)
+
+
+def test_a_write_that_breaks_off_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch):
+    path = tmp_path / 'a.json'
+    write_whole(path, 'old')
+
+    def full(fd):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(files.os, 'fsync', full)
+    with pytest.raises(OSError, match='No space'):
+        write_whole(path, 'new')
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_main_file_comes_last(good, tmp_path, monkeypatch):
+    order = []
+    whole = write_whole
+    monkeypatch.setattr(files, 'write_whole',
+                        lambda path, text: (order.append(path.name), whole(path, text)))
+    write_results(good, Config(), tmp_path, INPUTS, CREATED)
+    assert order[-1] == 'calibration.json'
+    assert len(order) > 3

@@ -1,0 +1,97 @@
+"""What a person reads: digits, words, and no nan."""
+
+from dataclasses import replace
+import math
+import re
+
+import pytest
+
+from odocal_ros.calib.result import Calibration, Estimate, TrackCheck
+from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.output.summary import overall, screen, sentence
+
+
+@pytest.mark.parametrize(('value', 'sigma', 'text'), [
+    (0.0500123456, 1.23e-6, '0.0500123 ± 0.0000012'),
+    (19.995, 0.00048, '19.99500 ± 0.00048'),
+    (1234.5, 56.0, '1234 ± 56'),
+    (1234.5, 5.6, '1234.5 ± 5.6'),
+    (0.5, 0.0, '0.500000 ± 0.000000'),
+    (0.5, None, '0.5'),
+    (0.5, math.nan, '0.5'),
+    (math.nan, 0.1, 'unknown'),
+])
+def test_digits_stop_where_the_sigma_begins(value, sigma, text):
+    assert with_sigma(value, sigma) == text
+
+
+def test_signs_and_units_are_the_callers(good):
+    assert with_sigma(0.0174533, 5e-5, math.degrees(1), signed=True) == '+1.0000 ± 0.0029'
+    assert with_sigma(-0.0174533, None, math.degrees(1), signed=True) == '-1'
+
+
+def test_lengths_and_times():
+    assert [length(x) for x in (11200.3, 1004.2, 12.345, 0.09, 0.0, math.nan)] == [
+        '11.20 km', '1004 m', '12.35 m', '90 mm', '0 m', 'unknown']
+    assert [time_span(t) for t in (59.96, 600.0, 3600.0, 7325.0)] == [
+        '60.0 s', '10 min 00 s', '1 h 00 min', '2 h 02 min']
+
+
+def test_the_screen_says_it_all_in_few_lines(good):
+    text = screen(good)
+    for part in ('ACCEPTED', '1 leg, 11.20 km in 10 min 00 s',
+                 '0.0500000 ± 0.0000012 m/pulse   (24 ppm)', '20.00000 ± 0.00048 pulses/m',
+                 '1.250000 ± 0.000030   (+250000 ± 30 ppm)',
+                 '-1.0000 ± 0.0029 deg   (-0.017453 ± 0.000050 rad)',
+                 'pitch mounting      not determined', 'roll, pitch, yaw 0.000, 0.000, -1.000 deg',
+                 '08-02 08:53:20', '1500 m', '0.10 m', 'TOPIC_GAP: odometer gap of 1.2 s',
+                 '-> Use a receiver that gives ellipsoidal height.'):
+        assert part in text, part
+    assert len(text.splitlines()) < 30
+    assert max(len(line) for line in text.splitlines()) <= 98
+
+
+def test_the_gravest_reasons_come_first(rejected):
+    text = screen(rejected)
+    assert text.index('REJECTED: do not use') < text.index('rejected because')
+    assert text.index('GYRO_SIGN') < text.index('notes') < text.index('TOPIC_GAP')
+
+
+def test_the_sentence_is_one_line_with_the_figures(good, rejected):
+    text = sentence(good)
+    assert text == (
+        'accepted: scale factor 0.0500000 ± 0.0000012 m/pulse (20.00000 ± 0.00048 pulses/m), '
+        'yaw mounting -1.0000 ± 0.0029 deg, pitch mounting not determined; 1 of 1 leg good')
+    assert sentence(rejected).startswith('rejected: scale factor 0.05')
+
+
+def test_speeds_have_no_pulses(good):
+    speed = good.estimates | {'scale_factor': Estimate(0.98, 1e-3, '1')}
+    calibration = replace(good, estimates=speed)
+    assert 'scale factor 0.9800 ± 0.0010, yaw' in sentence(calibration)
+    assert 'pulses/m' not in screen(calibration)
+    joint = replace(good, estimates=good.estimates | {
+        'scale_factor': Estimate(0.5, 1e-3, 'm/rad')})
+    assert '2.0000 ± 0.0040 rad/m' in screen(joint)
+
+
+def test_nothing_found_is_said_without_nan(nothing, good):
+    empty = Calibration((), {}, {}, ())
+    broken = replace(good, estimates=good.estimates | {
+        'scale_factor': Estimate(math.nan, math.nan, 'm/pulse'),
+        'yaw_mounting_angle': Estimate(0.0, math.nan, 'rad')})
+    for calibration in (nothing, empty, broken):
+        for text in (screen(calibration), sentence(calibration)):
+            assert not re.search(r'\bnan\b|None', text)
+    assert 'scale factor not determined' in sentence(nothing)
+    assert '0 of 1 leg good' in sentence(nothing)
+
+
+def test_legs_pool_their_checks_over_fixes():
+    a, b = TrackCheck(1.0, 5.0, 0.5, 2.0, 0.1), TrackCheck(3.0, 4.0, 1.5, 3.0, 0.05)
+    both = overall([(a, 3), (None, 100), (b, 1)])
+    assert both.rms == pytest.approx(math.sqrt((3 * 1.0 + 9.0) / 4), rel=1e-15)
+    assert both.mean == pytest.approx((3 * 0.5 + 1.5) / 4, rel=1e-15)
+    assert (both.max, both.end, both.percent_of_distance) == (5.0, 3.0, 0.1)
+    assert overall([(None, 5)]) is None
+    assert overall([]) is None
