@@ -4,7 +4,7 @@ import json
 import math
 from types import SimpleNamespace
 
-from conftest import answer_of, wait_for
+from bench import answer_of, Client, NodeProcess, wait_for
 from player import messages_of, part, Player
 import pytest
 
@@ -14,19 +14,23 @@ from odocal_ros.messages import make_reader
 from odocal_ros.output.files import as_json
 from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Verdict
-from odocal_ros.sim.scenarios import simulate, SimOptions
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0            # times real time: 2400 messages a second
 HEADING = 0.7           # rad, a heading of its own makes the yaw separable
 SETTINGS = {'alignment.heading_source': 'fixed', 'alignment.heading_sigma': 0.002}
-KEYS = ('state leg_id leg_start_ns leg_stop_ns leg_event distance_m duration_s imu_rate_hz '
-        'odometer_rate_hz fix_rate_hz scale_factor scale_factor_sigma yaw_mounting_angle_rad '
-        'yaw_mounting_angle_sigma_rad verdict hint').split()
+KEYS = ['state', 'leg_id', 'leg_start_ns', 'leg_stop_ns', 'leg_event', 'distance_m',
+        'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'scale_factor',
+        'scale_factor_sigma', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad',
+        'verdict', 'hint']
+ESTIMATES = ['scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle']
+RESULTS = ([f'result.{name}{end}' for name in ESTIMATES for end in ('', '_sigma')]
+           + ['result.legs', 'result.valid', 'result.stamp'])
 
 
 @pytest.fixture(scope='module')
 def drive():
-    """A straight drive with stamped messages only: 60 s of rest, 60 s of driving, 60 s of rest."""
+    """Simulate a straight drive, all stamped: 60 s of rest, 60 s of driving, 60 s of rest."""
     simulated = simulate(SimOptions(
         scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
         fix_noise='rtk', imu_grade='tactical', heading=HEADING))
@@ -36,9 +40,8 @@ def drive():
 
 
 @pytest.fixture(scope='module')
-def session(drive, tmp_path_factory, module_domain):
+def session(drive, tmp_path_factory, domain):
     """Drive two legs through one node and keep everything it said; the tests then look."""
-    from conftest import Client, NodeProcess
     folder = tmp_path_factory.mktemp('results')
     settings = [x for name, value in SETTINGS.items() for x in ('-p', f'{name}:={value}')]
     node = NodeProcess('-p', f'output.directory:={folder}', '-p',
@@ -114,12 +117,6 @@ def _undone(seen, client):
     seen.results_after_reset = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
 
 
-RESULTS = ['result.' + name for name in (
-    'scale_factor scale_factor_sigma scale_ratio scale_ratio_sigma yaw_mounting_angle '
-    'yaw_mounting_angle_sigma pitch_mounting_angle pitch_mounting_angle_sigma legs valid stamp'
-).split()]
-
-
 def replayed(drive, status):
     """Compute the leg that a status marks from the recorded messages, read as one block each."""
     config = with_settings(Config(), SETTINGS | {'alignment.heading': drive.heading})
@@ -141,7 +138,7 @@ def test_live_and_recorded_agree_in_every_digit(session, drive):
     calibration, config = replayed(drive, session.calibrated)
     assert calibration.verdict is not Verdict.REJECTED
     results = session.results
-    for name in ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle'):
+    for name in ESTIMATES:
         estimate = calibration.estimates[name]
         for key, value in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
             live = results[f'result.{key}']

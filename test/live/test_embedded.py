@@ -1,0 +1,87 @@
+"""The node inside another program: its executor, its context, and a pipeline that fails."""
+
+import threading
+
+from bench import Client, wait_for
+from player import messages_of, part, Player
+import pytest
+
+from odocal_ros.live import jobs, operation
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+
+@pytest.fixture
+def embedded(domain, tmp_path):
+    """Spin the node and a stranger in one executor of a context of our own."""
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.parameter import Parameter
+
+    from odocal_ros.live.node import Calibrator
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = Calibrator('second', context=context, cli_args=['--ros-args', '-r', 'fix:=gps/fix'],
+                      parameter_overrides=[
+                          Parameter('output.directory', value=str(tmp_path)),
+                          Parameter('leg.min_distance', value=20.0)])
+    stranger = rclpy.create_node('stranger', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(stranger)
+    executor.add_node(node)
+
+    def spin():
+        try:
+            executor.spin()
+        except ExternalShutdownException:
+            return
+
+    thread = threading.Thread(target=spin, daemon=True)
+    thread.start()
+    client = Client('second')
+    yield node, client
+    executor.shutdown()
+    thread.join(10)
+    client.close()
+    node.destroy_node()
+    stranger.destroy_node()
+    context.try_shutdown()
+
+
+def test_name_overrides_and_remaps_pass_through(embedded):
+    _, client = embedded
+    assert client.get('leg.min_distance') == [20.0]
+    client.until(state='waiting')
+    wait_for(lambda: '/gps/fix' in client.status['missing'], 'the remapped topic')
+    wait_for(lambda: 'second: imu' in client.health, "diagnostics under the node's name")
+
+
+def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):
+    node, client = embedded
+    drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0,
+                                odometer='speed', fix_noise='rtk'))
+    types, messages = messages_of(drive)
+    player = Player(client.node, types, {'fix': 'gps/fix'})
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(messages, 45, 60), 30)
+    client.until(state='idle')
+    assert client.call('start_leg').success
+    player.play(part(messages, 60, 80), 30)
+
+    def explode(*_):
+        raise MemoryError('not enough for this leg')
+    monkeypatch.setattr(operation.jobs, 'compute', explode)
+    stopping = client.ask('stop_leg')
+    player.play(part(messages, 80, 82), 30)
+    status = client.until(state='failed')
+    answer = stopping.result() if stopping.done() else wait_for(stopping.result, 'the answer')
+    assert not answer.success
+    for words in ('MemoryError: not enough for this leg', '~/stop_leg', '~/cancel_leg'):
+        assert words in answer.message
+    assert status['level'] == b'\x02'
+    assert 'not enough for this leg' in status['message']
+    assert not client.call('start_leg').success
+    monkeypatch.undo()
+    assert operation.jobs.compute is jobs.compute
+    retried = client.call('stop_leg')
+    assert 'scale factor' in retried.message
+    client.until(state='calibrated', leg_id='1', legs='1')

@@ -1,0 +1,275 @@
+"""Start and end of the node's process, its inputs, and its times."""
+
+import math
+import os
+import signal
+import time
+
+from bench import answer_of, NodeProcess, ROOT, wait_for
+from player import messages_of, part, Player, Sent
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.config import SETTINGS
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+RELIABLE, BEST_EFFORT = 'reliable', 'best effort'
+
+
+@pytest.fixture(scope='module')
+def sent():
+    """Return a minute of slow rates out of a drive: enough to start a leg, light to play."""
+    drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0,
+                                odometer='speed'))
+    types, messages = messages_of(drive)
+    return types, part(messages, 60, 120)
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
+    node, client = start(), connect()
+    player = Player(client.node, sent[0])
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(sent[1], 0, 5), 20)
+    client.until(state='idle')
+    assert client.call('start_leg').success
+    assert node.end(how) == 0
+    assert 'Traceback' not in node.text
+    assert 'rror' not in node.text
+
+
+def test_a_signal_before_anything_ran_is_clean_too(start, connect):
+    node = start()
+    connect().until(state='waiting')
+    node.end()
+    assert (node.process.returncode, [x for x in node.lines if 'INFO' not in x]) == (0, [])
+
+
+@pytest.mark.parametrize(('override', 'words'), [
+    ('leg.min_distance:=3', "'3' of type 'INTEGER', expecting type 'DOUBLE'; write it as a decim"),
+    ('leg.min_distance:=0.5', 'leg.min_distance out of range'),
+    ('gnss.min_status:=9', 'gnss.min_status out of range'),
+    ('imu.gyro_noise:=5.0', 'imu.gyro_noise = 5: want 0 to 1'),
+    ('odometer.lever_arm:=[1.0, 2.0]', 'odometer.lever_arm: 2 values, want 3'),
+    ('method:=magic', "method: 'magic' is not one of auto, two_point"),
+    ('odometer.type:=no_msgs/msg/Such', "'no_msgs/msg/Such' cannot be imported here"),
+    ('result.valid:=7', 'result.valid: 7 is not of type bool'),
+    ('qos_overrides./imu/data.subscription.depth:=x', "'x' of type 'STRING'"),
+    ('leg.min_distance', "Couldn't parse parameter override rule"),
+])
+def test_a_bad_override_is_one_line_and_exit_1(domain, override, words):
+    node = NodeProcess('-p', override)
+    assert node.wait() == 1
+    line, = node.lines
+    assert line.startswith('calibrator: ')
+    assert words in line
+
+
+def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
+    start('-p', 'reference.start:=[]', '-p', 'imu.nominal_yaw:=.nan')
+    client = connect()
+    client.until(state='waiting')
+    assert client.set(leg__min_distance=250.0).successful
+    assert client.get('leg.min_distance') == [250.0]
+    assert client.set(imu__gyro_noise=math.nan).successful
+    assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
+    for value, words in (({'leg__min_distance': 0.5}, 'out of range'),
+                         ({'leg__min_distance': 3}, 'Wrong parameter type'),
+                         ({'leg__min_distance': math.nan}, 'out of range'),
+                         ({'imu__gyro_noise': 2.0}, 'want 0 to 1'),
+                         ({'reference__start': [40.0]}, '1 values, want 4'),
+                         ({'imu__grade': 'golden'}, 'not one of consumer'),
+                         ({'odometer__type': 'std_msgs/msg/Int64'}, 'read-only'),
+                         ({'result__valid': True}, 'set by the node')):
+        result = client.set(**value)
+        assert not result.successful, value
+        assert words in result.reason
+    assert client.get('leg.min_distance') == [250.0]
+
+
+def test_the_shipped_parameter_file_is_taken_as_it_is(start, connect):
+    start('--params-file', str(ROOT / 'config' / 'calibrator.yaml'))
+    client = connect()
+    client.until(state='waiting')
+    names = [name for name in SETTINGS if name != 'output.directory']
+    for name, value in zip(names, client.get(*names), strict=True):
+        default = SETTINGS[name].default
+        value = default if value is None else value
+        same = list(value) == list(default) if isinstance(default, tuple) else (
+            value == default or math.isnan(value) and math.isnan(default))
+        assert same, name
+
+
+def test_a_saved_result_comes_back_as_overrides(start, connect):
+    start('-p', 'result.scale_factor:=0.0213', '-p', 'result.legs:=2', '-p', 'result.valid:=true',
+          '-p', 'result.yaw_mounting_angle:=1', '-p', "result.stamp:='2026-01-02T03:04:05Z'")
+    client = connect()
+    client.until(state='waiting', scale_factor='0.0213', yaw_mounting_angle_rad='1.0')
+    assert client.get('result.legs', 'result.valid', 'result.stamp') == [
+        2, True, '2026-01-02T03:04:05Z']
+
+
+def test_namespace_and_remaps(start, connect, sent):
+    start('-r', '__ns:=/car', '-r', 'imu/data:=/front/imu', '-p',
+          'diagnostic_updater.use_fqn:=true')
+    client = connect('/car/calibrator')
+    player = Player(client.node, sent[0], {
+        'imu': '/front/imu', 'odometer': '/car/odometer', 'fix': '/car/fix'})
+    wait_for(player.matched, 'subscriptions under the namespace')
+    player.play(part(sent[1], 0, 3), 20)
+    client.until(state='idle')
+    wait_for(lambda: '/car/calibrator: imu' in client.health, 'diagnostics with the full name')
+
+
+def test_sim_time_and_its_jump_back(start, connect, sent):
+    from rosgraph_msgs.msg import Clock
+    node = start('-p', 'use_sim_time:=true')
+    client = connect()
+    clock = client.node.create_publisher(Clock, '/clock', 1)
+    player = Player(client.node, sent[0])
+    wait_for(lambda: player.matched() and clock.get_subscription_count(), 'subscriptions')
+
+    def play(first_s, last_s):
+        for one in part(sent[1], first_s, last_s):
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(one.stamp_ns, 10**9)
+            clock.publish(message)
+            player.publishers[one.slot].publish(one.raw)
+            time.sleep(0.002)
+
+    play(0, 10)
+    client.until(state='idle')
+    arrival = wait_for(lambda: client.health.get('calibrator: imu', {}).get('stamp_delay_s'),
+                       'diagnostics')
+    assert abs(float(arrival)) < 1.0   # on the sim clock; against the wall clock it is a year
+    assert client.call('start_leg').success
+    play(10, 14)
+    play(2, 4)
+    status = client.until(leg_event='cancelled')
+    assert status['leg_id'] == '1'
+    wait_for(lambda: 'time jumped: leg 1 is cancelled' in node.text, 'the warning')
+    client.until(state='idle')         # and it goes on with what comes after the jump
+    assert client.call('start_leg').success
+
+
+def test_imu_stamps_that_start_anew_cancel_the_leg(start, connect, sent):
+    node, client = start(), connect()
+    player = Player(client.node, sent[0])
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(sent[1], 10, 20), 20)
+    client.until(state='idle')
+    assert client.call('start_leg').success
+    waiting = client.ask('stop_leg')
+    player.play(part(sent[1], 0, 5), 20)
+    client.until(leg_event='cancelled')
+    answer = answer_of(waiting)
+    assert not answer.success
+    assert 'time jumped' in answer.message
+    assert 'time jumped' in node.text
+
+
+def test_a_forgotten_leg_is_stopped(start, connect, sent):
+    node, client = start('-p', 'leg.max_duration:=10.0'), connect()
+    player = Player(client.node, sent[0])
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(sent[1], 0, 5), 20)
+    client.until(state='idle')
+    assert client.call('start_leg').success
+    player.play(part(sent[1], 5, 20), 20)
+    client.until(state='rejected', leg_event='stopped')   # 10 s are too short a leg
+    assert 'longer than leg.max_duration' in node.text
+    answer = client.call('stop_leg')
+    assert not answer.success
+    assert 'LEG_TOO_SHORT' in answer.message
+
+
+def counter_messages(messages, kind):
+    """Return the speed messages of a drive replaced by a headerless counter."""
+    drive = simulate(SimOptions(duration=180.0, imu_rate=20.0, odometer_rate=10.0))
+    topic = encode.counter('odometer', drive.odometer)
+    raws = [row.tobytes() for row in topic.pack(slice(0, len(messages)))]
+    assert kind == 'std_msgs/msg/Int64'
+    return [Sent(one.stamp_ns, 'odometer', raw)
+            for one, raw in zip(messages, raws, strict=False)]
+
+
+def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
+    node, client = start(), connect()
+    types = sent[0] | {'odometer': 'std_msgs/msg/Int64'}
+    others = [one for one in sent[1] if one.slot != 'odometer']
+    counters = counter_messages([one for one in sent[1] if one.slot == 'odometer'],
+                                types['odometer'])
+    player = Player(client.node, types)
+    wait_for(player.matched, 'subscriptions')
+    wait_for(lambda: 'odometer: std_msgs/msg/Int64 on /odometer, best effort' in node.text,
+             'the log line')
+    player.play(sorted(others + counters, key=lambda one: one.stamp_ns)[:300], 20)
+    # header stamps of last year beside arrival stamps of now: no leg can be made of these
+    status = client.until(state='idle', level=b'\x01')
+    assert 'CLOCKS_DIFFER' in status['hint']
+    answer = client.call('start_leg')
+    assert not answer.success
+    assert 'CLOCKS_DIFFER' in answer.message
+    assert 'odometer.time_offset' in answer.message
+
+
+@pytest.mark.parametrize('reliable', [True, False])
+def test_increments_are_asked_for_reliably_where_offered(start, connect, reliable):
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from std_msgs.msg import Int32
+    node = start('-p', 'odometer.quantity:=increment')
+    client = connect()
+    client.node.create_publisher(Int32, 'odometer', QoSProfile(
+        depth=10, reliability=(ReliabilityPolicy.RELIABLE if reliable
+                               else ReliabilityPolicy.BEST_EFFORT)))
+    offer = RELIABLE if reliable else BEST_EFFORT
+    wait_for(lambda: f'Int32 on /odometer, {offer}' in node.text, f'a {offer} subscription')
+
+
+def test_waiting_says_why(start, connect, sent):
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import Image, Imu, NavSatFix
+    start()
+    client = connect()
+    client.until(state='waiting', hint='no Imu on /imu/data: 0 publishers found; start the '
+                 'driver or remap imu/data')
+    silent = client.node.create_publisher(
+        Imu, 'imu/data', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    client.until(hint='/imu/data: 1 publisher found (best effort) but no message yet')
+    client.node.create_publisher(Image, 'odometer', 1)
+    wait_for(lambda: 'sensor_msgs/msg/Image' in client.status['missing'], 'the foreign type')
+    client.node.create_publisher(Image, 'fix', 1)
+    wait_for(lambda: '/fix is published as sensor_msgs/msg/Image, want sensor_msgs/msg/NavSatFix'
+             in client.status['missing'], 'the foreign type of the fix')
+    assert silent.topic_name == '/imu/data'
+    assert NavSatFix.__name__ in client.status['missing']
+
+
+def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
+    drive = simulate(SimOptions(duration=180.0, imu_rate=1000.0, odometer_rate=250.0,
+                                fix_rate=25.0, odometer='speed'))
+    types, messages = messages_of(drive)
+    messages = part(messages, 60, 63)
+    start()
+    client = connect()
+    player = Player(client.node, types)
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(messages, 0, 1), 1)
+    assert client.call('start_leg').success
+    player.play(part(messages, 1, 3), 1)
+    assert client.get('leg.min_distance') == [100.0]
+    for slot, name in (('imu', 'imu'), ('odometer', 'odometer'), ('fix', 'gnss')):
+        count = str(sum(one.slot == slot for one in messages))
+        health = wait_for(lambda name=name, count=count: (
+            client.health.get(f'calibrator: {name}', {}).get('messages') == count
+            and client.health[f'calibrator: {name}']), f'{count} messages of {name}')
+        assert health['dropped'] == '0'
+
+
+def test_results_go_to_the_ros_home_by_default(domain, tmp_path, monkeypatch):
+    from odocal_ros.config import Config
+    from odocal_ros.live.outputs import output_root
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    assert output_root(Config()) == tmp_path / 'odocal'
+    monkeypatch.delenv('ROS_HOME')
+    assert str(output_root(Config())) == os.path.expanduser('~/.ros/odocal')
