@@ -80,12 +80,20 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
         t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=t_imu,
-        w_b=imu.w_i * config.imu.gyro_scale @ C_bi.T,
-        f_b=imu.f_i * config.imu.accel_scale @ C_bi.T,
+        w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
+        f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi, travel=whole, travel_left=left,
         travel_right=right, t_fix=t_fix, geodetic=geodetic, covariance_n=covariance,
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
         fixes_rejected=rejected, scale_unit=leg.form.scale_unit), tuple(found)
+
+
+def _turned(vector_i, scale, C_bi):
+    """Return scale * C_bi @ vector_i by row; a matrix product of (n, 3) costs 40 ns a row."""
+    if np.array_equal(C_bi, np.eye(3)):
+        return vector_i if scale == 1.0 else vector_i * scale
+    x, y, z = vector_i.T
+    return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
 
 
 def _travels(leg, config, rows, found):
