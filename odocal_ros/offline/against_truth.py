@@ -1,0 +1,132 @@
+"""
+Show a calibration beside the truth of its drive.
+
+``python -m odocal_ros.offline.against_truth calibration.json truth.yaml``: exit 0 where every
+figure agrees, 1 where one does not, 2 where the files cannot be read. A figure agrees inside the
+truth's ``accept`` interval if it has one, else within four sigmas.
+"""
+
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+import sys
+
+from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.output.figures import with_sigma
+
+LIMIT = 4.0     # sigmas: by chance in one of 16 000
+DEG = math.degrees(1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure beside its truth, both in the unit shown."""
+
+    name: str
+    value: float | None
+    sigma: float | None
+    truth: float
+    truth_sigma: float = 0.0
+    accept: tuple[float, float] | None = None
+
+    @property
+    def sigmas_off(self) -> float | None:
+        """Return the error over its sigma, None where there is none."""
+        if self.value is None or self.sigma is None:
+            return None
+        return (self.value - self.truth) / max(math.hypot(self.sigma, self.truth_sigma), 1e-300)
+
+    @property
+    def agrees(self) -> bool:
+        """Tell whether the figure is what the truth allows; one not given is no error."""
+        if self.value is None:
+            return True
+        if self.accept is not None:
+            return self.accept[0] <= self.value <= self.accept[1]
+        return self.sigmas_off is not None and abs(self.sigmas_off) <= LIMIT
+
+
+def rows(calibration: dict, truth: dict) -> list[Row]:
+    """
+    Return each figure whose truth is known.
+
+    Parameters
+    ----------
+    calibration : dict
+        Content of calibration.json.
+    truth : dict
+        Content of a truth.yaml: of odocal simulate, where ``scale`` holds the scale factor and
+        its ratio, or of a real drive, where its value is the ratio to the nominal scale.
+
+    """
+    result, found = calibration['result'], []
+    if 'scale' in truth:
+        scale = truth['scale']
+        name = 'scale_factor' if 'ratio' in scale else 'scale_ratio'
+        found.append(_row(name, result, scale, 1.0))
+    found += [_row(name, result, truth[key], DEG) for name, key in (
+        ('yaw_mounting_angle', 'yaw_mounting_deg'),
+        ('pitch_mounting_angle', 'pitch_mounting_deg')) if key in truth]
+    return found
+
+
+def _row(name, result, truth, factor) -> Row:
+    entry = result[name]
+    value, sigma = (None if entry[k] is None else entry[k] * factor for k in ('value', 'sigma'))
+    unit = 'deg' if factor != 1.0 else entry['unit'] or ''
+    accept = truth.get('accept')
+    return Row(f'{name.replace("_", " ")}{f", {unit}" if unit not in ("", "1") else ""}', value,
+               sigma, float(truth['value']), float(truth.get('sigma', 0.0)),
+               None if accept is None else (float(accept[0]), float(accept[1])))
+
+
+def table(found: list[Row]) -> str:
+    """Return the rows as text for a terminal."""
+    lines = [f'{"":<28}{"found":<26}{"truth":<20}{"off by":<14}']
+    for row in found:
+        if row.value is None:
+            lines.append(f'{row.name:<28}{"not determined":<26}{_truth(row)}')
+            continue
+        off = '' if row.sigmas_off is None else f'{row.sigmas_off:+.1f} sigma'
+        lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<26}{_truth(row):<20}'
+                     f'{off:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
+    return '\n'.join(lines)
+
+
+def _truth(row):
+    return with_sigma(row.truth, row.truth_sigma) if row.truth_sigma else f'{row.truth:.8g}'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the table; return 0 where all agree, 1 where not, 2 on wrong use."""
+    argv = sys.argv[1:] if argv is None else argv
+    try:
+        if len(argv) != 2:
+            raise BadUsage('want two files: calibration.json truth.yaml')
+        found = rows(*(_read(Path(name)) for name in argv))
+        if not found or found[0].value is None:
+            raise BadUsage(f'{argv[0]}: no scale factor to compare; see its reasons')
+    except OdocalError as error:
+        print(f'against_truth: {error}', file=sys.stderr)
+        return 2
+    print(table(found))
+    return 0 if all(row.agrees for row in found) else 1
+
+
+def _read(path: Path) -> dict:
+    import yaml
+    try:
+        text = path.read_text(encoding='utf-8')
+        content = json.loads(text) if path.suffix == '.json' else yaml.safe_load(text)
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot be read ({error.strerror})') from None
+    except (ValueError, yaml.YAMLError) as error:
+        raise BadUsage(f'{path}: {" ".join(str(error).split())}') from None
+    if not isinstance(content, dict) or path.suffix == '.json' and 'result' not in content:
+        raise BadUsage(f'{path}: not the file meant; want calibration.json and truth.yaml')
+    return content
+
+
+if __name__ == '__main__':
+    sys.exit(main())
