@@ -56,7 +56,7 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
 
     """
     path = Path(path)
-    _check(path, storage, compression, force)
+    check_target(path, storage, compression, force)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix='.odocal_', dir=path.parent))
@@ -77,7 +77,8 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     return path
 
 
-def _check(path, storage, compression, force):
+def check_target(path: Path, storage: str, compression: str, force: bool) -> None:
+    """Raise BadUsage where write_bag would, before any work is done."""
     if storage not in STORAGES:
         raise BadUsage(f'--storage {storage}: want one of {", ".join(STORAGES)}')
     if compression not in COMPRESSIONS:

@@ -87,6 +87,13 @@ POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'scale', 'n
             'track_width', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
                 'slip_events', 'slip_size', 'outliers', 'outlier_size', 'seed')
+# largest size, and how a person gives it: rad inside, degrees on the command line
+LIMITS = {'outliers': 0.5, 'wheel_difference': 0.5, 'odometer_delay': 10.0, 'fix_delay': 10.0,
+          'duration': 36_000.0, 'imu_rate': 10_000.0, 'odometer_rate': 10_000.0,
+          'fix_rate': 1000.0, 'heading_rate': 1000.0}
+ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0, 'yaw': 180.0,
+          'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}
+MOST_SAMPLES = 20_000_000   # of one topic; more would not fit in memory
 
 
 def resolved(options: SimOptions) -> SimOptions:
@@ -102,7 +109,7 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--odometer', options.odometer, ODOMETERS)
-    defaults = EVERYWHERE | DEFAULTS[options.scenario]
+    defaults: dict[str, Any] = EVERYWHERE | DEFAULTS[options.scenario]
     scale, nominal = SCALES[options.odometer]
     if options.scenario == 'paper':
         scale = FINE if options.odometer == 'counts' else scale
@@ -121,20 +128,32 @@ def _check(options):
     _choice('--imu-grade', options.imu_grade, SIM_GRADES)
     for field in fields(options):
         value = getattr(options, field.name)
-        flag = '--' + field.name.replace('_', '-')
-        if isinstance(value, float) and not math.isfinite(value):
-            raise BadUsage(f'{flag} {value}: want a finite number')
-        if field.name in POSITIVE and not value > 0:
-            raise BadUsage(f'{flag} {value:g}: want a number above 0')
-        if field.name in NOT_NEGATIVE and value is not None and value < 0:
-            raise BadUsage(f'{flag} {value:g}: want 0 or more')
-    if options.outliers > 0.5:
-        raise BadUsage(f'--outliers {options.outliers:g}: a share of the fixes, want 0 to 0.5')
+        for one in value if isinstance(value, tuple) else (value,):
+            if isinstance(one, (int, float)) and not isinstance(one, bool):
+                _check_number(field.name, one)
     if options.two_wheels and options.odometer == 'speed':
         raise BadUsage('--two-wheels goes with --odometer counts or angle, not with speed')
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: want A:B, seconds with 0 <= A < B')
+    if options.duration * options.imu_rate > MOST_SAMPLES:
+        raise BadUsage(f'--duration {options.duration:g} at --imu-rate {options.imu_rate:g}: more '
+                       f'than {MOST_SAMPLES:,} samples; lower one of them')
+
+
+def _check_number(name, value):
+    degrees = name in ANGLES
+    flag = '--' + name.replace('_', '-') + ('-deg' if degrees else '')
+    shown = math.degrees(value) if degrees else value
+    if not math.isfinite(value):
+        raise BadUsage(f'{flag} {value}: want a finite number')
+    if name in POSITIVE and not value > 0:
+        raise BadUsage(f'{flag} {shown:g}: want a number above 0')
+    if name in NOT_NEGATIVE and value < 0:
+        raise BadUsage(f'{flag} {shown:g}: want 0 or more')
+    limit = (ANGLES | LIMITS).get(name, math.inf)
+    if abs(shown) > limit * (1 + 1e-12):
+        raise BadUsage(f'{flag} {shown:g}: want at most {limit:g}')
 
 
 def _choice(flag, name, names):

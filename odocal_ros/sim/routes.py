@@ -111,7 +111,7 @@ def _route(stretches) -> Route:
 def _clean(speed: Profile) -> Profile:
     """Take rounding out of standing and cruising: a stop is exactly 0 m/s."""
     powers = speed.powers.copy()
-    powers[:, 0] = np.round(powers[:, 0], 12)
+    powers[:, 0] = np.round(powers[:, 0], 11)
     return Profile(speed.breaks, powers)
 
 

@@ -96,7 +96,7 @@ def simulate(options: SimOptions | None = None) -> Drive:
         odometer_right=wheels[1] if len(wheels) > 1 else no_odometer(),
         fix=sensors.fixes(motion, options),
         heading=(no_heading() if options.heading_sigma is None
-                 else sensors.heading(motion, options)))
+                 else sensors.heading(motion, options, options.heading_sigma)))
 
 
 def _truth(motion, options, imu) -> Truth:

@@ -36,6 +36,7 @@ FIRST_COUNT = 10_000     # an encoder that was on before the recording
 WHITE_SHARE = 0.2        # of the correlated sigma: receiver noise on top
 SIGMA_FLOOR = 0.001      # m; no receiver reports zero
 SLIP_TIME = 1.0          # s that a slip event takes
+AT_REST = 1e-9           # m/s
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0):
@@ -86,13 +87,13 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
                       f_v @ C_vi + accel, q_ni, variance)
 
 
-def heading(motion: Motion, options: SimOptions) -> HeadingSamples:
+def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
     """Return an outside heading of the Imu's x axis, as a dual-antenna receiver sends it."""
     ns, t = stamps(motion.duration, options.heading_rate, HEADING_PHASE)
-    q_ni = _orientation(motion.at(t), options, options.heading_sigma, 'heading')
+    q_ni = _orientation(motion.at(t), options, sigma, 'heading')
     stamp = options.start_ns + ns
     return HeadingSamples(stamp, stamp + round(HEADING_TRANSPORT * 1e9), q_ni,
-                          np.full(len(t), options.heading_sigma**2))
+                          np.full(len(t), sigma**2))
 
 
 def _orientation(state, options, sigma, name):
@@ -141,15 +142,15 @@ def _reading(state, options, side, arm, scale):
 def slip(state, options: SimOptions, side: str = 'L'):
     """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
     spun = np.zeros(len(state.t))
-    moving = state.speed != 0
+    moving = np.abs(state.speed) > AT_REST
+    steps = np.diff(state.t, prepend=state.t[:1]) * moving
     if options.slip_walk:
         walk = stream(options.seed, f'slip walk {side}')
-        steps = np.sqrt(np.diff(state.t, prepend=state.t[:1])) * walk.standard_normal(len(spun))
-        spun += options.slip_walk * np.cumsum(steps * moving)
+        spun += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(spun)))
     if options.slip_events:
         rng = stream(options.seed, f'slip events {side}')
-        hours = moving.sum() / options.odometer_rate / 3600
-        for at in rng.choice(state.t[moving], rng.poisson(options.slip_events * hours)):
+        spins = rng.poisson(options.slip_events * steps.sum() / 3600)
+        for at in rng.choice(state.t[moving], spins):
             spun += options.slip_size * np.clip((state.t - at) / SLIP_TIME, 0.0, 1.0)
     return spun
 

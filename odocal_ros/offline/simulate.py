@@ -1,0 +1,180 @@
+"""odocal simulate: a bag of a drive whose truth is known."""
+
+import argparse
+import math
+from pathlib import Path
+import shlex
+import sys
+
+from odocal_ros.errors import BadUsage
+
+HELP = 'write a bag with known truth'
+TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
+MADE_HERE = 'Made by odocal simulate.'
+# option: (what follows it, help); its name is SimOptions' field
+NUMBERS = {
+    'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
+    'imu_rate': ('HZ', 'rate of /imu/data (default 100)'),
+    'odometer_rate': ('HZ', 'rate of the odometer (default 50)'),
+    'fix_rate': ('HZ', 'rate of /fix (default 5)'),
+    'heading_rate': ('HZ', 'rate of /heading (default 10)'),
+    'scale': ('K', 'true scale factor, m/pulse, m/rad or 1'),
+    'nominal_scale': ('K0', 'scale factor as configured'),
+    'speed_noise': ('M/S', 'white noise of --odometer speed'),
+    'odometer_delay': ('S', 'seconds by which odometer stamps are late'),
+    'wheel_difference': ('X', 'right scale over left, less 1 (default 0.004)'),
+    'track_width': ('M', 'distance between the two wheels (default 1.6)'),
+    'slip_events': ('N', 'wheel spins per hour of motion'),
+    'slip_size': ('M', 'metres lost in each spin (default 0.1)'),
+    'fix_sigma': ('M', 'horizontal error of fixes, 1 sigma; up: twice (default 1.5, rtk 0.02)'),
+    'fix_correlation_time': ('S', 'of --fix-noise correlated (default 60)'),
+    'fix_delay': ('S', 'seconds by which fix stamps are late'),
+    'outliers': ('SHARE', 'share of the fixes that are far off, 0 to 0.5'),
+    'outlier_size': ('M', 'how far off they are (default 20)'),
+    'height': ('M', 'ellipsoidal height at the start (default 50)'),
+}
+DEGREES = {
+    'yaw': 'yaw mounting angle (default 1)',
+    'pitch': 'pitch mounting angle (default 0.4; paper 0)',
+    'roll': 'roll mounting angle (default 0)',
+    'heading': 'heading of the vehicle at the start, clockwise from north (default 45)',
+    'slope': 'steepest slope of the road (default 0: level)',
+    'latitude': 'latitude of the start (default 40)',
+    'longitude': 'longitude of the start (default 116)',
+    'orientation_sigma': 'the Imu sends its orientation, with a heading error of this size',
+    'heading_sigma': 'a topic /heading is sent, with an error of this size',
+}
+LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
+
+
+def add_arguments(parser) -> None:
+    """Declare the options; the simulator checks their values."""
+    add = parser.add_argument
+    add('--scenario', required=True, metavar='NAME',
+        help='paper, straight, out_and_back or town')
+    add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
+        'calibrator.yaml go beside it')
+    add('--seed', type=int, metavar='N', help='of all random numbers (default 1)')
+    add('--imu-grade', metavar='GRADE',
+        help='consumer, industrial, tactical, navigation or perfect')
+    add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
+        'angle (JointState)')
+    add('--two-wheels', action='store_true', default=None, help='left and right odometer')
+    add('--fix-noise', metavar='KIND', help='white (default), correlated or rtk')
+    add('--slip', type=float, metavar='M', dest='slip_walk',
+        help='random slip while moving, m per square root of a second')
+    add('--outage', type=_span, action='append', metavar='A:B', dest='outages',
+        help='no fixes from A to B seconds; repeatable')
+    for name, (what, text) in NUMBERS.items():
+        add(_flag(name), type=float, metavar=what, help=text)
+    for name, text in DEGREES.items():
+        add(_flag(name) + '-deg', type=float, metavar='DEG', dest=f'{name}_deg', help=text)
+    for name in LEVER_ARMS:
+        add(_flag(name), type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+            help='m forward, left, up of the rear axle')
+    add('--mounting-rpy-deg', type=float, nargs=3, metavar=('R', 'P', 'Y'),
+        help='nominal rotation from the Imu frame to forward-left-up')
+    add('--known-heading-sigma-deg', type=float, metavar='DEG',
+        help='put a heading of this accuracy into calibrator.yaml')
+    add('--storage', default='mcap', metavar='KIND', help='mcap (default), sqlite3 or rosbag1')
+    add('--compression', default='none', metavar='KIND',
+        help='none (default), message, file or storage (mcap chunks)')
+    add('--force', action='store_true', help='replace the bag and the files beside it')
+    add('--quiet', action='store_true', help='print nothing but errors')
+
+
+def _flag(name: str) -> str:
+    return '--' + name.replace('_', '-')
+
+
+def _span(text: str) -> tuple[float, float]:
+    begin, _, end = text.partition(':')
+    try:
+        return float(begin), float(end)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text}: want A:B, two numbers of seconds') from None
+
+
+def options_of(args):
+    """Return the SimOptions that parsed arguments ask for."""
+    from odocal_ros.sim.scenarios import SimOptions
+    plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'fix_noise', 'slip_walk',
+             *NUMBERS]
+    given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
+    for name in DEGREES:
+        if getattr(args, f'{name}_deg') is not None:
+            given[name] = math.radians(getattr(args, f'{name}_deg'))
+    for name in LEVER_ARMS:
+        if getattr(args, name) is not None:
+            given[name] = tuple(getattr(args, name))
+    if args.mounting_rpy_deg is not None:
+        given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
+    if args.outages:
+        given['outages'] = tuple(args.outages)
+    return SimOptions(**given)
+
+
+def run(args) -> int:
+    """Simulate, write the bag and the two files beside it; return 0."""
+    out = Path(args.out)
+    beside = [out.parent / name for name in (TRUTH, SETTINGS)]
+    for path in beside:
+        _check_beside(path, args.force)
+    known = args.known_heading_sigma_deg
+    if known is not None and not 0 <= known <= 180:
+        raise BadUsage(f'--known-heading-sigma-deg {known:g}: want 0 to 180')
+    from odocal_ros.bagio.write import check_target, drive_topics, write_bag
+    from odocal_ros.sim.scenarios import simulate
+    from odocal_ros.sim.truth import settings, topic_arguments, truth_entries
+    check_target(out, args.storage, args.compression, args.force)
+    drive = simulate(options_of(args))
+    topics = drive_topics(drive)
+    write_bag(out, topics, args.storage, args.compression, args.force, _progress(args.quiet))
+    known = None if known is None else math.radians(known)
+    _write_yaml(beside[0], truth_entries(drive, out.name), f'Truth of {out.name}.')
+    _write_yaml(beside[1], {'/**/calibrator': {'ros__parameters': settings(drive, known)}},
+                f'What an operator of {out.name} would know.')
+    if not args.quiet:
+        replay = ['odocal', 'replay', str(out), '--config', str(beside[1]),
+                  *topic_arguments(drive)]
+        print(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
+              f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
+              f'{shlex.join(replay)}')
+    return 0
+
+
+def _check_beside(path: Path, force: bool) -> None:
+    """Refuse to write over a file, unless forced and it was made here."""
+    if not path.exists():
+        return
+    if not force:
+        raise BadUsage(f'{path} is there already; give --force to replace it, or --out in '
+                       'another folder')
+    if MADE_HERE not in path.read_text(encoding='utf-8', errors='replace'):
+        raise BadUsage(f'{path} was not made by odocal simulate and is kept; give --out in '
+                       'another folder')
+
+
+def _write_yaml(path: Path, content: dict, title: str) -> None:
+    """Write a file whole or not at all."""
+    import yaml
+    part = path.with_name(f'.{path.name}.part')
+    try:
+        part.write_text(f'# {title} {MADE_HERE}\n'
+                        + yaml.safe_dump(content, sort_keys=False, default_flow_style=None),
+                        encoding='utf-8')
+        part.replace(path)
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot write ({error.strerror}); the bag itself is '
+                       'complete') from None
+
+
+def _progress(quiet: bool):
+    """Return a function that shows the share done on a terminal, or None."""
+    if quiet or not sys.stderr.isatty():
+        return None
+
+    def show(share: float) -> None:
+        end = '\r\x1b[K' if share >= 1 else ''
+        print(f'\rwriting {share:4.0%}{end}', end='', file=sys.stderr, flush=True)
+    return show

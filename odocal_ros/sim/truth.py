@@ -1,0 +1,97 @@
+"""What a simulated drive says of itself: truth.yaml, and the settings an operator would have."""
+
+from dataclasses import asdict
+import math
+
+from odocal_ros.sim.noise import stream
+from odocal_ros.sim.scenarios import Drive
+
+STANDS_FOR_PERFECT = 'navigation'   # the best grade there is in the settings
+
+
+def truth_entries(drive: Drive, bag: str) -> dict:
+    """Return the content of truth.yaml: what is to be found, then how it was made."""
+    truth, options = drive.truth, drive.options
+    return {
+        'bag': bag,
+        'scenario': options.scenario,
+        'seed': options.seed,
+        **_topics(drive),
+        'scale': {'value': truth.scale, 'ratio': truth.scale_ratio,
+                  'unit': drive.form.scale_unit, 'nominal': options.nominal_scale,
+                  'wheels': list(truth.wheel_scales)},
+        'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
+        'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
+        'roll_mounting_deg': {'value': math.degrees(options.roll)},
+        'nominal_rpy_deg': [math.degrees(a) for a in options.mounting_rpy],
+        # of the body frame's x axis, clockwise from north, at the start mark
+        'heading': {'rad': truth.heading, 'deg': math.degrees(truth.heading)},
+        'distance': {'value': truth.distance, 'unit': 'm'},
+        'marks': {'start_ns': truth.start_ns, 'stop_ns': truth.stop_ns},
+        'lever_arms': {'imu': list(options.imu_lever_arm),
+                       'antenna': list(options.antenna_lever_arm),
+                       'odometer': list(options.odometer_lever_arm), 'unit': 'm, base_link'},
+        'delays': {'odometer': options.odometer_delay, 'fix': options.fix_delay, 'unit': 's'},
+        'gyro_bias': {'value': truth.gyro_bias.tolist(), 'unit': 'rad/s, imu frame, at turn-on'},
+        'accel_bias': {'value': truth.accel_bias.tolist(),
+                       'unit': 'm/s^2, imu frame, at turn-on'},
+        'options': _plain(asdict(options)),
+    }
+
+
+def _topics(drive):
+    odometer: dict | str = '/odometer'
+    if drive.options.odometer == 'angle':
+        odometer = '/joint_states'
+    elif drive.options.two_wheels:
+        odometer = {'left': '/odometer/left', 'right': '/odometer/right'}
+    topics = {'imu_topic': '/imu/data', 'odometer_topic': odometer, 'fix_topic': '/fix'}
+    return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
+
+
+def _plain(value):
+    """Return tuples as lists: YAML has no tuples."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+
+
+def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
+    """
+    Return the settings an operator of this vehicle would give, by group.
+
+    ``known_heading_sigma`` (rad): the heading at the start mark is known too, with an error drawn
+    of that size.
+    """
+    options = drive.options
+    grade = options.imu_grade
+    odometer: dict = {'nominal_scale': float(options.nominal_scale),
+                      'lever_arm': [float(x) for x in options.odometer_lever_arm]}
+    if options.two_wheels:
+        left, right = (('left_wheel_joint', 'right_wheel_joint')
+                       if options.odometer == 'angle' else ('topic', 'topic'))
+        odometer |= {'left': left, 'right': right, 'track_width': float(options.track_width)}
+    groups = {
+        'odometer': odometer,
+        'imu': {'grade': STANDS_FOR_PERFECT if grade == 'perfect' else grade,
+                'mounting_rpy': [float(x) for x in options.mounting_rpy],
+                'lever_arm': [float(x) for x in options.imu_lever_arm]},
+        'gnss': {'lever_arm': [float(x) for x in options.antenna_lever_arm]},
+    }
+    if known_heading_sigma is not None:
+        error = known_heading_sigma * stream(options.seed, 'known heading').standard_normal()
+        groups['alignment'] = {'heading_source': 'fixed',
+                               'heading': float(drive.truth.heading + error),
+                               'heading_sigma': float(known_heading_sigma)}
+    return groups
+
+
+def topic_arguments(drive: Drive) -> list[str]:
+    """Return the topic options replay needs where a type alone does not tell."""
+    arguments = []
+    if drive.options.two_wheels and drive.options.odometer == 'counts':
+        arguments += ['--odometer-topic', '/odometer/left',
+                      '--odometer-right-topic', '/odometer/right']
+    if len(drive.heading.stamp_ns):
+        arguments += ['--imu-topic', '/imu/data', '--heading-topic', '/heading']
+    return arguments

@@ -1,0 +1,160 @@
+"""The simulate command: a real bag, its truth and its settings, or one sentence."""
+
+import math
+
+import pytest
+import yaml
+
+from odocal_ros.offline import cli
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SHORT = ['--scenario', 'town', '--duration', '140', '--imu-rate', '50']
+
+
+def odocal(*arguments):
+    return cli.main(['simulate', *map(str, arguments)])
+
+
+def files(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def load(path):
+    return yaml.safe_load(path.read_text())
+
+
+def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
+    out = tmp_path / 'one' / 'drive'
+    assert odocal(*SHORT, '--out', out, '--seed', 7) == 0
+    assert files(out.parent) == ['calibrator.yaml', 'drive', 'truth.yaml']
+    assert files(out) == ['drive.mcap', 'metadata.yaml']
+    drive = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=50.0, seed=7))
+    truth = load(out.parent / 'truth.yaml')
+    assert truth['bag'] == 'drive'
+    assert truth['scale'] == {'value': 0.0213, 'ratio': 0.0213 / 0.02, 'unit': 'm/pulse',
+                              'nominal': 0.02, 'wheels': [0.0213]}
+    assert truth['yaw_mounting_deg']['value'] == pytest.approx(1.0)
+    assert truth['pitch_mounting_deg']['value'] == pytest.approx(0.4)
+    assert truth['heading']['deg'] == pytest.approx(44.0, abs=1e-6)
+    assert truth['distance']['value'] == drive.truth.distance
+    assert truth['marks'] == {'start_ns': drive.truth.start_ns, 'stop_ns': drive.truth.stop_ns}
+    assert truth['options']['seed'] == 7
+    told = capsys.readouterr()
+    assert told.err == ''                   # no terminal, no bar
+    assert told.out.count('\n') == 1
+    n = len(drive.imu.stamp_ns) + len(drive.odometer.stamp_ns) + len(drive.fix.stamp_ns)
+    assert f'{n} messages' in told.out
+    assert f'odocal replay {out} --config {out.parent / "calibrator.yaml"}' in told.out
+
+
+def test_the_options_in_truth_make_the_drive_again(tmp_path):
+    out = tmp_path / 'drive'
+    assert odocal(*SHORT, '--out', out, '--outage', '50:60', '--yaw-deg', 2,
+                  '--antenna-lever-arm', 1, 0, 1.5, '--two-wheels', '--quiet') == 0
+    options = load(tmp_path / 'truth.yaml')['options']
+    again = simulate(SimOptions(**{k: tuple(v) if isinstance(v, list) else v
+                                   for k, v in options.items()}))
+    assert again.options.outages[0] == [50.0, 60.0]
+    assert math.degrees(again.truth.yaw) == pytest.approx(2)
+    assert again.truth.distance == load(tmp_path / 'truth.yaml')['distance']['value']
+
+
+def test_the_settings_are_settings_of_the_node(tmp_path):
+    """Each name and value passes the very checks of the pipeline."""
+    from odocal_ros.config import Config, flat, SETTINGS, with_settings
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', '--two-wheels', '--imu-grade', 'tactical',
+                  '--antenna-lever-arm', 1.2, 0, 1.5, '--known-heading-sigma-deg', 0.06,
+                  '--mounting-rpy-deg', 180, 0, 0, '--quiet') == 0
+    groups = load(tmp_path / 'calibrator.yaml')['/**/calibrator']['ros__parameters']
+    given = {f'{group}.{name}': value for group, values in groups.items()
+             for name, value in values.items()}
+    assert set(given) <= set(SETTINGS)
+    config = flat(with_settings(Config(), given))
+    assert config['odometer.nominal_scale'] == 0.02
+    assert config['odometer.left'] == config['odometer.right'] == 'topic'
+    assert config['imu.grade'] == 'tactical'
+    assert config['gnss.lever_arm'] == (1.2, 0.0, 1.5)
+    assert config['imu.mounting_rpy'] == pytest.approx((math.pi, 0, 0))
+    assert config['alignment.heading_source'] == 'fixed'
+    assert config['alignment.heading_sigma'] == pytest.approx(math.radians(0.06))
+    truth = load(tmp_path / 'truth.yaml')['heading']['rad']
+    error = config['alignment.heading'] - truth
+    assert 0 < abs(error) < 5 * math.radians(0.06)     # 5 sigma
+
+
+def test_perfect_sensors_go_by_the_best_grade(tmp_path):
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', '--imu-grade', 'perfect',
+                  '--fix-sigma', 0, '--quiet') == 0
+    groups = load(tmp_path / 'calibrator.yaml')['/**/calibrator']['ros__parameters']
+    assert groups['imu']['grade'] == 'navigation'
+    assert 'alignment' not in groups
+
+
+@pytest.mark.parametrize(('asked', 'topics', 'command'), [
+    ([], {'/imu/data', '/odometer', '/fix'}, ''),
+    (['--odometer', 'speed'], {'/imu/data', '/odometer', '/fix'}, ''),
+    (['--odometer', 'angle'], {'/imu/data', '/joint_states', '/fix'}, ''),
+    (['--two-wheels'], {'/imu/data', '/odometer/left', '/odometer/right', '/fix'},
+     '--odometer-topic /odometer/left --odometer-right-topic /odometer/right'),
+    (['--heading-sigma-deg', '0.2'], {'/imu/data', '/odometer', '/fix', '/heading'},
+     '--imu-topic /imu/data --heading-topic /heading')])
+def test_replay_is_told_the_topics_it_cannot_guess(tmp_path, capsys, asked, topics, command):
+    from rosbags.highlevel import AnyReader
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 0
+    assert command in capsys.readouterr().out
+    with AnyReader([tmp_path / 'drive']) as reader:
+        assert {c.topic for c in reader.connections} == topics
+
+
+def test_nothing_is_replaced_unasked(tmp_path, capsys):
+    out = tmp_path / 'drive'
+    assert odocal(*SHORT, '--out', out, '--quiet') == 0
+    first = (tmp_path / 'truth.yaml').read_text()
+    assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
+    assert 'truth.yaml is there already; give --force' in capsys.readouterr().err
+    assert odocal(*SHORT, '--out', tmp_path / 'other', '--seed', 2) == 2
+    (tmp_path / 'truth.yaml').unlink()
+    (tmp_path / 'calibrator.yaml').unlink()
+    assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
+    assert 'drive is there already; give --force' in capsys.readouterr().err
+    assert not (tmp_path / 'truth.yaml').exists()
+    assert odocal(*SHORT, '--out', out, '--seed', 2, '--force', '--quiet') == 0
+    assert (tmp_path / 'truth.yaml').read_text() != first
+    assert load(tmp_path / 'truth.yaml')['seed'] == 2
+
+
+def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
+    (tmp_path / 'calibrator.yaml').write_text('mine: true\n')
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', '--force') == 2
+    assert 'was not made by odocal simulate' in capsys.readouterr().err
+    assert files(tmp_path) == ['calibrator.yaml']
+
+
+@pytest.mark.parametrize(('asked', 'told'), [
+    (['--scenario', 'moon'], '--scenario moon: want one of paper'),
+    (['--imu-grade', 'best'], '--imu-grade best: want one of'),
+    (['--duration', '5'], 'scenario town: --duration 5 s is too short'),
+    (['--duration', 'nan'], '--duration nan: want a finite number'),
+    (['--imu-rate', 'fast'], "invalid float value: 'fast'"),
+    (['--outage', '5'], '5: want A:B, two numbers of seconds'),
+    (['--outage', '9:5'], '--outage 9:5: want A:B'),
+    (['--pitch-deg', '90'], '--pitch-deg 90: want at most 45'),
+    (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: want 0 to 180'),
+    (['--storage', 'tape'], '--storage tape: want one of mcap'),
+    (['--storage', 'sqlite3', '--compression', 'storage'], 'is not there for --storage sqlite3'),
+    (['--frobnicate'], 'unrecognized arguments: --frobnicate')])
+def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, asked, told):
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 2
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert said.err.count('\n') == 1
+    assert told in said.err
+    assert files(tmp_path) == []
+
+
+def test_a_terminal_gets_a_bar_that_goes_away(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True, raising=False)
+    assert odocal(*SHORT, '--out', tmp_path / 'drive') == 0
+    bar = capsys.readouterr().err
+    assert '100%' in bar
+    assert bar.endswith('\r\x1b[K')

@@ -1,0 +1,200 @@
+"""True motion: closed forms, and an IMU integrated back by other means."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.nav.earth import A, C_en, E2, earth_rate_n, ecef_from_geodetic, gravity, OMEGA
+from odocal_ros.nav.rotations import exp_so3, skew
+from odocal_ros.sim.motion import (
+    attitude,
+    contact_speed,
+    contact_travel,
+    Hills,
+    inertial_v,
+    Motion,
+    point,
+    Start,
+    velocity_n,
+)
+from odocal_ros.sim.profile import chain, hold, ramp, turn
+
+HOME = Start(np.radians(40), 0.2, 50.0, 0.7)
+ARM = (1.5, -0.5, 1.0)
+
+
+def still(seconds=10.0, start=HOME):
+    return Motion(chain(hold(seconds)), chain(hold(seconds)), start)
+
+
+def lively(start=HOME, slope=0.05):
+    """Return 20 s with a ramp, a turn of 100 deg, a hill and a stop."""
+    speed = chain(hold(1) + ramp(6, 15, 1.0) + hold(6) + ramp(6, -15, 1.0) + hold(1)).integral()
+    rate = chain(hold(4) + turn(8, np.radians(100), 2.0) + hold(8))
+    return Motion(speed, rate, start, Hills(slope, 200.0))
+
+
+def paper():
+    pieces = hold(300) + ramp(40, 20, 0.0) + hold(520) + ramp(40, -20, 0.0) + hold(30)
+    return Motion(chain(pieces).integral(), chain(hold(930)),
+                  Start(np.radians(40), 0.2, 0.0, np.pi / 4))
+
+
+def test_the_papers_drive_is_11200_m_of_loxodrome():
+    """Northing is a meridian arc; longitude goes with the isometric latitude."""
+    pyproj = pytest.importorskip('pyproj')
+    motion = paper()
+    end = motion.at([motion.duration])
+    assert motion.distance == pytest.approx(11_200, abs=1e-9)
+    north = pyproj.Geod(ellps='WGS84').inv(0, 40, 0, np.degrees(end.latitude[0]))[2]
+    # 1e-12 of 11 km of summed rounding, and Geod's own nanometres
+    assert north == pytest.approx(11_200 * np.sqrt(0.5), abs=2e-8)
+
+    def isometric(latitude):
+        e, s = np.sqrt(E2), np.sin(latitude)
+        return np.arctanh(s) - e * np.arctanh(e * s)
+    east = (end.longitude[0] - 0.2) - (isometric(end.latitude[0]) - isometric(np.radians(40)))
+    assert east * A == pytest.approx(0, abs=2e-8)
+
+
+def test_at_rest_the_imu_feels_gravity_upwards_and_the_earths_turn():
+    state = still().at(np.arange(3.0))
+    w_v, f_v = inertial_v(state, (0, 0, 0))
+    assert_allclose(f_v, np.tile([0, 0, gravity(HOME.latitude, 50.0)], (3, 1)), atol=1e-15)
+    w_n = np.einsum('nij,nj->ni', attitude(state), w_v)
+    assert_allclose(w_n, earth_rate_n(state.latitude), atol=1e-19)
+
+
+def test_at_rest_a_lever_arm_feels_the_gravity_of_its_own_place():
+    state = still().at(np.arange(2.0))
+    _, f_v = inertial_v(state, (0.0, 0.0, 100.0))
+    assert_allclose(f_v[0], [0, 0, gravity(HOME.latitude, 150.0)], atol=1e-12)
+    # 100 m to the side: the vertical there leans by 100 m / R, outwards
+    _, f_v = inertial_v(state, (0.0, 100.0, 0.0))
+    assert f_v[0, 1] == pytest.approx(9.80 * 100 / 6.37e6, rel=0.01)
+
+
+def test_travel_speed_and_position_belong_together():
+    """Central differences of the Earth-fixed place are the velocity."""
+    motion, h = lively(), 1e-3
+    t = np.arange(0.05, 19.9, 0.1)     # between the kinks
+    before, state, after = motion.at(t - h), motion.at(t), motion.at(t + h)
+    v_n = velocity_n(state)
+    r_e = [ecef_from_geodetic(s.latitude, s.longitude, s.height) for s in (before, after)]
+    v_e = np.einsum('nji,nj->ni', C_en(state.latitude, state.longitude),
+                    (r_e[1] - r_e[0]) / (2 * h))
+    # h^2 / 6 * jerk (w^2 v = 2 m/s^3) = 4e-7; rounding of 6e6 m: 1e-9 / 2e-3 = 5e-7
+    assert_allclose(v_e, v_n, atol=2e-6)
+    assert_allclose(np.linalg.norm(v_n, axis=1), state.speed, atol=1e-14)
+    assert_allclose((after.travel - before.travel) / (2 * h), state.speed, atol=1e-6)
+
+
+def test_nonholonomic_velocity_lies_along_x():
+    state = lively().at(np.linspace(0, 20, 300))
+    v_v = np.einsum('nji,nj->ni', attitude(state), velocity_n(state))
+    assert_allclose(v_v[:, 1:], 0, atol=1e-14)
+    assert_allclose(v_v[:, 0], state.speed, atol=1e-14)
+
+
+def integrate(motion, rate, arm):
+    """
+    Return how far an Earth-fixed strapdown strays from the truth over the drive, m and rad.
+
+    Second order in the step: mean rate as rotation vector, force turned by the mean attitude,
+    trapezoid for the rest. Written apart from the package's own navigation.
+    """
+    from odocal_ros.nav.earth import geodetic_from_ecef
+    n = int(motion.duration * rate) + 1
+    h = 1 / rate
+    state = motion.at(np.arange(n) * h)
+    w, f = inertial_v(state, arm)
+    C_ev = C_en(state.latitude, state.longitude) @ attitude(state)
+    latitude, longitude, height = point(state, arm)
+    truth = ecef_from_geodetic(latitude, longitude, height)
+    C, r, v = C_ev[0], truth[0], np.zeros(3)
+    earth = np.array([0, 0, OMEGA])
+    turn_back, W = exp_so3(-earth * h), skew(earth)
+
+    def acceleration(C, f, r, v):
+        place = geodetic_from_ecef(r)
+        up = C_en(place[0], place[1])[:, 2]
+        return C @ f - gravity(place[0], place[2]) * up - 2 * W @ v
+    for k in range(n - 1):
+        C_next = turn_back @ C @ exp_so3((w[k] + w[k + 1]) / 2 * h)
+        a = acceleration(C, f[k], r, v)
+        a_next = acceleration(C_next, f[k + 1], r + v * h, v + a * h)
+        r = r + v * h + (2 * a + a_next) * h**2 / 6
+        v = v + (a + a_next) * h / 2
+        C = C_next
+    twist = C_ev[-1].T @ C
+    return r - truth[-1], np.array([twist[2, 1], twist[0, 2], twist[1, 0]])
+
+
+@pytest.mark.parametrize('arm', [(0.0, 0.0, 0.0), ARM])
+def test_an_imu_integrated_back_reaches_the_truth_with_second_order(arm):
+    misses = [integrate(lively(), rate, arm) for rate in (25, 50, 100)]
+    for coarse, fine in zip(misses, misses[1:], strict=False):
+        # a halved step leaves a quarter; a wrong term would leave what does not shrink
+        assert np.linalg.norm(coarse[0]) / np.linalg.norm(fine[0]) == pytest.approx(4, rel=0.1)
+        assert np.linalg.norm(coarse[1]) / np.linalg.norm(fine[1]) == pytest.approx(4, rel=0.1)
+    # Richardson: a step of no length. The next term, of fourth order, is 1.6e-3 m of the coarse
+    # run times (0.5 rad/s * 0.02 s)^2 = 1e-4, for the attitude 4e-6 rad times as much
+    (_, _), (r2, p2), (r4, p4) = misses
+    assert np.linalg.norm(r4 + (r4 - r2) / 3) < 3e-7
+    assert np.linalg.norm(p4 + (p4 - p2) / 3) < 4e-10
+
+
+def test_wheels_differ_by_track_times_turn_rate():
+    state = lively(slope=0.0).at(np.linspace(0, 20, 2001))
+    track = 1.6
+    left, right = (0.0, track / 2, 0.0), (0.0, -track / 2, 0.0)
+    apart = contact_speed(state, right) - contact_speed(state, left)
+    # the level itself turns against the Earth by v tan(L) / R < 2e-6 rad/s
+    assert_allclose(apart, track * state.yaw_rate, atol=track * 2.1e-6)
+    assert np.abs(apart).max() > 0.3
+    rolled = contact_travel(state, right) - contact_travel(state, left)
+    assert rolled[-1] == pytest.approx(track * np.radians(100), abs=track * 2e-5)
+    mean = (contact_travel(state, right) + contact_travel(state, left)) / 2
+    assert_allclose(mean, state.travel, atol=1e-13)
+
+
+def test_going_east_turns_the_vehicle_against_the_earth():
+    pieces = ramp(10, 20, 0.0) + hold(980) + ramp(10, -20, 0.0)
+    motion = Motion(chain(pieces).integral(), chain(hold(1000)),
+                    Start(np.radians(60), 0.0, 0.0, 0.0))
+    end = motion.at([1000.0])
+    # the level turns by dlon * sin(lat); a parallel is a curve to the left, 19.8 km: 0.0054 rad
+    assert end.turned[0] == pytest.approx(end.longitude[0] * np.sin(np.radians(60)), rel=1e-9)
+    rolled = [contact_travel(end, (0.0, y, 0.0))[0] for y in (0.8, -0.8)]
+    assert rolled[1] - rolled[0] == pytest.approx(1.6 * end.turned[0], rel=1e-8)
+    assert end.turned[0] > 0.005
+
+
+@pytest.mark.parametrize('arm', [(0.0, 0.8, 0.0), (0.3, -0.8, -0.3)])
+def test_a_wheels_travel_is_the_integral_of_its_speed(arm):
+    state = lively().at(np.arange(0, 20.0005, 1e-3))
+    speed = contact_speed(state, arm)
+    # trapezoid: h^2 / 12 * summed change of slope (25 m/s^2) = 2e-6; tilt couples the level's
+    # own turn in the second order, 0.05 * 2e-6 rad/s * 20 s * 1 m
+    total = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 1e-3)])
+    assert_allclose(contact_travel(state, arm) - contact_travel(state, arm)[0], total, atol=5e-6)
+
+
+def test_an_antenna_stands_where_its_lever_arm_says():
+    state = still().at([0.0])
+    latitude, longitude, height = point(state, (2.0, 1.0, 1.5))
+    r = (ecef_from_geodetic(latitude, longitude, height)
+         - ecef_from_geodetic(state.latitude, state.longitude, state.height))[0]
+    there_n = C_en(state.latitude, state.longitude)[0].T @ r
+    c, s = np.cos(HOME.yaw), np.sin(HOME.yaw)
+    assert_allclose(there_n, [2 * c - s, 2 * s + c, 1.5], atol=3e-9)   # rounding of 6e6 m
+
+
+def test_any_times_give_the_same_states():
+    motion = lively()
+    t = np.array([0.0, 3.3333, 7.0, 7.1, 19.99, 20.0])
+    whole = motion.at(np.sort(np.concatenate([t, np.linspace(0, 20, 57)])))
+    alone = motion.at(t)
+    pick = np.searchsorted(whole.t, t)
+    assert np.array_equal(whole.latitude[pick], alone.latitude)
+    assert np.array_equal(whole.turned[pick], alone.turned)

@@ -1,0 +1,138 @@
+"""Named drives: what they promise of length, stops, turns and marks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.sim.options import BY_SCENARIO, resolved
+from odocal_ros.sim.scenarios import motion_of, SCENARIOS, SimOptions, simulate
+
+
+def states(name, step=0.1, **options):
+    options = resolved(SimOptions(scenario=name, **options))
+    motion = motion_of(options)
+    return motion, motion.at(np.arange(0, motion.duration + step / 2, step))
+
+
+def chord(state):
+    north = (state.latitude[-1] - state.latitude[0]) * 6.36e6
+    east = (state.longitude[-1] - state.longitude[0]) * 6.386e6 * np.cos(state.latitude[0])
+    return np.hypot(north, east)
+
+
+def test_paper_is_the_papers_drive():
+    motion, state = states('paper')
+    assert motion.duration == 930
+    assert motion.distance == pytest.approx(11_200, abs=1e-9)
+    assert state.speed[[0, 2990, 3400, 8600, 9000, 9300]] == pytest.approx([0, 0, 20, 20, 0, 0])
+    assert state.acceleration[3100] == 0.5
+    assert np.ptp(state.yaw) == 0
+    options = resolved(SimOptions(scenario='paper'))
+    assert options.nominal_scale == pytest.approx(1.2 * options.scale)
+    assert options.imu_grade == 'navigation'
+    assert np.degrees(options.yaw) == pytest.approx(1)
+
+
+def test_straight_is_the_methods_straight_run():
+    motion, state = states('straight')
+    assert motion.duration == 720
+    # 60 still, 25 up, 550 at 12 m/s, 25 down, 60 still
+    assert motion.distance == pytest.approx(12 * (550 + 25))
+    assert state.speed[[600, 850, 6350, 6600]] == pytest.approx([0, 12, 12, 0], abs=1e-12)
+    assert (state.yaw_rate == 0).all()
+
+
+def test_out_and_back_stops_at_the_far_end_and_comes_back():
+    motion, state = states('out_and_back')
+    assert chord(state) < 60 < motion.distance / 20
+    assert state.yaw[-1] - state.yaw[0] == pytest.approx(np.pi)
+    still = state.speed == 0
+    stops = np.flatnonzero(still[1:] & ~still[:-1])
+    assert len(stops) == 2
+    half = state.travel[stops[0]]
+    # the same straight back, and the metres of the U turn
+    assert motion.distance - 2 * half == pytest.approx(0, abs=150)
+    assert half > 2000
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_town_is_lively_and_gets_away(seed):
+    motion, state = states('town', seed=seed)
+    assert motion.duration == 600
+    assert chord(state) > 0.35 * motion.distance    # the two-point method wants a fifth
+    assert (state.speed[:200] == 0).all()
+    assert (state.speed[-150:] == 0).all()
+    moves = state.speed > 0
+    assert np.count_nonzero(moves[1:] & ~moves[:-1]) >= 6          # stop and go
+    assert 0.1 < (~moves).mean() < 0.45
+    assert state.speed.max() <= 14
+    assert np.degrees(np.abs(state.yaw_rate)).max() > 8
+    assert np.abs(state.speed * state.yaw_rate).max() < 3.3        # m/s^2 to the side
+    assert state.speed.min() >= 0
+    assert (np.abs(state.yaw_rate[~moves]) == 0).all()             # no turning on the spot
+
+
+def test_towns_differ_by_seed():
+    assert len({states('town', seed=s)[0].distance for s in range(5)}) == 5
+
+
+@pytest.mark.parametrize(('name', 'duration'), [
+    ('paper', 500.0), ('straight', 200.0), ('out_and_back', 300.0), ('town', 3600.0)])
+def test_duration_is_the_drives(name, duration):
+    motion, state = states(name, duration=duration)
+    assert motion.duration == pytest.approx(duration)
+    assert state.speed[-1] == 0
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_marks_are_imu_stamps_at_rest(name):
+    drive = simulate(SimOptions(scenario=name, imu_rate=20.0))
+    for mark in (drive.truth.start_ns, drive.truth.stop_ns):
+        assert mark in drive.imu.stamp_ns
+        assert drive.motion.at([(mark - drive.options.start_ns) * 1e-9]).speed[0] < 1e-9
+    after = drive.truth.start_ns + 200_000_000
+    assert drive.motion.at([(after - drive.options.start_ns) * 1e-9]).speed[0] > 1e-9
+    leg = drive.leg()
+    assert (leg.start_ns, leg.stop_ns) == (drive.truth.start_ns, drive.truth.stop_ns)
+    assert leg.form.scale_unit == 'm/pulse'
+    assert leg.imu is drive.imu
+
+
+def test_every_choice_is_filled_in():
+    for name in SCENARIOS:
+        options = resolved(SimOptions(scenario=name))
+        for field in ('duration', 'imu_grade', 'yaw', 'pitch', 'scale', 'nominal_scale',
+                      'fix_sigma'):
+            assert getattr(options, field) is not BY_SCENARIO
+    assert resolved(options) == options
+    assert resolved(SimOptions(scenario='paper', scale=0.5)).nominal_scale == 0.6
+    assert resolved(SimOptions(odometer='angle', nominal_scale=0.33)).nominal_scale == 0.33
+    assert resolved(SimOptions(fix_noise='rtk')).fix_sigma == 0.02
+
+
+@pytest.mark.parametrize(('change', 'told'), [
+    ({'scenario': 'moon'}, '--scenario moon: want one of paper, straight'),
+    ({'imu_grade': 'best'}, '--imu-grade best: want one of consumer'),
+    ({'fix_noise': 'pink'}, '--fix-noise pink: want one of white'),
+    ({'odometer': 'radar'}, '--odometer radar: want one of counts'),
+    ({'imu_rate': 0.0}, '--imu-rate 0: want a number above 0'),
+    ({'imu_rate': float('nan')}, '--imu-rate nan: want a finite number'),
+    ({'imu_rate': 20_000.0}, '--imu-rate 20000: want at most 10000'),
+    ({'seed': -1}, '--seed -1: want 0 or more'),
+    ({'fix_sigma': -1.0}, '--fix-sigma -1: want 0 or more'),
+    ({'orientation_sigma': -0.1}, '--orientation-sigma-deg -5.7'),
+    ({'pitch': 1.0}, '--pitch-deg 57.2958: want at most 45'),
+    ({'antenna_lever_arm': (0.0, np.inf, 0.0)}, '--antenna-lever-arm inf: want a finite'),
+    ({'outliers': 0.6}, '--outliers 0.6: want at most 0.5'),
+    ({'outages': ((5.0, 2.0),)}, '--outage 5:2: want A:B'),
+    ({'two_wheels': True, 'odometer': 'speed'}, '--two-wheels goes with'),
+    ({'duration': 30_000.0, 'imu_rate': 1000.0}, 'more than 20,000,000 samples'),
+    ({'duration': 100.0}, 'scenario straight: --duration 100 s is too short, give 180'),
+    ({'scenario': 'paper', 'duration': 411.0}, 'scenario paper: .* give 420'),
+    ({'scenario': 'out_and_back', 'duration': 200.0}, 'scenario out_and_back: .* too short'),
+    ({'scenario': 'town', 'duration': 46.0}, 'scenario town: .* holds no cycle')])
+def test_what_cannot_be_driven_is_said(change, told):
+    with pytest.raises(BadUsage, match=told):
+        simulate(replace(SimOptions(), **change))

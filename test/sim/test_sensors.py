@@ -1,0 +1,294 @@
+"""Sensors: noise of the stated density, bounded pulses, streams that do not disturb each other."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.grades import GRADES
+from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
+from odocal_ros.sim import sensors
+from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, Start
+from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
+from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.profile import chain, hold, ramp
+from odocal_ros.sim.scenarios import simulate
+
+TOWN = SimOptions(scenario='town', duration=200.0, imu_rate=50.0)
+MANY = 60_000
+
+
+def sure(n):
+    """Return 5 sigma of the relative error of a variance from n independent draws."""
+    return 5 * np.sqrt(2 / n)
+
+
+def motion(speed=5.0, seconds=20.0):
+    """Return a drive on the level that starts and ends at rest, backwards if speed < 0."""
+    pieces = hold(2) + ramp(4, speed, 1.0) + hold(seconds) + ramp(4, -speed, 1.0) + hold(2)
+    acceleration = chain(pieces)
+    return Motion(acceleration.integral(), chain(hold(acceleration.end)),
+                  Start(0.7, 0.2, 0.0, 0.3))
+
+
+def test_grades_are_those_of_the_method():
+    industrial = GRADES['industrial']
+    # 0.15 deg/sqrt(h) at 1 Hz: 0.15 deg of random walk after an hour
+    assert np.degrees(industrial.gyro_noise) * 60 == pytest.approx(0.15)
+    assert np.degrees(industrial.gyro_bias) * 3600 == pytest.approx(20)
+    # 5 deg/h per sqrt(h): after an hour the bias has gone 5 deg/h
+    assert np.degrees(industrial.gyro_bias_walk) * 3600 * 60 == pytest.approx(5)
+    assert industrial.accel_noise * 60 == pytest.approx(0.03)
+    assert industrial.accel_bias == 0.02
+    assert industrial.accel_bias_walk * 60 == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize('rate', [50.0, 400.0])
+def test_white_noise_has_its_density_at_any_rate(rate):
+    noise = white(stream(3, 'test'), 0.02, rate, (MANY, 3))
+    assert noise.var() / rate == pytest.approx(0.02**2, rel=sure(3 * MANY))
+    # white: neighbours do not know each other, 5 / sqrt(n)
+    together = (noise[1:] * noise[:-1]).mean() / noise.var()
+    assert abs(together) < 5 / np.sqrt(3 * MANY)
+
+
+def test_a_random_walk_starts_at_zero_and_grows_with_the_root_of_time():
+    walk = random_walk(stream(3, 'test'), 0.1, 20.0, (1001, 3000))
+    assert (walk[0] == 0).all()
+    assert walk[1000].var() == pytest.approx(0.1**2 * 50, rel=sure(3000))
+    assert walk[250].var() == pytest.approx(0.1**2 * 12.5, rel=sure(3000))
+
+
+def test_gauss_markov_is_stationary_with_its_correlation_time():
+    tau, sigma, dt = 20.0, 1.5, 0.2
+    t = np.arange(MANY) * dt
+    x = gauss_markov(stream(3, 'test'), sigma, tau, t)
+    decay = np.exp(-dt / tau)
+    push = x[1:] - decay * x[:-1]
+    assert push.var() == pytest.approx(sigma**2 * (1 - decay**2), rel=sure(3 * MANY))
+    # a variance of correlated draws: relative sigma sqrt(2 tau / T), three axes
+    spread = np.sqrt(2 * tau / t[-1] / 3)
+    assert x.var() == pytest.approx(sigma**2, rel=5 * spread)
+    lag = round(tau / dt)
+    together = (x[lag:] * x[:-lag]).mean() / x.var()
+    assert together == pytest.approx(np.exp(-1), abs=5 * spread)
+    firsts = np.array([gauss_markov(stream(s, 'first'), sigma, tau, t[:1]) for s in range(1000)])
+    assert firsts.var() == pytest.approx(sigma**2, rel=sure(3000))
+
+
+@pytest.mark.parametrize('grade', list(GRADES))
+def test_imu_errors_have_the_grades_figures(grade):
+    options = resolved(replace(TOWN, imu_grade=grade))
+    figures = GRADES[grade]
+    gyro, accel = sensors.imu_errors(options, 30_000)
+    for errors, noise, walk in ((gyro, figures.gyro_noise, figures.gyro_bias_walk),
+                                (accel, figures.accel_noise, figures.accel_bias_walk)):
+        steps = np.diff(errors, axis=0)   # no bias left: twice the white variance, and the walk's
+        wanted = 2 * noise**2 * options.imu_rate + walk**2 / options.imu_rate
+        # neighbouring steps share a draw: correlation -1/2 makes the variance 1.5 times as wide
+        assert steps.var() == pytest.approx(wanted, rel=sure(90_000 / 1.5))
+    starts = [sensors.turn_on_biases(replace(options, seed=s)) for s in range(500)]
+    assert np.var([g for g, _ in starts]) == pytest.approx(figures.gyro_bias**2, rel=sure(1500))
+    assert np.var([a for _, a in starts]) == pytest.approx(figures.accel_bias**2, rel=sure(1500))
+
+
+def test_a_perfect_imu_reads_the_motion_through_its_mounting():
+    options = resolved(replace(TOWN, imu_grade='perfect', yaw=0.3, pitch=-0.1, roll=0.05,
+                               mounting_rpy=(np.pi, 0.0, 0.0), imu_lever_arm=(1.0, 0.5, 0.2)))
+    drive = simulate(options)
+    t = (drive.imu.stamp_ns - options.start_ns) * 1e-9
+    w_v, f_v = inertial_v(drive.motion.at(t), options.imu_lever_arm)
+    C_vi = matrix_from_rpy([0.05, -0.1, 0.3]) @ np.diag([1.0, -1.0, -1.0])
+    # rounding of 10 m/s^2
+    assert_allclose(drive.imu.f_i @ C_vi.T, f_v, atol=1e-14)
+    assert_allclose(drive.imu.w_i @ C_vi.T, w_v, atol=1e-15)
+    assert drive.imu.f_i[0, 2] < -9.6     # z down at rest reads -g
+    assert np.isnan(drive.imu.yaw_variance).all()
+
+
+def test_a_yaw_mounting_angle_turns_the_imu_to_the_left():
+    drive = simulate(replace(TOWN, imu_grade='perfect', yaw=0.1, pitch=0.0))
+    t = (drive.imu.stamp_ns - drive.options.start_ns) * 1e-9
+    state = drive.motion.at(t)
+    pulling = (state.acceleration > 1.0) & (state.yaw_rate == 0)
+    # forward acceleration is seen to the right of an x axis that points left; Coriolis at
+    # 14 m/s: 2 w v sin(L) = 1.3e-3 m/s^2 beside 1 m/s^2
+    seen = drive.imu.f_i[pulling]
+    assert_allclose(-seen[:, 1] / seen[:, 0], np.tan(0.1), atol=1.5e-3)
+    assert drive.truth.heading == pytest.approx(drive.options.heading - 0.1)
+
+
+def test_orientation_and_heading_have_one_error_for_the_drive():
+    errors = []
+    for seed in range(60):
+        drive = simulate(replace(TOWN, duration=140.0, imu_rate=10.0, seed=seed,
+                                 orientation_sigma=0.02, heading_sigma=0.005))
+        for sent in (drive.imu, drive.heading):
+            t = (sent.stamp_ns - drive.options.start_ns) * 1e-9
+            C_ni = attitude(drive.motion.at(t)) @ matrix_from_rpy(
+                [0, drive.options.pitch, drive.options.yaw])
+            E = matrix_from_quat(sent.q_ni) @ np.swapaxes(C_ni, -1, -2)
+            error = np.arctan2(E[:, 1, 0], E[:, 0, 0])
+            assert np.ptp(error) < 1e-12
+            errors.append(error[0] / np.sqrt(sent.yaw_variance[0]))
+    assert drive.imu.yaw_variance[0] == 0.02**2
+    assert np.var(errors) == pytest.approx(1, rel=sure(120))
+
+
+@pytest.mark.parametrize('speed', [5.0, -5.0])
+def test_pulses_lag_the_travel_by_less_than_one(speed):
+    drive, options = motion(speed), resolved(TOWN)
+    (sent,) = sensors.odometers(drive, options)
+    t = (sent.stamp_ns - options.start_ns) * 1e-9
+    left = drive.at(t).travel / options.scale - (sent.value - sent.value[0])
+    assert sent.value.dtype == np.int64
+    assert np.ptp(left) < 1              # floor of travel + phase
+    assert np.ptp(left) > 0.9            # and truly whole pulses
+    steps = np.diff(sent.value) * np.sign(speed)
+    assert steps.min() == 0
+    assert steps.sum() == pytest.approx(abs(drive.distance) / options.scale, abs=1)
+
+
+def test_an_angle_is_not_quantised_and_a_speed_is_the_true_one_over_scale():
+    drive = motion()
+    options = resolved(replace(TOWN, odometer='angle'))
+    (sent,) = sensors.odometers(drive, options)
+    t = (sent.stamp_ns - options.start_ns) * 1e-9
+    assert_allclose((sent.value - sent.value[0]) * options.scale, drive.at(t).travel, atol=1e-12)
+    options = resolved(replace(TOWN, odometer='speed'))
+    (sent,) = sensors.odometers(drive, options)
+    assert_allclose(sent.value * options.scale, drive.at(t).speed, atol=1e-14)
+    noisy = sensors.odometers(drive, replace(options, speed_noise=0.05))[0].value
+    assert ((noisy - sent.value) * options.scale).var() == pytest.approx(
+        0.05**2, rel=sure(len(noisy)))
+
+
+def test_two_wheels_roll_on_their_own_sides_with_their_own_scales():
+    drive = simulate(replace(TOWN, two_wheels=True, wheel_difference=0.01, odometer='angle'))
+    left, right = drive.odometer, drive.odometer_right
+    assert np.array_equal(left.stamp_ns, right.stamp_ns)
+    k_left, k_right = drive.truth.wheel_scales
+    assert k_right / k_left == pytest.approx(1.01 / 1.0, rel=1e-4)
+    assert (k_left + k_right) / 2 == pytest.approx(drive.truth.scale)
+    t = (left.stamp_ns - drive.options.start_ns) * 1e-9
+    state = drive.motion.at(t)
+    apart = k_right * (right.value - right.value[0]) - k_left * (left.value - left.value[0])
+    assert_allclose(apart, drive.options.track_width * (state.turned - state.turned[0]),
+                    atol=1e-10)
+    assert np.ptp(state.turned) > 1.0
+
+
+def test_late_stamps_change_no_value():
+    plain = simulate(TOWN)
+    late = simulate(replace(TOWN, odometer_delay=0.05, fix_delay=0.1))
+    assert (late.odometer.stamp_ns - plain.odometer.stamp_ns == 50_000_000).all()
+    assert np.array_equal(late.odometer.value, plain.odometer.value)
+    assert (late.fix.stamp_ns - plain.fix.stamp_ns == 100_000_000).all()
+    assert np.array_equal(late.fix.latitude, plain.fix.latitude)
+
+
+def test_slip_spins_only_while_moving_and_as_much_as_said():
+    options = resolved(replace(TOWN, slip_walk=0.01, odometer_rate=200.0))
+    drive = motion(seconds=200.0)
+    _, t = sensors.stamps(drive.duration, 200.0)
+    state = drive.at(t)
+    steps = np.diff(sensors.slip(state, options))
+    moving = state.speed[1:] > sensors.AT_REST
+    assert (steps[~moving] == 0).all()
+    assert steps[moving].var() == pytest.approx(0.01**2 / 200, rel=sure(moving.sum()))
+    spins = resolved(replace(TOWN, slip_events=300.0, slip_size=0.2))
+    spun = sensors.slip(state, spins)
+    # whole events; 300 / h * 208 s = 17.3 expected, 5 sigma of Poisson: 21
+    events = spun[-1] / 0.2
+    assert events == pytest.approx(round(events), abs=1e-9)
+    assert 1 <= events <= 38
+    assert np.diff(spun).min() >= 0
+
+
+@pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
+def test_fix_errors_are_what_the_covariance_says(noise, sigma):
+    options = resolved(replace(TOWN, fix_noise=noise, fix_sigma=sigma))
+    errors = sensors.fix_errors(np.arange(20_000) * 0.2, options)
+    stated = simulate(options).fix
+    for axis in range(3):
+        assert errors[:, axis].var() == pytest.approx(
+            stated.covariance_n[0, axis, axis], rel=sure(20_000))
+    assert stated.covariance_n[0, 0, 0] == pytest.approx(sigma**2)
+    assert stated.covariance_n[0, 2, 2] == pytest.approx(4 * sigma**2)
+    assert set(stated.status.tolist()) == {2 if noise == 'rtk' else 0}
+
+
+def test_correlated_fixes_keep_their_power_and_forget_slowly():
+    options = resolved(replace(TOWN, fix_noise='correlated', fix_correlation_time=10.0))
+    t = np.arange(100_000) * 0.2
+    errors = sensors.fix_errors(t, options)[:, :2]
+    spread = 5 * np.sqrt(2 * 10.0 / t[-1] / 2)
+    total = simulate(options).fix.covariance_n[0, 0, 0]
+    assert errors.var() == pytest.approx(total, rel=spread)
+    together = (errors[50:] * errors[:-50]).mean()     # 10 s apart: the white part is gone
+    assert together == pytest.approx(1.5**2 * np.exp(-1), abs=1.5**2 * spread)
+
+
+def test_fixes_lie_about_the_antenna():
+    drive = simulate(replace(TOWN, fix_sigma=0.0, antenna_lever_arm=(2.0, 0.5, 1.5)))
+    bare = simulate(replace(TOWN, fix_sigma=0.0))
+    assert_allclose(drive.fix.height - bare.fix.height, 1.5, atol=1e-6)
+    north = (drive.fix.latitude - bare.fix.latitude)[0] * 6.36e6
+    east = (drive.fix.longitude - bare.fix.longitude)[0] * 6.386e6 * np.cos(np.radians(40))
+    # heading 45 deg: forward 2 and left 0.5; radii to 0.2 %
+    assert [east, north] == pytest.approx([1.5 / np.sqrt(2), 2.5 / np.sqrt(2)], rel=2e-3)
+    assert drive.fix.covariance_n[0, 0, 0] == sensors.SIGMA_FLOOR**2   # no receiver says zero
+
+
+def test_outliers_are_as_many_and_as_far_as_said():
+    options = resolved(replace(TOWN, outliers=0.1, fix_sigma=0.0))
+    far = np.hypot(*sensors.fix_errors(np.arange(20_000) * 0.2, options)[:, :2].T)
+    # 5 sigma of a binomial share
+    assert (far > 0).mean() == pytest.approx(0.1, abs=5 * np.sqrt(0.1 * 0.9 / 20_000))
+    assert far[far > 0].min() >= 10
+    assert far.max() <= 30
+
+
+def test_an_outage_has_no_fixes():
+    drive = simulate(replace(TOWN, outages=((50.0, 60.0), (100.0, 101.0))))
+    t = (drive.fix.stamp_ns - drive.options.start_ns) * 1e-9
+    assert not ((t >= 50) & (t < 60)).any()
+    assert not ((t >= 100) & (t < 101)).any()
+    assert len(t) == len(simulate(TOWN).fix.stamp_ns) - 55
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=True)
+               for n in a.__dataclass_fields__)
+
+
+def test_a_seed_is_a_drive_and_no_sensor_disturbs_another():
+    drive = simulate(TOWN)
+    again = simulate(TOWN)
+    assert same(drive.imu, again.imu)
+    assert same(drive.fix, again.fix)
+    assert same(drive.odometer, again.odometer)
+    other = simulate(replace(TOWN, seed=2))
+    assert other.truth.distance != drive.truth.distance
+    changed = simulate(replace(TOWN, fix_rate=1.0, fix_noise='correlated', outliers=0.1,
+                               slip_walk=0.1, heading_sigma=0.1))
+    assert same(changed.imu, drive.imu)
+    assert not same(changed.odometer, drive.odometer)
+    changed = simulate(replace(TOWN, imu_grade='tactical', imu_rate=20.0, odometer_rate=10.0))
+    assert same(changed.fix, drive.fix)
+
+
+def test_topics_are_not_sampled_together():
+    drive = simulate(TOWN)
+    assert not set(drive.imu.stamp_ns.tolist()) & set(drive.odometer.stamp_ns.tolist())
+    assert not set(drive.odometer.stamp_ns.tolist()) & set(drive.fix.stamp_ns.tolist())
+
+
+def test_contact_point_beside_the_axle_sees_the_turn():
+    drive = simulate(replace(TOWN, odometer='angle', odometer_lever_arm=(0.0, 0.7, 0.0)))
+    t = (drive.odometer.stamp_ns - drive.options.start_ns) * 1e-9
+    rolled = (drive.odometer.value - drive.odometer.value[0]) * drive.truth.scale
+    wanted = contact_travel(drive.motion.at(t), (0.0, 0.7, 0.0))
+    assert_allclose(rolled, wanted - wanted[0], atol=1e-10)
+    assert abs(rolled[-1] - drive.motion.distance) > 0.1
