@@ -1,0 +1,131 @@
+"""Legs of a recording: as asked on the command line, as marked, from standstills."""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from odocal_ros.config import Config
+from odocal_ros.errors import BadUsage
+from odocal_ros.leg import LegRecorder
+from odocal_ros.offline.legs import find_legs, LegSpan, marked_legs, parse_leg
+from odocal_ros.sim.scenarios import simulate, SimOptions
+
+S = 10**9
+
+
+@pytest.mark.parametrize(('text', 'span'), [
+    ('12.5:70', LegSpan(12_500_000_000, 70 * S, (True, True))),
+    (':70', LegSpan(None, 70 * S, (False, True))),
+    ('3:', LegSpan(3 * S, None, (True, False))),
+    # a float64 of this second has a grain of 238 ns: the digits must survive
+    ('1750000000.123456789:1750000100.000000001',
+     LegSpan(1_750_000_000_123_456_789, 1_750_000_100_000_000_001, (False, False))),
+    ('2015-05-21T10:00:00Z/2015-05-21T10:01:00.5+00:00',
+     LegSpan(1_432_202_400 * S, 1_432_202_460 * S + S // 2, (False, False))),
+    ('2015-05-21T10:00:00/', LegSpan(1_432_202_400 * S, None, (False, False))),
+])
+def test_leg_is_parsed_to_the_nanosecond(text, span):
+    assert parse_leg(text) == span
+
+
+@pytest.mark.parametrize('text', ['', '5', '1:2:3', 'a:b', '70:12', '5:5', 'nan:3', '1/x',
+                                  '2015-05-21T10:00:00Z/2014-05-21T10:00:00Z'])
+def test_a_leg_that_is_none_is_refused_in_a_sentence(text):
+    with pytest.raises(BadUsage, match='--leg'):
+        parse_leg(text)
+
+
+@dataclass
+class StatusBag:
+    """A bag with status messages of the node, newest last."""
+
+    rows: list = field(default_factory=list)
+    name: str = 'bag'
+    start_ns: int = 0
+    end_ns: int = 10**13
+
+    @property
+    def topics(self):
+        return {'/calibrator/status': SimpleNamespace(
+            name='/calibrator/status', msgtype='diagnostic_msgs/msg/DiagnosticArray')}
+
+    def messages(self, topic):
+        for leg_id, start, stop, event in self.rows:
+            values = {'leg_id': leg_id, 'leg_start_ns': start, 'leg_stop_ns': stop,
+                      'leg_event': event}
+            pairs = [SimpleNamespace(key=k, value=str(v)) for k, v in values.items()]
+            status = SimpleNamespace(name='calibrator: calibration', values=pairs)
+            yield 0, SimpleNamespace(status=[status])
+
+
+def test_marks_of_the_node_are_found_and_cancelled_legs_are_not():
+    bag = StatusBag([
+        ('', 0, 0, ''), ('1', 5 * S, 0, 'started'), ('1', 5 * S, 9 * S, 'stopped'),
+        ('1', 5 * S, 9 * S, ''),
+        ('2', 20 * S, 0, 'started'), ('2', 20 * S, 0, 'cancelled'), ('2', 20 * S, 0, ''),
+        ('3', 30 * S, 0, 'started'), ('3', 30 * S, 40 * S, 'stopped'),
+        ('3', 30 * S, 40 * S, 'undone'), ('4', 50 * S, 0, 'started')])
+    assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
+
+
+def recorded(drive):
+    """Return a recorder fed with a drive, and a bag of its span."""
+    recorder = LegRecorder()
+    for slot in ('imu', 'odometer', 'odometer_right', 'fix', 'heading'):
+        recorder.feed(slot, getattr(drive, slot))
+    recorder.form = drive.form
+    stamps = drive.imu.stamp_ns
+    return recorder, SimpleNamespace(name='bag', start_ns=int(stamps[0]), end_ns=int(stamps[-1]))
+
+
+@pytest.fixture(scope='module')
+def out_and_back():
+    """A drive with a stop at the far end, an intermediate one."""
+    return simulate(SimOptions(scenario='out_and_back', imu_rate=50.0, odometer_rate=20.0))
+
+
+def moving(drive, stamp):
+    """Tell whether the odometer counts within half a second of a stamp."""
+    near = np.abs(drive.odometer.stamp_ns - stamp) < S // 2
+    return np.ptp(drive.odometer.value[near]) > 2
+
+
+def test_without_marks_one_leg_from_first_to_last_standstill(out_and_back):
+    recorder, bag = recorded(out_and_back)
+    (leg,) = find_legs(recorder, bag, [], [], Config())
+    # the opening standstill ends, and the closing one begins, within the detector's window
+    assert abs(leg[0] - out_and_back.truth.start_ns) < S
+    assert leg[1] >= out_and_back.truth.stop_ns - 2 * S
+    assert not moving(out_and_back, leg[0] - S)
+    assert not moving(out_and_back, leg[1])
+
+
+def test_each_stop_splits_where_the_vehicle_stood(out_and_back):
+    recorder, bag = recorded(out_and_back)
+    legs = find_legs(recorder, bag, ['each-stop'], [], Config())
+    assert len(legs) == 2
+    assert legs[0][1] == legs[1][0]
+    for edge in (e for leg in legs for e in leg):
+        assert not moving(out_and_back, edge - S)
+
+
+def test_marks_win_over_standstills_and_asked_legs_over_marks(out_and_back):
+    recorder, bag = recorded(out_and_back)
+    mark = (bag.start_ns + 100 * S, bag.start_ns + 200 * S)
+    assert find_legs(recorder, bag, [], [mark], Config()) == [mark]
+    asked = parse_leg('120:150')
+    assert find_legs(recorder, bag, [asked], [mark], Config()) == [
+        (bag.start_ns + 120 * S, bag.start_ns + 150 * S)]
+    still_open = find_legs(recorder, bag, [], [(mark[0], 0)], Config())
+    assert still_open[0][1] == min(out_and_back.imu.stamp_ns[-1],
+                                   np.median(out_and_back.imu.stamp_ns[-5:]),
+                                   np.median(out_and_back.odometer.stamp_ns[-5:]),
+                                   np.median(out_and_back.fix.stamp_ns[-5:]))
+
+
+def test_a_leg_outside_the_bag_is_refused_with_the_span_there_is(out_and_back):
+    recorder, bag = recorded(out_and_back)
+    with pytest.raises(BadUsage, match=r'runs from 0 to \d+\.\d s'):
+        find_legs(recorder, bag, [parse_leg('5000:6000')], [], Config())
