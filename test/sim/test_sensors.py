@@ -6,7 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.grades import GRADES
+from odocal_ros.grades import Grade, GRADES
 from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, Start
@@ -91,6 +91,15 @@ def test_imu_errors_have_the_grades_figures(grade):
     starts = [sensors.turn_on_biases(replace(options, seed=s)) for s in range(500)]
     assert np.var([g for g, _ in starts]) == pytest.approx(figures.gyro_bias**2, rel=sure(1500))
     assert np.var([a for _, a in starts]) == pytest.approx(figures.accel_bias**2, rel=sure(1500))
+
+
+def test_biases_walk_as_the_grade_says(monkeypatch):
+    monkeypatch.setitem(sensors.SIM_GRADES, 'perfect', Grade(0, 0, 2e-6, 0, 0, 3e-5))
+    options = resolved(replace(TOWN, imu_grade='perfect'))
+    for errors, walk in zip(sensors.imu_errors(options, 10_000), (2e-6, 3e-5), strict=True):
+        steps = np.diff(errors, axis=0)
+        assert steps.var() == pytest.approx(walk**2 / options.imu_rate, rel=sure(3 * 9_999))
+        assert (errors[0] == 0).all()
 
 
 def test_a_perfect_imu_reads_the_motion_through_its_mounting():
@@ -217,6 +226,18 @@ def test_fix_errors_are_what_the_covariance_says(noise, sigma):
     assert stated.covariance_n[0, 0, 0] == pytest.approx(sigma**2)
     assert stated.covariance_n[0, 2, 2] == pytest.approx(4 * sigma**2)
     assert set(stated.status.tolist()) == {2 if noise == 'rtk' else 0}
+
+
+def test_fix_errors_go_east_north_and_up():
+    noisy, bare = (simulate(replace(TOWN, fix_sigma=sigma)) for sigma in (5.0, 0.0))
+    t = (bare.fix.stamp_ns - bare.options.start_ns) * 1e-9
+    errors = sensors.fix_errors(t, noisy.options)
+    east = (noisy.fix.longitude - bare.fix.longitude) * np.cos(bare.fix.latitude)
+    north = noisy.fix.latitude - bare.fix.latitude
+    # radii of WGS 84 at 40 deg, to the 20 m that height and latitude change them, of 20 m
+    assert_allclose(east * 6_386_976, errors[:, 0], atol=2e-3)
+    assert_allclose(north * 6_361_816, errors[:, 1], atol=2e-3)
+    assert_allclose(noisy.fix.height - bare.fix.height, errors[:, 2], atol=1e-8)
 
 
 def test_correlated_fixes_keep_their_power_and_forget_slowly():
