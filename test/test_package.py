@@ -1,0 +1,163 @@
+"""The package as pip and colcon install it: what is declared, and what starts."""
+
+import ast
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import uuid
+from xml.etree import ElementTree
+
+import pytest
+
+import odocal_ros
+
+ROOT = Path(__file__).resolve().parent.parent
+PARTS = ('package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml', 'README.md', 'LICENSE',
+         'resource', 'config', 'launch', 'odocal_ros')
+XML = ElementTree.parse(ROOT / 'package.xml').getroot()
+# import name: what package.xml and setup.py call it
+KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
+        'pyproj': ('python3-pyproj', 'pyproj'), 'rosbags': ('python3-rosbags-pip', 'rosbags'),
+        'tqdm': ('python3-tqdm', 'tqdm')}
+WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
+
+
+def imported():
+    """Return the names of all foreign packages that the package and its launch files import."""
+    names = set()
+    for path in [*(ROOT / 'odocal_ros').rglob('*.py'), *(ROOT / 'launch').rglob('*.py')]:
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names.add(node.module.split('.')[0])
+    return names - set(sys.stdlib_module_names) - {'odocal_ros'} - WITH_ROSBAGS
+
+
+def test_one_version_everywhere():
+    version = odocal_ros.__version__
+    assert XML.findtext('version') == version
+    changes = (ROOT / 'CHANGELOG.rst').read_text()
+    assert re.search(r'^(\d+\.\d+\.\d+) \(', changes, re.MULTILINE).group(1) == version
+
+
+def test_package_xml_names_all_that_is_imported():
+    declared = {e.text for e in XML.findall('exec_depend')}
+    wanted = {KEYS[name][0] if name in KEYS else name for name in imported()}
+    assert len(wanted) > 10
+    assert wanted <= declared
+    assert XML.attrib['format'] == '3'
+    assert XML.findtext('export/build_type') == 'ament_python'
+
+
+def test_setup_requires_all_that_is_imported_but_ros():
+    setup = (ROOT / 'setup.py').read_text()
+    block = setup.partition('install_requires=[')[2].partition(']')[0]
+    required = set(re.findall(r"'([A-Za-z]+)", block))
+    foreign = imported() & set(KEYS)
+    assert required == {KEYS[name][1] for name in foreign}
+
+
+def copy_of_the_package(target: Path) -> Path:
+    target.mkdir(parents=True)
+    for part in PARTS:
+        source = ROOT / part
+        if source.is_dir():
+            shutil.copytree(source, target / part,
+                            ignore=shutil.ignore_patterns('__pycache__', '*.egg-info'))
+        else:
+            shutil.copy(source, target / part)
+    return target
+
+
+def clean_environment(**more) -> dict[str, str]:
+    """Return the environment without what ties it to this interpreter or checkout."""
+    drop = ('PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH')
+    return {k: v for k, v in os.environ.items()
+            if k not in drop and not k.startswith(('_ROS_', 'COLCON_'))} | more
+
+
+def run(*command, **more):
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.mark.parametrize('editable', [False, True], ids=['plain', 'editable'])
+def test_pip_puts_both_commands_on_the_path(tmp_path, editable):
+    source = copy_of_the_package(tmp_path / 'source')
+    run(sys.executable, '-m', 'venv', tmp_path / 'venv', env=clean_environment())
+    bin_ = tmp_path / 'venv' / 'bin'
+    install = subprocess.run(
+        [bin_ / 'python', '-m', 'pip', 'install', '--no-deps', '--disable-pip-version-check',
+         *(['--editable'] if editable else []), str(source)],
+        capture_output=True, text=True, env=clean_environment(), cwd=tmp_path)
+    if 'No matching distribution found for setuptools' in install.stderr:
+        pytest.skip('NO PACKAGE INDEX HERE: pip could not fetch setuptools to build with')
+    assert install.returncode == 0, install.stderr
+    assert (bin_ / 'calibrator').exists()
+    share = tmp_path / 'venv' / 'share'
+    assert (share / 'odocal_ros' / 'package.xml').exists() or editable
+    env = clean_environment()
+    assert 'replay' in run(bin_ / 'odocal', '--help', env=env, cwd=tmp_path).stdout
+    version = run(bin_ / 'odocal', '--version', env=env, cwd=tmp_path).stdout
+    assert version.strip() == f'odocal_ros {odocal_ros.__version__}'
+
+
+@pytest.fixture(scope='module')
+def installed(tmp_path_factory):
+    """Build the package with colcon and return its install folder."""
+    colcon = shutil.which('colcon', path=str(Path(sys.executable).parent))
+    if colcon is None:
+        pytest.skip('NO COLCON beside this Python: pip install colcon-common-extensions')
+    work = tmp_path_factory.mktemp('colcon')
+    copy_of_the_package(work / 'src' / 'odocal_ros')
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
+    run(colcon, '--log-base', 'log', 'build', cwd=work, env=clean_environment(PATH=path))
+    return work / 'install' / 'odocal_ros'
+
+
+def environment_of(installed) -> dict[str, str]:
+    site, = installed.glob('lib/python3*/site-packages')
+    return clean_environment(PYTHONPATH=str(site))
+
+
+def test_colcon_puts_both_commands_where_ros2_run_looks(installed):
+    assert {p.name for p in (installed / 'lib' / 'odocal_ros').iterdir()} == {
+        'calibrator', 'odocal'}
+    share = installed / 'share'
+    assert (share / 'ament_index' / 'resource_index' / 'packages' / 'odocal_ros').exists()
+    assert (share / 'odocal_ros' / 'package.xml').exists()
+    assert (share / 'odocal_ros' / 'config' / 'calibrator.yaml').exists()
+    assert (share / 'odocal_ros' / 'launch' / 'calibrator.launch.py').exists()
+    out = run(installed / 'lib' / 'odocal_ros' / 'odocal', '--help',
+              env=environment_of(installed), cwd=installed).stdout
+    assert 'replay' in out
+
+
+def test_the_node_that_colcon_installed_starts_and_ends(installed):
+    rclpy = pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
+    from std_srvs.srv import Trigger
+    space = f'package_{uuid.uuid4().hex}'
+    node = subprocess.Popen(
+        [installed / 'lib' / 'odocal_ros' / 'calibrator', '--ros-args', '-r', f'__ns:=/{space}',
+         '--params-file', installed / 'share' / 'odocal_ros' / 'config' / 'calibrator.yaml'],
+        env=environment_of(installed), cwd=installed, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True)
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        client = rclpy.create_node('looks', context=context)
+        service = client.create_client(Trigger, f'/{space}/calibrator/start_leg')
+        answers = service.wait_for_service(timeout_sec=30)
+    finally:
+        rclpy.shutdown(context=context)
+        node.send_signal(signal.SIGINT)
+        output, _ = node.communicate(timeout=30)
+    assert answers, output
+    assert node.returncode == 0, output
+    assert 'Traceback' not in output
