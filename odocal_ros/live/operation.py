@@ -98,7 +98,9 @@ class Operation:
             self._end_leg()
 
     def _end_leg(self) -> None:
-        self.session.stop(self._mark_ns())
+        mark_ns = self._mark_ns()
+        self._distance_m = self._recording.progress.distance_m()
+        self.session.stop(mark_ns)
         self._close_by_ns = self._steady.now().nanoseconds + round(PATIENCE_S * 1e9)
         self.show_status()
         self._close_when_complete()

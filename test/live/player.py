@@ -1,7 +1,9 @@
 """A small rclpy player: publishes serialised messages by their stamps, N times real time."""
 
+import contextlib
 from dataclasses import dataclass
 import importlib
+import threading
 import time
 
 import numpy as np
@@ -43,6 +45,7 @@ class Player:
         names = {'imu': 'imu/data', 'odometer': 'odometer', 'fix': 'fix'} | (names or {})
         qos = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
         self.publishers = {}
+        self._stop = threading.Event()
         for slot, msgtype in types.items():
             package, folder, name = msgtype.split('/')
             kind = getattr(importlib.import_module(f'{package}.{folder}'), name)
@@ -52,6 +55,19 @@ class Player:
         """Return whether every topic has a subscriber."""
         return all(p.get_subscription_count() for p in self.publishers.values())
 
+    @contextlib.contextmanager
+    def playing(self, messages: list[Sent], speed: float):
+        """Publish in a thread for as long as the block lasts."""
+        self._stop.clear()
+        thread = threading.Thread(target=self.play, args=(messages, speed), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            thread.join()
+            self._stop.clear()
+
     def play(self, messages: list[Sent], speed: float) -> None:
         """Publish messages in the rhythm of their stamps, ``speed`` times real time."""
         if not messages:
@@ -59,8 +75,8 @@ class Player:
         begin, first_ns = time.monotonic(), messages[0].stamp_ns
         for one in messages:
             ahead = (one.stamp_ns - first_ns) * 1e-9 / speed - (time.monotonic() - begin)
-            if ahead > 0.001:
-                time.sleep(ahead)
+            if ahead > 0.001 and self._stop.wait(ahead):
+                return
             self.publishers[one.slot].publish(one.raw)
 
 
