@@ -64,7 +64,7 @@ class Code(Enum):
                                'between start and end.')
     SPEED_TOO_LOW = CAUTION, 'Drive faster than leg.min_speed for at least part of the leg.'
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
-    TRACK_MISMATCH = CAUTION, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
+    TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
                                'fixes; drive again on a firm straight road with open sky.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
