@@ -1,0 +1,104 @@
+"""The pages keep their word: commands parse, names exist, tables are those of the code."""
+
+from pathlib import Path
+import re
+import shlex
+
+import pytest
+
+from odocal_ros import settings_page
+from odocal_ros.offline import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / name for name in ('README.md', 'CONTRIBUTING.md', 'docs/conventions.md',
+                                  'docs/method.md')] + sorted(
+    (ROOT / 'docs' / 'decisions').glob('*.md'))
+README = (ROOT / 'README.md').read_text(encoding='utf-8')
+
+
+def commands(page: str) -> list[str]:
+    """Return the lines of code blocks without their comments, and code spans of odocal."""
+    blocks = re.findall(r'^```\n(.*?)^```', page, re.MULTILINE | re.DOTALL)
+    lines = [line.partition('  #')[0].strip() for block in blocks for line in block.splitlines()]
+    return lines + re.findall(r'`(odocal [^`]+)`', page)
+
+
+@pytest.mark.parametrize('path', [*settings_page.pages()], ids=lambda path: path.name)
+def test_pages_made_from_the_code_are_fresh(path):
+    assert path.read_text(encoding='utf-8') == settings_page.pages()[path], (
+        'stale: run python -m odocal_ros.settings_page --write')
+
+
+def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
+    (tmp_path / 'config').mkdir()
+    (tmp_path / 'README.md').write_text(README.replace('| `method` | string |', '| old |'))
+    (tmp_path / 'config' / 'calibrator.yaml').write_text('old')
+    fresh = settings_page.pages
+    monkeypatch.setattr(settings_page, 'pages', lambda: fresh(tmp_path))
+    monkeypatch.setattr('sys.argv', ['settings_page'])
+    assert settings_page.main() == 1
+    assert capsys.readouterr().out.count('stale: ') == 2
+    monkeypatch.setattr('sys.argv', ['settings_page', '--write'])
+    assert settings_page.main() == 0
+    assert (tmp_path / 'README.md').read_text() == README
+    monkeypatch.setattr('sys.argv', ['settings_page'])
+    assert settings_page.main() == 0
+    with pytest.raises(ValueError, match='the page has no'):
+        settings_page.filled('no tables here')
+
+
+def test_odocal_commands_parse():
+    lines = [line for page in PAGES for line in commands(page.read_text(encoding='utf-8'))
+             if line.startswith('odocal ')]
+    assert len(lines) >= 3
+    for line in lines:
+        words = shlex.split(line)[1:]
+        args = cli._parser({words[0]}).parse_args(words)
+        assert args.command == words[0], line
+
+
+def test_scripts_and_links_exist():
+    for page in PAGES:
+        text = page.read_text(encoding='utf-8')
+        for link in re.findall(r'\]\((?!http)([^)#]+)\)', text):
+            assert (page.parent / link).exists(), f'{page.name}: {link}'
+        for line in commands(text):
+            if line.startswith(('./tools/', '.ci/')):
+                script = ROOT / shlex.split(line)[0]
+                assert script.stat().st_mode & 0o111, line
+    for name in re.findall(r'`((?:odocal_ros|test|config|docs|launch)/[\w./]+)`', ''.join(
+            page.read_text(encoding='utf-8') for page in PAGES)):
+        assert (ROOT / name).exists(), name
+
+
+def test_modules_of_the_method_page_exist():
+    for page in PAGES:
+        for name in re.findall(r'`((?:\w+/)*\w+\.py)`', page.read_text(encoding='utf-8')):
+            places = (ROOT / name, ROOT / 'odocal_ros' / name)
+            assert any(p.exists() for p in places), f'{page.name}: {name}'
+
+
+def test_settings_and_reasons_named_in_the_text_exist():
+    from odocal_ros.config import SETTINGS
+    from odocal_ros.reasons import Code
+    groups = {name.partition('.')[0] for name in SETTINGS if '.' in name}
+    for page in PAGES:
+        text = re.sub(r'<!-- (\w+): begin -->.*?<!-- \1: end -->', '',
+                      page.read_text(encoding='utf-8'), flags=re.DOTALL)
+        for name in re.findall(r'`([a-z_]+\.[a-z_]+)`', text):
+            if name.partition('.')[0] in groups and not name.endswith(('.py', '.yaml')):
+                assert name in SETTINGS, f'{page.name}: {name}'
+        for name in re.findall(r'`([A-Z]+_[A-Z_]+)`', text):
+            if not name.startswith('ODOCAL'):
+                assert name in Code.__members__, f'{page.name}: {name}'
+        for name, _ in re.findall(r'--set ([\w.]+)=(\S+)', text):
+            assert name in SETTINGS, f'{page.name}: {name}'
+
+
+def test_the_node_offers_what_the_readme_lists():
+    pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
+    from odocal_ros.live import inputs, node
+    services = set(re.findall(r'`~/(\w+)`', README)) - {'status'}
+    assert services == set(node.SERVICES)
+    for topic in inputs.TOPICS.values():
+        assert f'`{topic}`' in README, topic
