@@ -5,14 +5,17 @@ A leg's end displacement D = M f (M: attitude summed over travel, f: scale times
 is set equal to the chord between the reference positions. An error e of the chord against D, m,
 moves f by M^-1 e, and so ln K, yaw and pitch; each source is written as the e that one sigma of it
 makes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
-gyro error at time tau turns all that is still to come: r(tau) = D(end) - D(tau).
+gyro error at time tau turns all that is still to come: r(tau) = D(end) - D(tau). Epochs may begin
+before the start mark, where the attitude was aligned: D is zero there and the gyros already err.
 """
 
 import numpy as np
 
 from odocal_ros.calib.result import Source
+from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import skew
 
+HEIGHT_UNKNOWN = 500.0    # m: fixes without a height are put on the ellipsoid, roads seldom are
 PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
@@ -43,8 +46,8 @@ def drift_sources(t, D, C_nb, alignment):
 
     Returns
     -------
-    dict of name to (3, k) array: bias (one column an axis of b), noise and bias walk (columns of
-    a Cholesky factor): integrals of r x (the error) over the leg.
+    dict of name to (3, k) array: bias by axis of b, noise and bias walk (columns of a root of the
+    covariance): integrals of r x (the error) over the leg.
 
     """
     r = D[-1] - D
@@ -55,7 +58,7 @@ def drift_sources(t, D, C_nb, alignment):
     # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
     slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
-    return {'gyro_bias': bias,
+    return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
             'gyro_noise': alignment.gyro_noise * _root(_spread(r, dt)),
             'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
 
@@ -73,19 +76,46 @@ def _root(covariance):
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
+def _late_odometer(f, t, D, C_nb, start, end):
+    """
+    Return what an odometer that is late by 1 s does to the chord, (3,) m.
+
+    Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
+    track has at one end and lacks at the other, v(end) - v(start).
+    """
+    middle = (C_nb[:-1] + C_nb[1:]) @ f / 2
+    speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
+    turned = (np.diff(C_nb, axis=0) @ f * speed[:, None]).sum(axis=0)
+    v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
+    v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
+    return turned - (v_end - v_start)
+
+
+def _velocity(t, D, begin, end):
+    """Return the mean velocity between two times, (3,) m/s."""
+    ends = np.stack([np.interp([begin, end], t, D[:, k]) for k in range(3)], -1)
+    return (ends[1] - ends[0]) / max(end - begin, 1e-9)
+
+
 def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_sigma,
-           velocity_change, lever_arm_sigma):
+           velocity_change, lever_arm_sigma, odometer_time_sigma):
     """
     Return the sources of error of (ln K, yaw, pitch) for one leg.
+
+    The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the error that
+    both ends share, which makes the Earth, and so the chord, larger. ``projection`` is there to
+    be seen to be zero: the chord is taken in space, not in a plane (method.md 1.1).
 
     Parameters
     ----------
     f : (3,)
-        Solution, m per unit of travel, in b.      M : (3, 3) attitude summed over travel.
+        Solution, m per unit of travel, in b.
+    M : (3, 3) array
+        Attitude summed over travel.
     start, end : MarkFix
         Reference positions.
     t, D, C_nb : arrays
-        The track, as in drift_sources.
+        The track, as in drift_sources, from the alignment or the start mark to the end mark.
     alignment : Alignment
         Level, heading and gyro sigmas.
     quantum : float
@@ -98,6 +128,8 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
         Velocity at the end mark less that at the start, m/s; zero between standing marks.
     lever_arm_sigma : float
         m, each axis.
+    odometer_time_sigma : float
+        Unknown latency of the odometer, s.
 
     """
     forward = D[-1] / np.linalg.norm(D[-1])
@@ -110,14 +142,26 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
         **drift_sources(t, D, C_nb, alignment),
         'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
         'fix_latency': (velocity_change * time_sigma)[:, None],
-        'antenna_lever_arm': (C_nb[-1] - C_nb[0]) * lever_arm_sigma,
+        'antenna_lever_arm': (C_nb[-1] - C_nb[np.searchsorted(t, start.t - 1e-9)])
+        * lever_arm_sigma,
+        'odometer_delay': (_late_odometer(f, t, D, C_nb, start, end)
+                           * odometer_time_sigma)[:, None],
+        'height': (D[-1] * _height_sigma(start, end) / A)[:, None],
+        'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
-    shared = {'fix_latency', 'antenna_lever_arm'} | (
+    shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height'} | (
         {'initial_heading'} if alignment.heading_shared else set())
     sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
     height = start.covariance_n[2, 2] + end.covariance_n[2, 2]
     return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))
+
+
+def _height_sigma(start, end):
+    """Return how well the height that both ends share is known, m."""
+    if not (start.height_known and end.height_known):
+        return HEIGHT_UNKNOWN
+    return float(np.sqrt((start.covariance_n[2, 2] + end.covariance_n[2, 2]) / 2))
 
 
 def _second_order(t, D, alignment, height_variance):

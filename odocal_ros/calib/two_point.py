@@ -8,7 +8,7 @@ between the reference positions, M f = c gives f = K forward_b, and so scale, ya
 once. The plane and the geodesic of the source are the cross-check.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
 from odocal_ros.nav.projection import geodesic_chord, plane_chord
+from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
 CHORD_SHARE = 0.2        # of the path: under it, the chord is no measure of the path
@@ -63,7 +64,7 @@ def solve(chord: Chord, up_scale=1.0):
     antenna = chord.end.position_n - chord.start.position_n
     sigma = np.sqrt(chord.start.covariance_n[2, 2] + chord.end.covariance_n[2, 2])
     vertical_known = bool(chord.start.height_known and chord.end.height_known
-                          and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
+                          and up_scale < np.inf and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
     f = np.array([1.0, 0.0, 0.0])
     for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
         yaw, pitch = mounting_from_forward(f / np.linalg.norm(f))
@@ -89,9 +90,12 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
     between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
     path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
     length = np.hypot(*(chord.end.position_n - chord.start.position_n)[:2])
-    if length < CHORD_SHARE * path or length == 0.0:
-        return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end is {length:.1f} m, '
-                       f'under a fifth of the {path:.1f} m driven'),)
+    # the length of the track's own chord, whatever the yaw: M is a turn times it
+    reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
+    for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
+        if chord_length <= CHORD_SHARE * path:
+            return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
+                           f'{chord_length:.1f} m, under a fifth of the {path:.1f} m driven'),)
     return ()
 
 
@@ -142,7 +146,8 @@ def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> 
         else Estimate(None, None, 'rad')}
     details = {'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
                'correlation': _correlations(covariance),
-               'cross_check': _cross_check(chord, f, nominal_scale or K, config),
+               'cross_check': _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0
+                                          else K, config),
                'heading_source': chord.alignment.heading_source}
     reasons += _planes_agree(details['cross_check'], K, sigma[0])
     return MethodResult('two_point', reasons, estimates, PARAMETERS, sources,
@@ -151,18 +156,22 @@ def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> 
 
 def _sources(chord, f, vertical_known, quantum, fix_scale, config):
     track = chord.track
-    keep = (track.t >= chord.start.t) & (track.t <= chord.end.t)
-    P = track.P[keep] - track.at(chord.start.t)
+    # the gyros err from the alignment on; but a fixed heading holds at the mark itself
+    first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
+    keep = (track.t >= min(first, chord.start.t)) & (track.t <= chord.end.t)
+    t = track.t[keep]
+    D = (track.P[keep] - track.at(chord.start.t)) @ f * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the belief in the pitch stands in for the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
-    C_nb = chord.track.C_nb_at(track.t[keep])
+    C_nb = matrix_from_quat(track.q_nb[keep])
     K = float(np.linalg.norm(f))
-    return budget(f, M, start, end, track.t[keep], P @ f, C_nb, chord.alignment,
+    return budget(f, M, start, end, t, D, C_nb, chord.alignment,
                   quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
                   velocity_change=chord.velocity_change @ f,
-                  lever_arm_sigma=config.gnss.lever_arm_sigma)
+                  lever_arm_sigma=config.gnss.lever_arm_sigma,
+                  odometer_time_sigma=config.odometer.time_sigma)
 
 
 def _blind_height(mark, sigma=0.0):
@@ -170,7 +179,7 @@ def _blind_height(mark, sigma=0.0):
     covariance = mark.covariance_n.copy()
     covariance[2, :] = covariance[:, 2] = 0.0
     covariance[2, 2] = sigma**2
-    return MarkFix(mark.t, mark.position_n, covariance, mark.standing, mark.used, mark.dropped)
+    return replace(mark, covariance_n=covariance)
 
 
 def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
