@@ -180,11 +180,12 @@ class Operation:
             self._log.info(future.result()[1])
             self.show_status()
 
-        topics = {slot: one.topic for slot, one in self._recording.inputs.by_slot.items()
-                  if one.reader is not None}
+        inputs = self._recording.inputs.by_slot
+        topics = {slot: one.topic for slot, one in inputs.items() if one.reader is not None}
         self._worker.submit(partial(
             outputs.save, self.session.calibration, self.session.config,
-            [{'bag': '', 'topics': topics}], self._clock.now().nanoseconds), then)
+            [{'bag': '', 'sha256': None, 'topics': topics}], inputs['imu'].frame,
+            self._clock.now().nanoseconds), then)
         return future
 
     def _promise(self) -> Future:

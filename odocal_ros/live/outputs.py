@@ -11,7 +11,7 @@ import numpy as np
 from std_msgs.msg import Header
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
+from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import OdocalError
 
 MOST_POSES = 2000
@@ -48,9 +48,12 @@ def output_root(config: Config) -> Path:
     return Path(config.output.directory or Path(home) / 'odocal').expanduser()
 
 
-def save(calibration: Calibration, config: Config, inputs: list[dict], now_ns: int) -> Path:
+def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
+         now_ns: int) -> Path:
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
+
+    ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty.
 
     Raises
     ------
@@ -59,6 +62,8 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], now_ns: i
 
     """
     from odocal_ros.output.files import write_results
+    if not config.frames.imu and imu_frame:
+        config = with_settings(config, {'frames.imu': imu_frame})
     root = output_root(config)
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:

@@ -1,5 +1,6 @@
 """Settings as ROS parameters, and the result as parameters that only the node may set."""
 
+import difflib
 import math
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -72,7 +73,17 @@ def declare(node: Node) -> Config:
         except ParameterException as error:
             raise BadConfig(_refusal(name, setting, error)) from None
         values[name] = setting.default if value is None else _plain(value)
+    _warn_of_typos(node)
     return with_settings(Config(), values)
+
+
+def _warn_of_typos(node: Node) -> None:
+    """Name overrides that are nearly settings; ROS passes over what nobody declares."""
+    for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public way to them
+        near = difflib.get_close_matches(name, SETTINGS, 1, 0.8)
+        if near and name not in SETTINGS:
+            node.get_logger().warning(
+                f'no parameter {name}: did you mean {near[0]}? It is not taken.')
 
 
 def changed(config: Config, parameters: list[Parameter]) -> Config:

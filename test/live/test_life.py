@@ -87,6 +87,29 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.get('leg.min_distance') == [250.0]
 
 
+def test_a_parameter_that_does_not_exist_is_named(start, connect):
+    node = start('-p', 'leg.min_distanse:=3.0', '-p', 'somebody.elses:=1')
+    connect().until(state='waiting')
+    assert 'no parameter leg.min_distanse: did you mean leg.min_distance?' in node.text
+    assert 'somebody' not in node.text
+
+
+def test_messages_that_cannot_be_read_are_said(start, connect):
+    from std_msgs.msg import Int32MultiArray
+    start('-p', 'odometer.field:=data[3]')
+    client = connect()
+    publisher = client.node.create_publisher(Int32MultiArray, 'odometer', 10)
+    wait_for(publisher.get_subscription_count, 'the subscription')
+
+    def unreadable():
+        publisher.publish(Int32MultiArray(data=[1, 2]))
+        health = client.health.get('calibrator: odometer', {})
+        return health.get('unreadable', '0') != '0' and health
+    health = wait_for(unreadable, 'the count')
+    assert health['message'].startswith('/odometer: ')
+    assert 'data[3]' in client.until(state='waiting')['missing']
+
+
 def test_the_shipped_parameter_file_is_taken_as_it_is(start, connect):
     start('--params-file', str(ROOT / 'config' / 'calibrator.yaml'))
     client = connect()

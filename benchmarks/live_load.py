@@ -1,0 +1,165 @@
+"""
+What the node costs while it records: beside a bare typed subscriber of the same topics.
+
+    python benchmarks/live_load.py [--seconds 20] [--imu 1000] [--odometer 250] [--fix 25]
+
+A publisher process sends Imu, pulses and fixes; the calibrator and a bare rclpy node that
+subscribes to the same topics, typed, with an empty callback, run beside it, all at once. Printed:
+CPU of one core for each, messages lost, and the latency of a service call during a leg.
+"""
+
+import argparse
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
+
+TICKS = 100   # per second in /proc/<pid>/stat, on every Linux
+
+
+def publish(rates) -> None:
+    """Send the three topics in their rhythm, by wall-clock stamps, until ended."""
+    import rclpy
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import Imu, NavSatFix
+    from std_msgs.msg import Int64
+    rclpy.init()
+    node = rclpy.create_node('load')
+    qos = QoSProfile(depth=1000)
+    imu, fix = Imu(), NavSatFix()
+    imu.header.frame_id, fix.header.frame_id = 'imu_link', 'gnss'
+    imu.linear_acceleration.z, imu.orientation_covariance[0] = 9.81, -1.0
+    fix.latitude, fix.longitude, fix.position_covariance_type = 40.0, 116.0, 2
+    fix.position_covariance[0] = fix.position_covariance[4] = fix.position_covariance[8] = 1.0
+    pulses = Int64()
+    topics = [(node.create_publisher(type(m), name, qos), m, 1 / rate) for m, name, rate in
+              zip((imu, pulses, fix), ('imu/data', 'odometer', 'fix'), rates, strict=True)]
+    while any(publisher.get_subscription_count() < 2 for publisher, _, _ in topics):
+        time.sleep(0.05)   # both listeners: nothing sent before may count as lost
+    begin, sent, last = time.monotonic(), [0, 0, 0], 0.0
+    try:
+        while True:
+            now = time.monotonic() - begin
+            for i, (publisher, message, period) in enumerate(topics):
+                while sent[i] * period <= now:
+                    if hasattr(message, 'header'):
+                        message.header.stamp = node.get_clock().now().to_msg()
+                    else:
+                        message.data += 1
+                    publisher.publish(message)
+                    sent[i] += 1
+            if now > last + 0.2:
+                last = now
+                print(*sent, flush=True)
+            time.sleep(0.0005)
+    except (KeyboardInterrupt, Exception):
+        print(*sent, flush=True)
+
+
+def listen() -> None:
+    """Subscribe typed with empty callbacks; count nothing but messages."""
+    import rclpy
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import Imu, NavSatFix
+    from std_msgs.msg import Int64
+    rclpy.init()
+    node = rclpy.create_node('bare')
+    qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+    def nothing(_):
+        return
+
+    for kind, name in ((Imu, 'imu/data'), (Int64, 'odometer'), (NavSatFix, 'fix')):
+        node.create_subscription(kind, name, nothing, qos)
+    try:
+        rclpy.spin(node)
+    except BaseException:
+        return
+
+
+def cpu_s(pid: int) -> float:
+    """Return seconds of CPU that a process has used, all its threads."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def measure(args) -> None:
+    """Run the three processes and print what they used."""
+    from bench import Client, NodeProcess, wait_for
+    rates = (args.imu, args.odometer, args.fix)
+    me = [sys.executable, __file__]
+    folder = tempfile.mkdtemp()
+    node = NodeProcess('-p', f'output.directory:={folder}')
+    bare = subprocess.Popen([*me, '--role', 'listen'])
+    client = Client()
+    client.until(state='waiting')
+    load = subprocess.Popen([*me, '--role', 'publish', '--rates', *map(str, rates)],
+                            stdout=subprocess.PIPE, text=True)
+    try:
+        client.until(state='idle')
+        wait_for(lambda: float(client.status['imu_rate_hz']) > 0.9 * args.imu, 'the full rate')
+        assert client.call('start_leg').success
+        before = [cpu_s(p.pid) for p in (node.process, bare)]
+        begin, latencies = time.monotonic(), []
+        while time.monotonic() - begin < args.seconds:
+            asked = time.perf_counter()
+            client.call('start_leg')     # answers 'recording since'
+            latencies.append((time.perf_counter() - asked) * 1e3)
+            time.sleep(0.1)
+        seconds = time.monotonic() - begin
+        used = [(cpu_s(p.pid) - b) / seconds * 100 for p, b in
+                zip((node.process, bare), before, strict=True)]
+        client.call('cancel_leg')
+        load.terminate()
+        sent = [int(x) for x in load.communicate()[0].split()[-3:]]
+        report(args, client, sent, used, latencies)
+    finally:
+        for process in (load, bare):
+            process.terminate()
+        node.end()
+        client.close()
+
+
+def report(args, client, sent, used, latencies) -> None:
+    """Print the figures."""
+    time.sleep(2.5)   # the last /diagnostics comes within its period of 1 s
+    health = [client.health[f'calibrator: {name}'] for name in ('imu', 'odometer', 'gnss')]
+    lost = [int(h['dropped']) for h in health]
+    ordered = sorted(latencies)
+    print(f'rates {args.imu:g} / {args.odometer:g} / {args.fix:g} Hz (Imu, pulses, fixes), '
+          f'{args.seconds:g} s in a leg')
+    print(f'sent {sent}; received {[int(h["messages"]) for h in health]}; lost by sequence '
+          f'numbers {lost}')
+    print(f'CPU of one core: calibrator {used[0]:.1f} %, bare typed subscriber {used[1]:.1f} %, '
+          f'ratio {used[0] / used[1]:.2f}')
+    print(f'service call in a leg, {len(latencies)} calls: median '
+          f'{statistics.median(latencies):.1f} ms, p90 {ordered[int(0.9 * len(ordered))]:.1f} ms, '
+          f'max {ordered[-1]:.1f} ms')
+
+
+def main() -> None:
+    """Run one role; without one, measure."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--seconds', type=float, default=20.0)
+    parser.add_argument('--imu', type=float, default=1000.0)
+    parser.add_argument('--odometer', type=float, default=250.0)
+    parser.add_argument('--fix', type=float, default=25.0)
+    parser.add_argument('--role', choices=('publish', 'listen'), help=argparse.SUPPRESS)
+    parser.add_argument('--rates', nargs=3, type=float, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.role == 'publish':
+        publish(args.rates)
+    elif args.role == 'listen':
+        listen()
+    else:
+        measure(args)
+
+
+if __name__ == '__main__':
+    main()
