@@ -119,7 +119,7 @@ def _blocks(node, prefix) -> dict[str, list]:
         if key == PARAMETERS and prefix:
             found.setdefault(prefix, []).append(value)
         elif isinstance(key, str):
-            name = f'{prefix}/{key.lstrip("/")}' if prefix else key
+            name = f'{prefix}/{key}' if prefix else key
             for deeper, mappings in _blocks(value, name).items():
                 found.setdefault(deeper, []).extend(mappings)
     return found

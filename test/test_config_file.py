@@ -155,23 +155,51 @@ def test_file_then_set_is_the_order(write):
 SCALARS = ['true', 'yes', 'Y', 'on', 'off', 'no', 'n', '3', '+3', '-3', '0x10', '010', '08', '0',
            '1.', '.5', '1e3', '1E-3', '-1.5e-7', '1_000', '1_0.5', '.nan', '.NaN', 'nan', 'NaN',
            '.inf', '-.inf', 'inf', '1:30', '~', 'null', 'text', "'3.0'", '"on"', '1e', 'e3', '--1']
+BLOCKS = {
+    'a wildcard after the node wins': ['calibrator', '/**'],
+    'the node after a wildcard wins': ['/**', 'calibrator'],
+    'a key that comes again keeps its place': ['/**', 'calibrator', '/**'],
+    'four ways to say it': ['/calibrator', '/**/calibrator', '/*', 'calibrator'],
+    'others are passed over': ['/**', '/car/calibrator', 'driver', '/*/calibrator'],
+}
 READ_BY_ROS = """
 import json, sys, rclpy
 from rclpy.node import Node
 rclpy.init(args=['--ros-args', '--params-file', sys.argv[1]])
 node = Node('calibrator', automatically_declare_parameters_from_overrides=True)
-print(json.dumps({k: repr(p.value) for k, p in node._parameters.items() if k[0] == 's'}))
+print(json.dumps({k: repr(p.value) for k, p in node._parameters.items()}))
 rclpy.shutdown()
 """
+
+
+def read_by_ros(path) -> dict[str, str]:
+    """Return what a node named calibrator gets from a parameter file, as reprs."""
+    out = subprocess.run([sys.executable, '-c', READ_BY_ROS, str(path)], check=True, text=True,
+                         capture_output=True, env=os.environ).stdout
+    return json.loads(out)
+
+
+@pytest.mark.parametrize('keys', BLOCKS.values(), ids=BLOCKS)
+def test_blocks_count_as_they_do_for_a_node(write, keys):
+    pytest.importorskip('rclpy')
+    path = write(''.join(
+        f'{key}:\n  ros__parameters:\n    leg.min_distance: {n}.0\n    leg.max_gap: 0.{n}\n'
+        for n, key in enumerate(keys, 1)))
+    by_ros = read_by_ros(path)
+    assert {k: repr(v) for k, v in read_config_file(path).items()} == {
+        k: by_ros[k] for k in ('leg.min_distance', 'leg.max_gap')}
+
+
+def test_namespaces_may_be_nested(write):
+    path = write('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n')
+    assert read_config_file(path) == {'leg.min_distance': 5.0}
 
 
 def test_plain_values_are_typed_as_ros_types_them(write):
     pytest.importorskip('rclpy')
     path = write('/**:\n  ros__parameters:\n' + ''.join(
         f'    s{i}: {text}\n' for i, text in enumerate(SCALARS)))
-    out = subprocess.run([sys.executable, '-c', READ_BY_ROS, str(path)], check=True, text=True,
-                         capture_output=True, env=os.environ).stdout
-    by_ros = {k: v for k, v in json.loads(out).items() if k[1:].isdigit()}
+    by_ros = {k: v for k, v in read_by_ros(path).items() if k[1:].isdigit()}
     ours = {f's{i}': repr(text[1:-1] if text[0] in '\'"' else scalar(text))
             for i, text in enumerate(SCALARS)}
     assert ours == by_ros

@@ -131,6 +131,15 @@ def test_a_write_that_breaks_off_leaves_the_old_file_and_no_litter(tmp_path, mon
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_reader_of_the_old_file_reads_it_to_its_end(tmp_path):
+    path = tmp_path / 'a.json'
+    write_whole(path, 'old and whole')
+    with path.open() as reader:
+        write_whole(path, 'new')
+        assert reader.read() == 'old and whole'
+    assert path.read_text() == 'new'
+
+
 def test_the_main_file_comes_last(good, tmp_path, monkeypatch):
     order = []
     whole = write_whole
