@@ -83,13 +83,13 @@ def _row(name, result, truth, factor) -> Row:
 
 def table(found: list[Row]) -> str:
     """Return the rows as text for a terminal."""
-    lines = [f'{"":<28}{"found":<26}{"truth":<20}{"off by":<14}']
+    lines = [f'{"":<28}{"found":<32}{"truth":<20}{"off by":<14}']
     for row in found:
         if row.value is None:
-            lines.append(f'{row.name:<28}{"not determined":<26}{_truth(row)}')
+            lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
             continue
         off = '' if row.sigmas_off is None else f'{row.sigmas_off:+.1f} sigma'
-        lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<26}{_truth(row):<20}'
+        lines.append(f'{row.name:<28}{with_sigma(row.value, row.sigma):<32}{_truth(row):<20}'
                      f'{off:<14}{"" if row.agrees else "DOES NOT AGREE"}'.rstrip())
     return '\n'.join(lines)
 

@@ -78,7 +78,7 @@ def _head(calibration):
 def _values(calibration):
     estimates = calibration.estimates
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
-    lines = [_line('scale factor', _scale_text(scale))]
+    lines = [_line('scale factor', _scale_text(scale) + _mostly(calibration, 'scale_factor'))]
     if scale.value and scale.unit in COUNTS:
         lines.append(_line('', inverse(scale)))
     if ratio.value is not None:
@@ -86,7 +86,8 @@ def _values(calibration):
         lines.append(_line('  against nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({ppm} ppm)'))
     for name, word in ANGLES.items():
-        lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name))))
+        text = _angle_text(known(estimates, name)) + _mostly(calibration, name)
+        lines.append(_line(f'{word} mounting', text))
     for name in estimates:
         estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', *ANGLES) and estimate.value is not None:
@@ -95,6 +96,17 @@ def _values(calibration):
         rpy = ', '.join(f'{angle * DEG:.3f}' for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return lines
+
+
+def _mostly(calibration, name):
+    """Return which source of error the sigma of an estimate is mostly made of."""
+    estimate = calibration.estimates.get(name, NONE)
+    method = calibration.methods.get(estimate.method)
+    budget = {} if method is None else method.details.get('budget', {})
+    shares = {source: row.get(name, 0.0) for source, row in budget.items()}
+    if estimate.value is None or not any(shares.values()):
+        return ''
+    return f'   mostly {max(shares, key=lambda s: shares[s]).replace("_", " ")}'
 
 
 def _line(label, text):

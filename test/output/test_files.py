@@ -38,7 +38,7 @@ def test_json_of_a_method_and_a_leg(good):
     method = content['methods']['two_point']
     assert method['verdict'] == 'accepted'
     assert method['correlation'] == {'scale_factor,yaw_mounting_angle': 0.25}
-    assert method['budget'] == {'fixes': {'scale_factor': 1e-6}}
+    assert method['budget']['fixes']['scale_factor'] == 1e-6
     assert method['estimates']['yaw_mounting_angle'] == {
         'value': -0.0174533, 'sigma': 5e-5, 'unit': 'rad'}
     assert 'f' not in method
