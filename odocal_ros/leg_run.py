@@ -9,12 +9,13 @@ from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.check import (
     against_travel, fix_noise_factor, gyro_against_course, mismatch, pieces, residuals,
     track_check)
+from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.marks import fix_at, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, rough_scale
-from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.earth import earth_rate_n, ecef_from_geodetic
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
@@ -23,6 +24,10 @@ from odocal_ros.screen import imu_gap
 
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 MARK_WINDOW = 1.0       # s, least half-window of fixes about a mark in motion
+FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
+AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
+FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
+ABOUT_START = 11        # fixes about the start mark that the origin is amid
 TRACK_ROWS = 5000       # of a track kept in a result
 
 
@@ -44,9 +49,7 @@ class LegRun:
         self.leg, self.inputs, self.config, self.reasons = leg, inputs, config, reasons
         self.t_fit = inputs.t_stop
         self.holdout = holdout
-        near = int(np.argmin(np.abs(inputs.t_fix)))
-        lat, lon, height = inputs.geodetic[near]
-        self.origin = Origin(float(lat), float(lon), float(np.nan_to_num(height)))
+        self.origin = _origin(inputs)
         geodetic = inputs.geodetic.copy()
         lost = np.isnan(geodetic[:, 2])
         geodetic[lost, 2] = self.origin.height
@@ -60,20 +63,28 @@ class LegRun:
 
     def result(self) -> LegResult:
         """Return what the leg gives, however far it carries."""
-        if not self.rough:
-            self._say(Code.ODOMETER_STILL if self._fixes_move() else Code.LEG_TOO_SHORT,
-                      'the odometer does not count' if self._fixes_move() else
-                      'the vehicle did not move')
-            return leg_result(self.leg, self.inputs, self.reasons)
-        self.spans = standstills(self.inputs.t_imu, self.inputs.w_b, self.inputs.travel,
-                                 self.rough, self.config.leg.standstill)
+        inputs = self.inputs
+        still = not_moving(inputs.travel, inputs.t_fix, self.fixes_n, self.fix_sigma,
+                           inputs.t_stop)
+        if still or not self.rough:
+            self.reasons += still or [Reason(Code.LEG_TOO_SHORT, 'the fixes move too little for a '
+                                             'scale')]
+            return leg_result(self.leg, inputs, self.reasons)
+        covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
+        if covered.sum() < FEWEST_ROWS:
+            self.reasons += imu_gap(inputs, 0.0, 0.0)
+            return leg_result(self.leg, inputs, self.reasons)
+        self.reasons += uncovered(inputs.travel, inputs.t_stop)
+        self.spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, self.rough,
+                                 self.config.leg.standstill)
         if self.alignment is None:
-            self.alignment, why = align(self.inputs, self.spans, self.rough, self.fixes_n,
+            self.alignment, why = align(inputs, self.spans, self.rough, self.fixes_n,
                                         self.origin, self.config)
             self.reasons += why
-        self.reasons += imu_gap(self.inputs, self.alignment.t, self.config.leg.max_gap)
+        self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), self.config.leg.max_gap)
         self.track = self._reckon()
-        distance = self._judge_drive()
+        distance, found = judge_drive(self.track, inputs.t_stop, self.rough, self.config.leg)
+        self.reasons += found
         if self.holdout:
             self.t_fit = self._four_fifths()
         chord = self._chord()
@@ -86,10 +97,6 @@ class LegRun:
     def _say(self, code, text):
         self.reasons.append(Reason(code, text))
 
-    def _fixes_move(self):
-        spread = np.ptp(self.fixes_n[:, :2], axis=0)
-        return bool(np.hypot(*spread) > max(20.0, 10 * self.fix_sigma))
-
     def _reckon(self):
         inputs, a = self.inputs, self.alignment
         pick = (inputs.t_imu >= a.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
@@ -99,31 +106,6 @@ class LegRun:
                                 earth_rate_n(self.origin.latitude),
                                 max(1, int(rate / EPOCH_RATE)))
         return dead_reckon(epochs, q_nb, inputs.travel)
-
-    def _judge_drive(self):
-        """Judge the drive itself; return the distance driven, m, by the rough scale."""
-        leg, track = self.config.leg, self.track
-        inside = (track.t >= 0) & (track.t <= self.inputs.t_stop)
-        step = np.abs(np.diff(track.s[inside])) * self.rough
-        dt = np.diff(track.t[inside])
-        distance = float(step.sum())
-        if distance < leg.min_distance:
-            self._say(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks, '
-                      f'{leg.min_distance:g} m are the least')
-        if not len(dt):
-            return distance
-        top = _top_speed(track, inside, self.rough)
-        if top < leg.min_speed:
-            self._say(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
-                      f'{leg.min_speed:g} m/s are asked')
-        C = matrix_from_quat(track.q_nb[inside])
-        yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
-        turning = np.abs(_rate_1s(track.t[inside], yaw)) > leg.max_yaw_rate
-        share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-        if share > 0.1:
-            self._say(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven in '
-                      f'turns above {leg.max_yaw_rate:g} rad/s')
-        return distance
 
     def _four_fifths(self):
         """Return when four fifths of the distance are driven, s."""
@@ -135,10 +117,12 @@ class LegRun:
     def _chord(self):
         """Return the chord between the marks, or None and say why."""
         inputs, config = self.inputs, self.config
-        ends = (max(0.0, float(self.track.t[0])), min(self.t_fit, float(self.track.t[-1])))
+        travel = inputs.travel
+        ends = (max(0.0, float(self.track.t[0]), float(travel.t[0])),
+                min(self.t_fit, float(self.track.t[-1]), float(travel.t[-1])))
         forward = np.array([self.rough, 0.0, 0.0])
         lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-        marks = [self._mark(t, forward, lever_b, getattr(config.reference, name))
+        marks = [self._mark(t, forward, lever_b, self._surveyed(name, t))
                  for t, name in zip(ends, ('start', 'end'), strict=True)]
         for mark, name in zip(marks, ('start', 'end'), strict=True):
             if mark is None:
@@ -155,6 +139,14 @@ class LegRun:
                      for m in marks]
             chord = replace(chord, start=marks[0], end=marks[1])
         return chord
+
+    def _surveyed(self, name, t):
+        """Return the reference point at a mark, empty where the chord cannot begin or end there."""
+        t_mark = 0.0 if name == 'start' else self.inputs.t_stop
+        span = standing_at(t_mark, self.spans)
+        if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
+            return getattr(self.config.reference, name)
+        return ()
 
     def _mark(self, t, forward, lever_b, surveyed):
         if surveyed:
@@ -176,7 +168,7 @@ class LegRun:
         """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
         change = np.zeros((3, 3))
         for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
-            if not (mark.standing or mark.surveyed):
+            if not mark.standing:
                 low, high = np.clip([mark.t - 0.5, mark.t + 0.5], *self.track.t[[0, -1]])
                 rate = np.diff(np.interp([low, high], self.track.t, self.track.s))[0]
                 change += sign * self.track.C_nb_at(np.array(mark.t)) * rate / max(
@@ -190,16 +182,12 @@ class LegRun:
         if refused:
             return unsolved(refused, inputs.scale_unit), {}
         f, _ = solve(chord, np.inf)
-        between = (inputs.t_fix >= chord.start.t) & (inputs.t_fix <= chord.end.t)
+        between = self._between(chord, f)
         fixes = inputs.t_fix[between], self.fixes_n[between]
         before = np.array([self.nominal or self.rough, 0.0, 0.0])
 
-        def antenna_n(times):
-            return (self.track.C_nb_at(times) - self.track.C_nb_at(chord.start.t)) \
-                @ chord.lever_b
-
         def strays(f):
-            return residuals(self.track, f, chord.start, fixes, antenna_n)
+            return residuals(self.track, f, chord.start, fixes, chord.lever_b)
 
         more, factor = {}, np.ones(3)
         if between.sum() >= 3:
@@ -229,6 +217,21 @@ class LegRun:
                  'origin': (self.origin.latitude, self.origin.longitude, self.origin.height)}
         return method, more
 
+    def _between(self, chord, f):
+        """Tell which fixes lie between the marks and not absurdly far from the corrected track."""
+        inputs = self.inputs
+        between = (inputs.t_fix >= chord.start.t) & (inputs.t_fix <= chord.end.t)
+        if not between.any():
+            return between
+        off = np.hypot(*residuals(self.track, f, chord.start,
+                                  (inputs.t_fix, self.fixes_n), chord.lever_b)[:, :2].T)
+        usual = max(float(np.median(off[between])), self.fix_sigma)
+        far = between & (off > FAR * usual)
+        if far.any():
+            self._say(Code.BAD_ROWS_DROPPED, f'{int(far.sum())} of {int(between.sum())} fixes lie '
+                      f'more than {FAR * usual:.0f} m off the track; not used in the check')
+        return between & ~far
+
     def _held_out(self, chord, before, f):
         """Return the check on the last fifth, from a fix at its begin, not used in the fit."""
         inputs = self.inputs
@@ -239,10 +242,7 @@ class LegRun:
         begin = chord.end
         way = np.abs(np.diff(self.track.s[self.track.t >= begin.t])).sum() * self.rough
 
-        def antenna_n(times):
-            return (self.track.C_nb_at(times) - self.track.C_nb_at(begin.t)) @ chord.lever_b
-
-        return {name: track_check(residuals(self.track, g, begin, fixes, antenna_n), way)
+        return {name: track_check(residuals(self.track, g, begin, fixes, chord.lever_b), way)
                 for name, g in (('before', before), ('after', f))}
 
     def _drift(self, chord, f):
@@ -274,11 +274,10 @@ class LegRun:
         self.reasons += found or mismatch(check, self.fix_sigma, drift, distance)
 
 
-def _rate_1s(t, x):
-    """Return the slope of x over one second about each t."""
-    low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
-    return (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-6)
-
-
-def _top_speed(track, inside, metres_per_unit):
-    return float(np.abs(_rate_1s(track.t[inside], track.s[inside])).max() * metres_per_unit)
+def _origin(inputs):
+    """Return where n is fixed: the fix amid those about the start, so that no outlier tilts n."""
+    near = np.sort(np.argsort(np.abs(inputs.t_fix), kind='stable')[:ABOUT_START])
+    r_e = ecef_from_geodetic(inputs.geodetic[near, 0], inputs.geodetic[near, 1], 0.0)
+    amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
+    latitude, longitude, height = inputs.geodetic[amid]
+    return Origin(float(latitude), float(longitude), float(np.nan_to_num(height)))

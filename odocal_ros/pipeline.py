@@ -47,8 +47,10 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     """
     inputs, found = screen(leg, config)
     reasons = [*notes, *found]
-    if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
-        return leg_result(leg, inputs, reasons)
+    missing = _missing(leg, inputs)
+    if missing or not len(inputs.t_fix):
+        seen = {r.code for r in reasons}
+        return leg_result(leg, inputs, reasons + [r for r in missing if r.code not in seen])
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
     reasons += sanity
     if z_down:
@@ -56,6 +58,21 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     if Code.IMU_AXES in {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
     return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
+
+
+def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
+    """Return what a leg lacks for any method to be tried."""
+    missing = []
+    if leg.stop_ns <= leg.start_ns:
+        missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark'))
+    for n, least, code, what in (
+            (len(inputs.t_imu), 4, Code.NO_IMU, 'Imu'),
+            (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
+        if n < least:
+            missing.append(Reason(code, f'{n} usable {what} messages'))
+    if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none sent is said already
+        missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
+    return missing
 
 
 def _turned_over(inputs: Inputs) -> Inputs:

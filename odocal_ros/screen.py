@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.config import Config
+from odocal_ros.fix_screen import usable_fixes
+from odocal_ros.glitches import beyond, imu_glitches, speed_glitches
 from odocal_ros.leg import Leg
 from odocal_ros.nav.odometer import mean_travel, Travel, travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -20,6 +22,8 @@ from odocal_ros.samples import take
 
 CLOCK_LIMIT = 0.5        # s, between topics (design.md, Stamps)
 GAP_FACTOR = 5.0         # a gap in odometer or fixes, in median intervals
+NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
+           'fix': Code.FIXES_UNUSABLE}
 LABEL = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
          'fix_velocity': 'fix velocity', 'heading': 'heading'}
 
@@ -63,18 +67,30 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
             found.append(Reason(code, f'no {LABEL[slot]} message between the marks'))
     found += _clocks(leg, config)
-    offset = {'imu': 0.0, 'odometer': config.odometer.time_offset - config.imu.time_offset,
-              'fix': config.gnss.time_offset - config.imu.time_offset}
-    offset['odometer_right'] = offset['odometer']
+    offset = _offsets(config)
 
     def rows(slot):
-        clean = _rising(_finite(getattr(leg, slot), slot, leg, found), slot, leg, found)
-        return clean, (clean.stamp_ns - leg.start_ns) * 1e-9 + offset.get(slot, 0.0)
+        sent = getattr(leg, slot)
+        clean = _rising(_finite(sent, slot, leg, found), slot, leg, found)
+        t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset[slot]
+        spikes = _spikes(slot, clean, t, leg.form, config)
+        if spikes.any():
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
+                                f'{LABEL[slot]} messages stand alone far from their neighbours, '
+                                f'first at t = {t[np.argmax(spikes)]:.2f} s; dropped'))
+            clean, t = take(clean, ~spikes), t[~spikes]
+        if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
+            found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
+                                'messages is usable'))
+        return clean, t
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
     whole, left, right = _travels(leg, config, rows, found)
-    t_fix, geodetic, covariance, rejected = _fixes(leg, config, rows, found)
+    fix, t_fix = rows('fix')
+    use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
+    found += why
+    t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
     _gaps('odometer', whole.t, found)
     _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
@@ -83,9 +99,10 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
         f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi, travel=whole, travel_left=left,
-        travel_right=right, t_fix=t_fix, geodetic=geodetic, covariance_n=covariance,
+        travel_right=right, t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
-        fixes_rejected=rejected, scale_unit=leg.form.scale_unit), tuple(found)
+        fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
+        scale_unit=leg.form.scale_unit), tuple(found)
 
 
 def _turned(vector_i, scale, C_bi):
@@ -94,6 +111,22 @@ def _turned(vector_i, scale, C_bi):
         return vector_i if scale == 1.0 else vector_i * scale
     x, y, z = vector_i.T
     return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
+
+
+def _offsets(config):
+    """Return what to add to each topic's times: the marks are Imu stamps, so the Imu's is 0."""
+    imu = config.imu.time_offset
+    wheel, gnss = config.odometer.time_offset - imu, config.gnss.time_offset - imu
+    return {'imu': 0.0, 'odometer': wheel, 'odometer_right': wheel, 'fix': gnss,
+            'fix_velocity': gnss, 'heading': -imu}
+
+
+def _spikes(slot, samples, t, form, config):
+    if slot == 'imu':
+        return imu_glitches(t, samples.w_i, samples.f_i, config.imu)
+    if slot in ('odometer', 'odometer_right') and form.quantity == 'rate':
+        return speed_glitches(t, samples.value.astype(float))
+    return np.zeros(len(t), bool)
 
 
 def _travels(leg, config, rows, found):
@@ -126,12 +159,11 @@ def _finite(samples, slot, leg, found):
     stamped = samples.stamp_ns > 0
     finite = np.ones(len(stamped), bool)
     for name in needed:
-        column = np.asarray(getattr(samples, name))
-        finite &= np.isfinite(column).all(axis=tuple(range(1, column.ndim)))
+        finite &= ~beyond(name, getattr(samples, name))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
-                      (stamped & ~finite, 'hold NaN or Inf')):
+                      (stamped & ~finite, 'hold NaN, Inf or a value beyond any sensor')):
         if bad.any():
             first = int(np.argmax(bad))
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
@@ -189,15 +221,15 @@ def _longest_rising(stamp):
 def _clocks(leg, config):
     """Compare each topic's clock with the Imu's, at equal times of arrival."""
     imu = leg.imu
+    if not (imu.stamp_ns > 0).all():
+        imu = take(imu, imu.stamp_ns > 0)
     if len(imu.stamp_ns) < 2:
         return []
     base = imu.received_ns[0]
     arrival = (imu.received_ns - base) * 1e-9
     order = np.argsort(arrival, kind='stable')
     lag = (imu.received_ns - imu.stamp_ns) * 1e-9
-    asked = {'odometer': config.odometer.time_offset - config.imu.time_offset,
-             'odometer_right': config.odometer.time_offset - config.imu.time_offset,
-             'fix': config.gnss.time_offset - config.imu.time_offset}
+    asked = _offsets(config)
     found = []
     for slot in ('odometer', 'odometer_right', 'fix', 'heading'):
         samples = getattr(leg, slot)
@@ -206,52 +238,19 @@ def _clocks(leg, config):
             continue
         own = (samples.received_ns[ok] - samples.stamp_ns[ok]) * 1e-9
         there = np.interp((samples.received_ns[ok] - base) * 1e-9, arrival[order], lag[order])
-        ahead = float(np.median(there - own)) + asked.get(slot, 0.0)
+        ahead = float(np.median(there - own)) + asked[slot]
         if abs(ahead) > CLOCK_LIMIT:
             found.append(Reason(Code.CLOCKS_DIFFER, f'the {LABEL[slot]} stamps are {ahead:+.3f} s '
-                                'against the Imu stamps of the same moment'))
+                                f'against the Imu stamps of the same moment{_cure(slot, ahead)}'))
     return found
 
 
-def _fixes(leg, config, rows, found):
-    """Return times, positions and covariances of the usable fixes, and how many are not."""
-    fix, t = rows('fix')
-    gnss = config.gnss
-    n = len(leg.fix.stamp_ns)
-    no_fix = fix.status < gnss.min_status
-    nowhere = (fix.latitude == 0) & (fix.longitude == 0)
-    beyond = (abs(fix.latitude) > np.pi / 2) | (abs(fix.longitude) > 2 * np.pi)
-    covariance, unknown = _covariances(fix, gnss)
-    sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
-    poor = (sigma > gnss.max_sigma) & (gnss.max_sigma > 0) & ~unknown
-    use = ~(no_fix | nowhere | beyond | poor)
-    if unknown.any():
-        found.append(Reason(Code.COVARIANCE_UNKNOWN, f'{int(unknown.sum())} of '
-                            f'{len(fix.stamp_ns)} fixes come without a usable covariance; taken '
-                            f'as {gnss.default_sigma:g} m (gnss.default_sigma)'))
-    bad = [f'{int(m.sum())} {what}' for m, what in (
-        (no_fix, f'with status below {gnss.min_status}'),
-        (nowhere | beyond, 'at no real position'),
-        (poor & ~no_fix, f'with sigma above {gnss.max_sigma:g} m')) if m.any()]
-    if bad and n:
-        code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
-        found.append(Reason(code, f'of {n} fixes are not used: {", ".join(bad)}'))
-    geodetic = np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
-    geodetic[~np.isfinite(geodetic)] = np.nan
-    return t[use], geodetic, covariance[use], n - int(use.sum())
-
-
-def _covariances(fix, gnss):
-    """Return covariances with the unknown ones (type 0, zero, not finite) replaced, and which."""
-    covariance = fix.covariance_n.copy()
-    diagonal = np.diagonal(covariance, axis1=1, axis2=2)
-    sound = np.isfinite(covariance).all(axis=(1, 2)) & (diagonal[:, :2] > 0).all(axis=1)
-    unknown = ~sound | (fix.covariance_type == 0)
-    vertical = 2 * gnss.default_sigma      # satellites are above only: height is about twice worse
-    covariance[unknown] = np.diag([gnss.default_sigma**2, gnss.default_sigma**2, vertical**2])
-    flat = covariance[:, 2, 2] <= 0
-    covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
-    return covariance, unknown
+def _cure(slot, ahead):
+    """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
+    group = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}.get(slot)
+    if group is None or abs(ahead) > 1.0:
+        return ''
+    return f': add {-ahead:+.3f} s to {group}.time_offset if they mean the same clock'
 
 
 def _gaps(slot, t, found):

@@ -13,7 +13,7 @@ LOOSE = 4.0               # sigmas of disagreement that name a mismatch
 SLOP = 0.002              # of the distance: slip, suspension, road
 
 
-def residuals(track, f, start, fixes, antenna_n):
+def residuals(track, f, start, fixes, lever_b):
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
@@ -27,12 +27,14 @@ def residuals(track, f, start, fixes, antenna_n):
         Where the track is pinned.
     fixes : (t, position_n)
         Within the leg.
-    antenna_n : callable
-        Times to antenna lever arm in n less that at the start, (n, 3) m.
+    lever_b : (3,) array
+        Antenna from the odometer's point, m; its turn since the start is taken with it.
 
     """
     t, position_n = fixes
-    reckoned = start.position_n + (track.at(t) - track.at(start.t)) @ f + antenna_n(t)
+    reckoned = start.position_n + (track.at(t) - track.at(start.t)) @ f
+    if np.any(lever_b):
+        reckoned = reckoned + (track.C_nb_at(t) - track.C_nb_at(start.t)) @ lever_b
     return reckoned - position_n
 
 

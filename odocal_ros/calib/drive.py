@@ -1,0 +1,93 @@
+"""What the drive itself must be: long, fast and straight enough, and moving at all."""
+
+import numpy as np
+
+from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.reasons import Code, Reason
+
+MOVED = 20.0     # m over which fixes must spread to say that the vehicle moved
+EDGE = 0.5       # s of odometer missing at a mark worth saying
+TURNS = 0.1      # of the distance: more of it in turns is worth saying
+
+
+def judge_drive(track, t_stop, metres_per_unit, leg):
+    """
+    Judge a drive between the marks.
+
+    Parameters
+    ----------
+    track : Track
+        Dead reckoned.
+    t_stop : float
+        The stop mark, s.
+    metres_per_unit : float
+        Rough scale.
+    leg : LegConfig
+        Limits.
+
+    Returns
+    -------
+    Distance driven, m, and what was found.
+
+    """
+    inside = (track.t >= 0) & (track.t <= t_stop)
+    t, s = track.t[inside], track.s[inside] * metres_per_unit
+    step = np.abs(np.diff(s))
+    distance = float(step.sum())
+    found: tuple[Reason, ...] = ()
+    if distance < leg.min_distance:
+        found += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks, '
+                         f'{leg.min_distance:g} m are the least'),)
+    if len(t) < 2:
+        return distance, found
+    top = float(np.abs(_rate_1s(t, s)).max())
+    if top < leg.min_speed:
+        found += (Reason(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
+                         f'{leg.min_speed:g} m/s are asked'),)
+    C = matrix_from_quat(track.q_nb[inside])
+    yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
+    turning = np.abs(_rate_1s(t, yaw)) > leg.max_yaw_rate
+    share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
+    if share > TURNS:
+        found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
+                         f'in turns above {leg.max_yaw_rate:g} rad/s'),)
+    return distance, found
+
+
+def _rate_1s(t, x):
+    """Return the slope of x over one second about each t."""
+    low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
+    return (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-6)
+
+
+def uncovered(travel, t_stop) -> tuple[Reason, ...]:
+    """Say where the odometer begins after the start mark or ends before the stop mark."""
+    late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
+    what = [f'begins {late:.1f} s after the start mark'] * (late > EDGE)
+    what += [f'ends {early:.1f} s before the stop mark'] * (early > EDGE)
+    if not what:
+        return ()
+    return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is taken as far '
+                   'as it reaches'),)
+
+
+def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
+    """Return why there is no leg where wheels or fixes show no motion, empty where both do."""
+    first = np.searchsorted(t_fix, -0.5)
+    here = fixes_n[max(0, first - 3):np.searchsorted(t_fix, t_stop + 0.5), :2]
+    if len(here) < 2:
+        return (Reason(Code.NO_FIX, f'{len(here)} usable fix{"es" * (len(here) != 1)} between the '
+                       'marks'),)
+    if len(here) > 4:       # a single outlier is no motion: running median of three
+        here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
+    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(MOVED, 10 * fix_sigma)
+    pick = (travel.t >= 0) & (travel.t <= t_stop)
+    if pick.sum() < 2:
+        return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
+    wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
+    if wheels_move and fixes_move:
+        return ()
+    if fixes_move:
+        return (Reason(Code.ODOMETER_STILL, 'the fixes move, the odometer does not count'),)
+    return (Reason(Code.LEG_TOO_SHORT, 'the fixes stay in one place while the odometer counts'
+                   if wheels_move else 'the vehicle did not move'),)

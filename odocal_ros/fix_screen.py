@@ -1,0 +1,68 @@
+"""Which fixes can be used, and how good each is taken to be."""
+
+import numpy as np
+
+from odocal_ros.reasons import Code, Reason
+
+HEIGHT = 1e5         # m, beyond it a fix is at no real position
+
+
+def usable_fixes(fix, sent, gnss):
+    """
+    Judge the fixes of a leg.
+
+    Parameters
+    ----------
+    fix : FixSamples
+        With stamps in order.
+    sent : int
+        How many there were before.
+    gnss : GnssConfig
+        Limits.
+
+    Returns
+    -------
+    use : (n,) bool.   covariance_n : (n, 3, 3) m^2.   What was found.
+
+    """
+    no_fix = fix.status < gnss.min_status
+    nowhere = (fix.latitude == 0) & (fix.longitude == 0)
+    # NaN compares false: what is not within is lost
+    within = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi)
+    lost = nowhere | ~within | (abs(fix.height) > HEIGHT)
+    covariance, unknown = covariances(fix, gnss.default_sigma)
+    sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
+    poor = (sigma > gnss.max_sigma) & (gnss.max_sigma > 0) & ~unknown
+    use = ~(no_fix | lost | poor)
+    found: tuple[Reason, ...] = ()
+    if (unknown & ~no_fix).any():
+        found += (Reason(Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {sent} '
+                         'fixes come without a usable covariance; taken as '
+                         f'{gnss.default_sigma:g} m (gnss.default_sigma)'),)
+    bad = [f'{int(m.sum())} {what}' for m, what in (
+        (no_fix, f'with status below {gnss.min_status}'),
+        (lost & ~no_fix, 'at no real position'),
+        (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m')) if m.any()]
+    if bad:
+        code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
+        found += (Reason(code, f'of {sent} fixes are not used: {", ".join(bad)}'),)
+    return use, covariance, found
+
+
+def covariances(fix, default_sigma):
+    """
+    Return covariances with the unknown ones replaced, and which those are.
+
+    Unknown is type 0, zero or less, not finite; where only the height's part is, it is taken from
+    the level part.
+    """
+    covariance = fix.covariance_n.copy()
+    diagonal = np.diagonal(covariance, axis1=1, axis2=2)
+    level = np.isfinite(covariance[:, :2, :2]).all(axis=(1, 2)) & (diagonal[:, :2] > 0).all(axis=1)
+    unknown = ~level | (fix.covariance_type == 0)
+    flat = unknown | ~(np.isfinite(covariance).all(axis=(1, 2)) & (diagonal[:, 2] > 0))
+    covariance[unknown] = np.eye(3) * default_sigma**2
+    covariance[flat, 2, :] = covariance[flat, :, 2] = 0.0
+    # satellites are above only: a height is about twice as bad
+    covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
+    return covariance, unknown
