@@ -102,11 +102,13 @@ def _mostly(calibration, name):
     """Return which source of error the sigma of an estimate is mostly made of."""
     estimate = calibration.estimates.get(name, NONE)
     method = calibration.methods.get(estimate.method)
-    budget = {} if method is None else method.details.get('budget', {})
-    shares = {source: row.get(name, 0.0) for source, row in budget.items()}
-    if estimate.value is None or not any(shares.values()):
+    if estimate.value is None or method is None or name not in method.parameters:
         return ''
-    return f'   mostly {max(shares, key=lambda s: shares[s]).replace("_", " ")}'
+    row = method.parameters.index(name)
+    shares = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    largest = max(shares, key=lambda source: shares[source], default='')
+    label = "the legs' own errors" if largest == 'legs' else largest.replace('_', ' ')
+    return f'   mostly {label}' if largest and shares[largest] else ''
 
 
 def _line(label, text):

@@ -36,9 +36,8 @@ def good():
     found = estimates()
     method = MethodResult(
         'two_point', (PITCH_LOST,), found, ('scale_factor', 'yaw_mounting_angle'),
-        (Source('fixes', np.eye(2)),),
-        {'budget': {'fixes': {'scale_factor': np.float64(1e-6), 'yaw_mounting_angle': 1e-6},
-                    'gyro_bias_z': {'scale_factor': 1e-7, 'yaw_mounting_angle': 5e-5}},
+        (Source('fixes', np.diag([2e-5, 1e-6])), Source('gyro_bias_z', np.diag([1e-6, 5e-5]))),
+        {'budget': {'fixes': {'scale_factor': np.float64(1e-6)}},
          'correlation': {'scale_factor,yaw_mounting_angle': 0.25},
          'heading_source': 'fixed', 'f': np.array([0.05, 0.0, 0.0]), 'odd': float('nan')})
     leg = LegResult(

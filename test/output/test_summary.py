@@ -40,7 +40,8 @@ def test_lengths_and_times():
 def test_the_screen_says_it_all_in_few_lines(good):
     text = screen(good)
     for part in ('ACCEPTED', '1 leg, 11.20 km in 10 min 00 s',
-                 '0.0500000 ± 0.0000012 m/pulse   (24 ppm)   mostly fixes', '20.00000 ± 0.00048 pulses/m',
+                 '0.0500000 ± 0.0000012 m/pulse   (24 ppm)   mostly fixes',
+                 '20.00000 ± 0.00048 pulses/m',
                  '1.250000 ± 0.000030   (+250000 ± 30 ppm)',
                  '-1.0000 ± 0.0029 deg   (-0.017453 ± 0.000050 rad)   mostly gyro bias z',
                  'pitch mounting      not determined', 'roll, pitch, yaw 0.000, 0.000, -1.000 deg',
