@@ -107,15 +107,15 @@ class Reader:
         good = np.ones(n, bool)
         for layout, rows, table in cdr.tables(self.msgtype, raws):
             if layout is None:
-                for i in rows.tolist():
+                for i in np.arange(n)[rows].tolist():
                     good[i] = self._one(out, i, raws[i], deserialize)
                 continue
-            values = [column.of_table(layout, table) for column in plan.columns]
-            if any(value is None for value in values):
-                good[rows] = False
-                self._lost(len(rows), plan.missing(layout))
-                continue
-            for target, value in zip(out, values, strict=True):
+            for target, column in zip(out, plan.columns, strict=True):
+                value = column.of_table(layout, table)
+                if value is None:
+                    good[rows] = False
+                    self._lost(len(table), plan.missing(layout))
+                    break
                 target[rows] = value
         received = np.array(received_ns, np.int64)
         if not good.all():

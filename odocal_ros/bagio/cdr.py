@@ -169,7 +169,7 @@ class _Walk:
         return self.raw[at:at + length - 1].decode() if keep and length else ''
 
 
-Rows = NDArray[np.intp]
+Rows = NDArray[np.intp] | slice
 Table = NDArray[np.uint8]
 
 
@@ -179,36 +179,35 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None,
 
     Yields
     ------
-    Layout, row numbers (n,) and the messages' bytes (n, size); the rows that have no layout come
-    last, with None and an empty table.
+    Layout, where its rows stand (numbers, or a slice: all of them) and the messages' bytes
+    (n, size). Rows that have no layout come last, with None and an empty table.
 
     """
-    lengths = np.fromiter(map(len, raws), np.intp, len(raws))
-    odd: list[Rows] = []
-    for size in dict.fromkeys(lengths.tolist()):
-        rows = np.flatnonzero(lengths == size)
-        all_alike = len(rows) == len(raws)
-        joined = b''.join(raws if all_alike else [raws[i] for i in rows.tolist()])
+    sizes = set(map(len, raws))
+    odd: list[NDArray[np.intp]] = []
+    for size in sizes:
+        if len(sizes) == 1:
+            rows, joined = np.arange(len(raws)), b''.join(raws)
+        else:
+            rows = np.flatnonzero(np.array([len(raw) == size for raw in raws]))
+            joined = b''.join([raws[i] for i in rows.tolist()])
         table = np.frombuffer(joined, np.uint8).reshape(len(rows), size)
         for _ in range(MAX_LAYOUTS):
             layout = layout_of(msgtype, table[0].tobytes())
             alike = _alike(table, layout.fixed if layout else [(0, size)])
-            if alike.all():
-                yield from _either(layout, rows, table, odd)
+            whole = bool(alike.all())
+            mine = table if whole else table[alike]
+            if layout is None:
+                odd.append(rows[alike])
+            else:
+                yield layout, slice(None) if len(mine) == len(raws) else rows[alike], mine
+            if whole:
                 break
-            yield from _either(layout, rows[alike], table[alike], odd)
             rows, table = rows[~alike], table[~alike]
         else:
             odd.append(rows)
     if odd:
         yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
-
-
-def _either(layout, rows, table, odd):
-    if layout is None:
-        odd.append(rows)
-    else:
-        yield layout, rows, table
 
 
 def _alike(table: Table, fixed) -> NDArray[np.bool_]:

@@ -1,0 +1,265 @@
+"""Read bags: rosbag1, rosbag2 (sqlite3, mcap), split, compressed, without metadata, cut off."""
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+import hashlib
+import heapq
+from itertools import islice
+from operator import itemgetter
+from pathlib import Path
+import tempfile
+
+from odocal_ros.bagio.parts import Batch, BLOCK, group, Part
+from odocal_ros.bagio.sources import find, names, Source, unpack
+from odocal_ros.bagio.types import Types
+from odocal_ros.errors import BadBag, BadData, BadUsage
+from odocal_ros.messages import Reader
+from odocal_ros.reasons import Code, Reason
+
+MISSING = 0.5   # s, less is not worth a word
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """A topic of a bag."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+class Bag:
+    """
+    An open bag: its topics and its messages.
+
+    ``start_ns`` and ``end_ns`` are the bag times of the first and the last message. ``notes`` are
+    what a user should know: sentences, and reasons where a result is concerned.
+    """
+
+    def __init__(self, source: Source, parts: list[Part], types: Types) -> None:
+        self.name, self.files = source.name, source.files
+        self._source, self._types = source, types
+        self._parts = sorted((p for p in parts if p.count), key=lambda p: p.start_ns)
+        self._reader_notes: list[Reason] = []
+        self._sentences = list(source.notes)
+        self.topics = self._collect()
+        self.start_ns = min(p.start_ns for p in self._parts)
+        self.end_ns = max(p.end_ns for p in self._parts)
+
+    def _collect(self) -> dict[str, TopicInfo]:
+        counts: dict[str, dict[str, int]] = {}
+        for part in self._parts:
+            for channel in part.channels:
+                self._types.define(channel.msgtype, channel.definition)
+                types = counts.setdefault(channel.topic, {})
+                types[channel.msgtype] = types.get(channel.msgtype, 0) + channel.count
+        for topic, types in counts.items():
+            if len(types) > 1:
+                self._sentences.append(f'{topic} has messages of {len(types)} types '
+                                       f'({", ".join(types)}); the most frequent is used')
+        best = {topic: max(types.items(), key=itemgetter(1)) for topic, types in counts.items()}
+        return {topic: TopicInfo(topic, *best[topic]) for topic in sorted(best)}
+
+    @property
+    def notes(self) -> tuple[Reason | str, ...]:
+        """Return what a user should know of this bag; all of it only after it was read."""
+        return (*self._sentences, *self._cut(), *self._reader_notes)
+
+    def _cut(self) -> list[Reason | str]:
+        """Say what is missing, in seconds where metadata or the next file tell."""
+        found: list[Reason | str] = []
+        whole = self._source.whole
+        for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
+            if not part.damage:
+                continue
+            span = dict(self._source.of_file).get(part.path.name) or (
+                whole if len(self._parts) == 1 else None)
+            told = f'{part.path.name} is damaged ({part.damage})'
+            if span and part.count >= span.count:
+                found.append(f'{told}, but all its {span.count} messages were read')
+                continue
+            span = span or (whole if after is None else None)
+            end_ns = span.end_ns if span else after.start_ns if after else None
+            seconds = (part.end_ns - part.start_ns) * 1e-9
+            missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at its end are missing'
+                       if end_ns is not None else
+                       'how much is missing cannot be known without metadata.yaml')
+            found.append(Reason(Code.BAG_TRUNCATED, f'{told}: {part.count} messages of '
+                                f'{seconds:.1f} s were read; {missing}'))
+        if not found and whole and (whole.end_ns - self.end_ns) * 1e-9 > MISSING:
+            found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: '
+                                f'{(whole.end_ns - self.end_ns) * 1e-9:.1f} s at its end that '
+                                'metadata.yaml tells of are missing'))
+        return found
+
+    def read(self, readers: dict[str, Reader], feed: Callable[[str, object], None],
+             progress: Callable[[float], None] | None = None) -> None:
+        """
+        Read topics in one pass.
+
+        Parameters
+        ----------
+        readers : dict
+            Topic -> reader of its messages.
+        feed : callable
+            Told (slot, block) of samples, in order of bag time.
+        progress : callable, optional
+            Told the share done.
+
+        Raises
+        ------
+        BadUsage, BadData
+            A topic is not in the bag; none of a topic's messages can be used.
+
+        """
+        for topic in readers.keys() - self.topics.keys():
+            raise BadUsage(f'{self.name}: has no topic {topic}; it has {", ".join(self.topics)}')
+        deserialize = {topic: self._types.deserializer(self.topics[topic].msgtype)
+                       for topic in readers}
+        used = dict.fromkeys(readers, 0)
+        for batch in self._batches(readers.keys()):
+            for topic, (times, raws) in batch.items():
+                for slot, block in readers[topic].rows(raws, times, deserialize[topic]):
+                    used[topic] += len(block.stamp_ns)
+                    feed(slot, block)
+            if progress:
+                newest = max(times[-1] for times, _ in batch.values())
+                progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
+        for topic, reader in readers.items():
+            self._tell(topic, reader, used[topic])
+
+    def _tell(self, topic: str, reader: Reader, used: int) -> None:
+        """Note messages that gave no row; raise where none gave one."""
+        if not reader.unreadable:
+            return
+        count = self.topics[topic].count
+        if not used:
+            raise BadData(f'{topic}: none of its {count} messages can be used: {reader.trouble}')
+        self._reader_notes.append(Reason(
+            Code.BAD_ROWS_DROPPED, f'{reader.unreadable} of {count} messages of {topic} were left '
+            f'out: {reader.trouble}'))
+
+    def messages(self, topic: str) -> Iterator[tuple[int, object]]:
+        """Yield (bag time ns, deserialised message) of a topic; empty if it is not there."""
+        if topic not in self.topics:
+            return
+        deserialize = self._types.deserializer(self.topics[topic].msgtype)
+        for batch in self._batches({topic}):
+            for time_ns, raw in zip(*batch[topic], strict=True):
+                try:
+                    message = deserialize(raw)
+                except BadData:
+                    raise
+                except Exception:   # one damaged message is no reason to lose the others
+                    continue
+                yield time_ns, message
+
+    def _batches(self, topics: Collection[str]) -> Iterator[Batch]:
+        """Yield messages of some topics in order of bag time, many at a time."""
+        wanted = {t: self.topics[t].msgtype for t in topics if self.topics[t].count}
+        together: list[Part] = []      # files that overlap in time
+        end_ns = 0
+        for part in self._parts:
+            if together and part.start_ns >= end_ns:
+                yield from _merged(together, wanted)
+                together, end_ns = [], 0
+            together.append(part)
+            end_ns = max(end_ns, part.end_ns)
+        yield from _merged(together, wanted)
+
+
+def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
+    """Yield the batches of files that overlap in time, merged; of one file as they are."""
+    if len(parts) == 1:
+        yield from parts[0].batches(topics)
+        return
+    stream = heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1))
+    while True:
+        batch: Batch = {}
+        group(islice(stream, BLOCK), batch)
+        if not batch:
+            return
+        yield batch
+
+
+class open_bag:
+    """
+    Open a bag: a folder or a file, of any kind that ``sources`` knows. Use it in ``with``.
+
+    Raises
+    ------
+    BadBag
+        Missing, unreadable, empty, or nothing usable left in it.
+
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Bag:
+        """Open the files."""
+        try:
+            return self._open()
+        except PermissionError as error:
+            self._stack.close()
+            raise BadBag(f'{error.filename or self._path}: no permission to read it') from None
+        except OSError as error:
+            self._stack.close()
+            raise BadBag(f'{self._path}: cannot be read ({error.strerror or error})') from None
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def _open(self) -> Bag:
+        source, types = find(self._path), Types()
+        if source.foreign:
+            raise BadBag(f'{self._path}: its serialization format is {source.foreign!r}, only cdr '
+                         'can be read; convert it with ros2 bag convert')
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
+        parts, lost = [], []
+        for path in source.files:
+            try:
+                part = Part(path, *unpack(path, folder), types.cdr_from_ros1)
+            except BadBag as error:
+                lost.append(error)
+                continue
+            self._stack.callback(part.close)
+            parts.append(part)
+        if not parts:
+            raise lost[0]
+        bag_notes = tuple(f'{error}; the other files are read' for error in lost)
+        formats = {c.serialization for part in parts for c in part.channels if c.count}
+        if formats and not formats & {'cdr', 'ros1'}:
+            raise BadBag(f'{self._path}: its serialization format is {", ".join(formats)!r}, only '
+                         'cdr can be read; convert it with ros2 bag convert')
+        if not any(part.count for part in parts):
+            damage = ' or '.join({part.damage for part in parts if part.damage})
+            topics = sum(len(part.channels) for part in parts)
+            raise BadBag(f'{self._path}: the bag is empty, 0 messages on {topics} topics in '
+                         f'{names(source.files)}{f" ({damage})" if damage else ""}; record again')
+        source = Source(source.name, source.files, source.notes + bag_notes, source.whole,
+                        source.of_file)
+        return Bag(source, parts, types)
+
+    def __exit__(self, *_) -> None:
+        """Close the files."""
+        self._stack.close()
+
+
+def bag_sha256(bag: Bag) -> str:
+    """
+    Return the SHA-256 of a bag.
+
+    Of one file it is what sha256sum prints; of several that of sha256sum's own output for them.
+    """
+    sums = [(_file_sha256(path), path.name) for path in bag.files]
+    if len(sums) == 1:
+        return sums[0][0]
+    return hashlib.sha256(''.join(f'{d}  {name}\n' for d, name in sums).encode()).hexdigest()
+
+
+def _file_sha256(path: Path) -> str:
+    with path.open('rb') as file:
+        return hashlib.file_digest(file, 'sha256').hexdigest()
