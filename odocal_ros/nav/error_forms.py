@@ -1,0 +1,121 @@
+"""
+Closed forms of source A's error analysis: plane, chord, straight leg (eq. 11-14, 29-33).
+
+All errors are estimate less truth (method.md 1.5; the paper's (30)-(33) print the reverse). K is
+the scale factor, alpha the yaw mounting angle (alpha_psi of the paper), phi_U the heading error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Krassovsky's ellipsoid as in eq. (1)-(5): m, m, m
+C, C0, C1 = 6399698.9018, 6367558.49686, 32005.79642
+
+
+def plane_error(latitude, longitude, central_meridian, dL, dlam):
+    """
+    Return northing and easting error dx, dy, m, of dL, dlam, rad: eq. (13), (14), corrected.
+
+    Good for an error budget within 3 deg of the central meridian (all in rad) and at 20 to 50 deg
+    of latitude: dx by dL to 1.2e-5, the cross terms to 1 %, dy by dlam to 0.3 %.
+    """
+    s, c = np.sin(latitude), np.cos(latitude)
+    off = central_meridian - longitude
+    dx = ((C0 + C1 * (s * s - c * c) + C / 2 * np.cos(2 * latitude) * off**2) * dL
+          - C * s * c * off * dlam)
+    return dx, C * s * off * dL + C * c * dlam
+
+
+def chord_error(x, y, dx, dy, S1, K0):
+    """
+    Return dK (unit of K0) and dalpha (rad) of an error of the dead-reckoned end: eq. (11), (12).
+
+    x, y : dead-reckoned end from the start, north and east, m.   dx, dy : its error, m.
+    S1 : true chord, m.   K0 : configured scale.
+    """
+    S2 = np.hypot(x, y)
+    return -K0 * S1 / S2**3 * (x * dx + y * dy), (y * dx - x * dy) / S2**2
+
+
+@dataclass(frozen=True)
+class StraightLeg:
+    """What a straight leg ends with: phi_U, dL, dlam, dalpha in rad, dK relative to K."""
+
+    phi_U: float
+    dL: float
+    dlam: float
+    dalpha: float
+    dK: float
+
+
+def straight_leg(phi_U0, eps_z, duration, velocity_E, velocity_N, latitude, radius):
+    """
+    Return eq. (29)-(33) in closed form: constant velocity, m/s, for ``duration``, s.
+
+    phi_U0 : rad at the start.   eps_z : drift up, rad/s.   latitude : rad.   radius : m.
+    """
+    turned = phi_U0 * duration - eps_z * duration**2 / 2
+    return StraightLeg(
+        phi_U=phi_U0 - eps_z * duration,                                     # (29)
+        dL=-velocity_E / radius * turned,                                    # (30)
+        dlam=velocity_N / np.cos(latitude) / radius * turned,                # (31)
+        dalpha=-turned / duration,                                           # (33)
+        dK=eps_z**2 * duration**2 / 24)                                      # in place of (32)
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedProfile:
+    """
+    How a leg's distance is spread over its time; turns any heading history into dalpha and dK.
+
+    t : (m,) s.   s : (m,) m travelled by then, at constant speed in between.
+    """
+
+    t: NDArray[np.float64]
+    s: NDArray[np.float64]
+
+    def mean(self, x):
+        """Return the distance-weighted mean of (m,) values, straight between epochs."""
+        return float(self._weight @ (x[1:] + x[:-1]) / 2)
+
+    def mean_square(self, x):
+        """Return the distance-weighted mean of the square."""
+        a, b = x[:-1], x[1:]
+        return float(self._weight @ (a * a + a * b + b * b) / 3)
+
+    def variance(self, x):
+        """Return the distance-weighted variance."""
+        return self.mean_square(x - self.mean(x))
+
+    def mounting_error(self, phi_U, tilt=None):
+        """
+        Return dalpha (rad) and dK / K of a straight leg of this profile: (29)-(33) generalised.
+
+        phi_U : (m,) heading error at the epochs, rad; dalpha is minus its mean.
+        tilt : (m,) error or unmodelled pitch of the track, rad: in a plane it shortens the track.
+
+        To second order; a turn common to the whole track changes no length.
+        """
+        spread = self.variance(phi_U) + (0.0 if tilt is None else self.mean_square(tilt))
+        return -self.mean(phi_U), spread / 2
+
+    def heading_and_drift(self, phi_U0, eps_z):
+        """Return dalpha (rad) and dK / K of an initial heading error, rad, and a drift, rad/s."""
+        return self.mounting_error(phi_U0 - eps_z * (self.t - self.t[0]))
+
+    def noise_sigma(self, gyro_noise):
+        """
+        Return the yaw error, rad, 1 sigma, of white gyro noise, rad/s/sqrt(Hz).
+
+        sigma^2 = q integral (1 - F)^2 dt, F the share of the distance driven by then.
+        """
+        left = 1 - (self.s - self.s[0]) / (self.s[-1] - self.s[0])
+        a, b = left[:-1], left[1:]
+        return float(gyro_noise * np.sqrt(np.diff(self.t) @ (a * a + a * b + b * b) / 3))
+
+    @property
+    def _weight(self):
+        ds = np.diff(self.s)
+        return ds / ds.sum()

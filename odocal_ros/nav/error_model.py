@@ -1,0 +1,294 @@
+"""
+Error model of dead reckoning: how attitude errors and gyro drift become a wrong end point.
+
+Source A, eq. (15)-(23), corrected (method.md 1.4), as a linear time-varying system along a leg
+
+    x' = F(t) x - [C_nb; 0] eps_b        x = [phi_E, phi_N, phi_U, dL, dlam, dh]
+
+phi (rad) and the position errors (rad, rad, m) are estimate less truth: computed attitude =
+(I - [phi x]) true attitude, the computed one against the local level at the *computed* position,
+the true one against that at the true position. eps_b (rad/s) is what the gyro reads too much.
+
+Two Earths. ``radius`` given: the sphere of the paper, no vertical speed, height not fed back;
+the first five states are eq. (15)-(23) and dh is the third row of (21). ``radius=None``: WGS 84
+with height and vertical speed, the exact linearisation of what ``strapdown`` and
+``dead_reckoning`` do.
+
+Those two work in axes n that are fixed to the Earth where the leg begins, and know no transport
+rate. With psi the attitude error there and dr the position error, both in n,
+
+    phi = C_ln psi + dtheta,    dtheta = [-dL, dlam cos L, dlam sin L]
+    C_ln dr = [(N + h) cos L dlam, (M + h) dL, dh]
+
+l being the local level at the true position: dtheta is the turn of the local level between the
+true and the computed position. There psi' = psi x omega_ie - C_nb eps_b and dr' = v x psi, so a
+heading error psi is constant but for the Earth's turn; phi has the rest.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import Origin, Track
+from odocal_ros.nav.earth import C_en, E2, OMEGA, radii
+from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy, transpose
+
+STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
+E, N, U, LAT, LON, H = range(6)
+BLOCK = 64        # steps that a scan multiplies up one after the other
+CHUNK = 4096      # steps made at a time
+PAPER_RADIUS = 6378137.0    # m, R_e of source A
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """
+    A leg as the error model sees it, recorded or planned.
+
+    t : (m,) s, rising.    latitude, longitude : (m,) rad.    height : (m,) m.
+    velocity_n : (m - 1, 3) mean velocity over ground of each interval, local ENU, m/s.
+    C_nb : (m, 3, 3) attitude against the local level at each epoch.
+    """
+
+    t: NDArray[np.float64]
+    latitude: NDArray[np.float64]
+    longitude: NDArray[np.float64]
+    height: NDArray[np.float64]
+    velocity_n: NDArray[np.float64]
+    C_nb: NDArray[np.float64]
+
+    @property
+    def travel(self) -> NDArray[np.float64]:
+        """Return the metres travelled by each epoch, (m,)."""
+        step = np.linalg.norm(self.velocity_n, axis=-1) * np.diff(self.t)
+        return np.concatenate([[0.0], np.cumsum(step)])
+
+
+def path_of_track(track: Track, forward, origin: Origin, start_n=(0.0, 0.0, 0.0)) -> Path:
+    """
+    Return the path of a dead-reckoned leg.
+
+    Parameters
+    ----------
+    track : Track
+        Attitude and travel in the n of ``origin``.
+    forward : (3,) array
+        Scale times forward axis in b, m per unit of travel.
+    origin : Origin
+        Where n is fixed.
+    start_n : (3,) array
+        Position of the track's first epoch in n, m.
+
+    """
+    position_n = track.P @ np.asarray(forward, dtype=float) + start_n
+    latitude, longitude, height = origin.to_geodetic(position_n).T
+    C_ln = transpose(C_en(latitude, longitude)) @ C_en(origin.latitude, origin.longitude)
+    step_n = np.diff(position_n, axis=0) / np.diff(track.t)[:, None]
+    velocity = np.einsum('mij,mj->mi', (C_ln[:-1] + C_ln[1:]) / 2, step_n)
+    C_nb = C_ln @ matrix_from_quat(track.q_nb)
+    return Path(track.t, latitude, longitude, height, velocity, C_nb)
+
+
+def planned_path(t, speed, yaw, latitude, longitude=0.0, height=0.0) -> Path:
+    """
+    Return the path of a level drive that is not driven yet.
+
+    Parameters
+    ----------
+    t, speed, yaw : (m,) arrays
+        Epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in between).
+    latitude, longitude, height : float
+        Start, rad, rad, m (WGS 84).
+
+    Returns
+    -------
+    Path, b lying along the vehicle.
+
+    """
+    t, speed = np.asarray(t, dtype=float), np.asarray(speed, dtype=float)
+    yaw = np.broadcast_to(np.asarray(yaw, dtype=float), t.shape)
+    flat = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], -1) * speed[:, None]
+    velocity = (flat[:-1] + flat[1:]) / 2
+    step = velocity * np.diff(t)[:, None]
+
+    def run(first, steps):
+        return first + np.concatenate([[0.0], np.cumsum(steps)])
+
+    along = np.full(len(t), float(latitude))
+    for _ in range(4):      # the radii change by 1 % per rad: each round gains four digits
+        middle = (along[1:] + along[:-1]) / 2
+        meridian, normal = radii(middle)
+        along = run(latitude, step[:, 1] / (meridian + height))
+    east = step[:, 0] / ((normal + height) * np.cos(middle))
+    C_nb = matrix_from_rpy(np.stack([0 * yaw, 0 * yaw, yaw], -1))
+    return Path(t, along, run(longitude, east), np.full(len(t), float(height)), velocity, C_nb)
+
+
+def coefficients(latitude, height, velocity_n, radius=None):
+    """
+    Return F, the rates of the states by the states: (...), (...), (..., 3) to (..., 6, 6).
+
+    Rows and columns in the order of STATES; rad, m, s. ``radius``: see the module.
+    """
+    latitude, height = np.asarray(latitude, float), np.asarray(height, float)
+    vE, vN, vU = np.moveaxis(np.asarray(velocity_n, dtype=float), -1, 0)
+    s, c = np.sin(latitude), np.cos(latitude)
+    tan, sec = s / c, 1 / c
+    if radius is None:
+        meridian, normal = radii(latitude)
+        RM, RN = meridian + height, normal + height
+        bend = E2 * s * c / (1 - E2 * s * s)      # d ln N / dL; that of M is three times as much
+        dRM, dRN, up = 3 * bend * meridian, bend * normal, 1.0
+    else:
+        RM = RN = float(radius)
+        dRM = dRN = up = 0.0
+        vU = np.zeros_like(vU)
+    F = np.zeros((*np.broadcast(latitude, vE).shape, 6, 6))
+    # phi x omega_in of the attitude rows
+    wE, wN, wU = -vN / RM, OMEGA * c + vE / RN, OMEGA * s + vE * tan / RN
+    F[..., E, N], F[..., E, U] = wU, -wN
+    F[..., N, E], F[..., N, U] = -wU, wE
+    F[..., U, E], F[..., U, N] = wN, -wE
+    _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec)
+    # a wrong position: the Earth rate is taken elsewhere, the radii differ
+    north_L, north_h = -vN / RM**2 * dRM, -vN / RM**2 * up
+    east_L, east_h = -vE / RN**2 * dRN, -vE / RN**2 * up
+    F[..., E, LAT], F[..., E, H] = -north_L, -north_h
+    F[..., N, LAT], F[..., N, H] = -OMEGA * s + east_L, east_h
+    F[..., U, LAT] = OMEGA * c + vE * sec**2 / RN + tan * east_L
+    F[..., U, H] = tan * east_h
+    F[..., LAT, LAT], F[..., LAT, H] = north_L, north_h
+    F[..., LON, LAT] = vE * sec * tan / RN + sec * east_L
+    F[..., LON, H] = sec * east_h
+    return F
+
+
+def _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec):
+    """Add what a velocity turned by phi, eq. (21), does to position and computed omega_in."""
+    dv = np.zeros((*F.shape[:-2], 3, 3))                # rows dvE, dvN, dvU by phi
+    dv[..., 0, 1], dv[..., 0, 2] = -vU, vN
+    dv[..., 1, 0], dv[..., 1, 2] = vU, -vE
+    dv[..., 2, 0], dv[..., 2, 1] = -vN, vE
+    by_north, by_east = dv[..., 1, :] / _column(RM), dv[..., 0, :] / _column(RN)
+    F[..., E, :3] -= by_north
+    F[..., N, :3] += by_east
+    F[..., U, :3] += by_east * _column(tan)
+    F[..., LAT, :3] = by_north                          # (18), (22)
+    F[..., LON, :3] = by_east * _column(sec)            # (19), (23)
+    F[..., H, :3] = dv[..., 2, :]
+
+
+def _column(x):
+    return np.asarray(x)[..., None]
+
+
+@dataclass(frozen=True, eq=False)
+class Transition:
+    """
+    Response of the states since the first epoch: x = Phi x_0 + Gamma eps_b, eps_b constant.
+
+    Phi : (m, 6, 6).   Gamma : (m, 6, 3), per rad/s in the axes of b.
+    """
+
+    Phi: NDArray[np.float64]
+    Gamma: NDArray[np.float64]
+
+
+def transition(path: Path, radius=None) -> Transition:
+    """Return the transition matrices of a path, without a loop over its epochs."""
+    S = _steps(path, radius, np.eye(3))
+    _scan(S)
+    return Transition(S[..., :6], S[..., 6:])
+
+
+def propagate(path: Path, x_0, eps_b, radius=None):
+    """
+    Return the states at every epoch, (m, 6).
+
+    Parameters
+    ----------
+    path : Path
+        Leg.
+    x_0 : (6,) array
+        States at its first epoch.
+    eps_b : (3,) or (m - 1, 3) array
+        Gyro drift in b, rad/s, constant or mean of each interval.
+    radius : float, optional
+        See the module.
+
+    """
+    S = _steps(path, radius, np.asarray(eps_b, dtype=float)[..., None])
+    _scan(S)
+    return S[..., :6] @ np.asarray(x_0, dtype=float) + S[..., 6]
+
+
+def _steps(path, radius, drift_b):
+    """
+    Return what each epoch makes of the one before: (m, 6, 6 + k), [A | B], x_1 = A x_0 + B.
+
+    drift_b : (..., 3, k) drifts in b, rad/s. The first row changes nothing.
+    """
+    S = np.zeros((len(path.t), 6, 6 + drift_b.shape[-1]))
+    S[:1, range(6), range(6)] = 1.0
+    drift_b = np.broadcast_to(drift_b, (len(S) - 1, *drift_b.shape[-2:]))
+    for first in range(0, len(S) - 1, CHUNK):      # what fits a cache is three times as fast
+        own = slice(first, first + CHUNK)
+        _fill(S[1:][own], path, slice(first, first + CHUNK + 1), own, radius, drift_b[own])
+    return S
+
+
+def _fill(S, path, epochs, intervals, radius, drift_b):
+    """Write [A | B] of some intervals into S; epochs: those at their edges."""
+    dt = np.diff(path.t[epochs])[:, None, None]
+    latitude, height = ((a[:-1] + a[1:]) / 2
+                        for a in (path.latitude[epochs], path.height[epochs]))
+    Fdt = coefficients(latitude, height, path.velocity_n[intervals], radius) * dt
+    # exp(F dt) to second order: rates are of 1e-4 /s, the next term is 1e-13 in a second
+    S[..., :6] = Fdt + Fdt @ Fdt / 2
+    S[:, range(6), range(6)] += 1.0
+    C_nb = path.C_nb[epochs]
+    turned = (C_nb[:-1] + C_nb[1:]) * (dt / 2) @ drift_b
+    # what came in during the interval has acted for half of it on average
+    S[..., 6:] = Fdt[..., :3] @ turned / -2
+    S[:, :3, 6:] -= turned
+
+
+def _scan(S):
+    """
+    Turn steps into running compositions, in place: (n, 6, 6 + k), see _steps.
+
+    Blocks are multiplied up side by side, their last rows by the same scan, and carried in.
+    """
+    width = min(BLOCK, max(2, int(np.sqrt(len(S)))))
+    for k in range(1, min(width, len(S))):
+        now = S[k::width]
+        now[:] = _after(now, S[k - 1::width][:len(now)])
+    ends = S[width - 1::width].copy()
+    if len(ends) > 1:
+        _scan(ends)
+    for k in range(width):
+        now = S[width + k::width]
+        now[:] = _after(now, ends[:len(now)])
+
+
+def _after(then, first):
+    """Return the map that does first and then: A2 A1 x + (A2 B1 + B2)."""
+    both = then[..., :6] @ first
+    both[..., 6:] += then[..., 6:]
+    return both
+
+
+def in_fixed_axes(path: Path, x, origin: Origin):
+    """
+    Return psi (rad) and dr (m) in the n of ``origin``, (m, 3) each, of states x, (m, 6).
+
+    The relation of the module's text; the ellipsoid's radii.
+    """
+    phi, dL, dlam, dh = x[:, :3], x[:, LAT], x[:, LON], x[:, H]
+    s, c = np.sin(path.latitude), np.cos(path.latitude)
+    meridian, normal = radii(path.latitude)
+    dtheta = np.stack([-dL, dlam * c, dlam * s], -1)
+    dr = np.stack([(normal + path.height) * c * dlam, (meridian + path.height) * dL, dh], -1)
+    C_nl = transpose(C_en(origin.latitude, origin.longitude)) @ C_en(path.latitude, path.longitude)
+    return np.einsum('mij,mj->mi', C_nl, phi - dtheta), np.einsum('mij,mj->mi', C_nl, dr)
