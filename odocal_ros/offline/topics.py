@@ -1,0 +1,151 @@
+"""Which topic of a bag is which input: by message type, where exactly one can be meant."""
+
+from collections.abc import Iterable
+
+from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.config import Config
+from odocal_ros.errors import BadUsage
+from odocal_ros.messages import FIX, full_type, IMU, VELOCITY
+from odocal_ros.odometer_types import TYPES as ODOMETERS
+
+OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
+          'odometer_right': '--odometer-right-topic', 'heading': '--heading-topic',
+          'fix_velocity': '--fix-velocity-topic'}
+NEVER = ('/rosout', '/parameter_events', '/tf', '/tf_static', '/clock', '/diagnostics')
+COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a vehicle, not measured
+# estimates made of GNSS or of everything: no odometer while there is another
+FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
+GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
+
+Topics = dict[str, TopicInfo]
+
+
+def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> dict[str, str]:
+    """
+    Return slot -> topic.
+
+    Parameters
+    ----------
+    topics : dict
+        Name -> TopicInfo of a bag.
+    config : Config
+        Which inputs are wanted, and of what type the odometer is.
+    overrides : dict
+        Slot -> topic, as the user named them.
+
+    Raises
+    ------
+    BadUsage
+        A topic named is not there, or a wanted input cannot be told: none or several serve. All
+        such inputs are named at once, with the option that settles each.
+
+    """
+    chosen = {slot: _named(topics, slot, topic) for slot, topic in overrides.items()}
+    troubles: list[str] = []
+    for slot in _wanted(config):
+        if slot in chosen:
+            continue
+        found = candidates(topics, slot, config, chosen)
+        if len(found) == 1:
+            chosen[slot] = found[0]
+        elif slot != 'heading' or config.alignment.heading_source == 'heading_topic':
+            troubles.append(_trouble(topics, slot, found, config))
+    if troubles:
+        raise BadUsage('; '.join(troubles) + (
+            '' if all(': name ' in text for text in troubles) else
+            f'; the bag has {_described(topics, topics)}'))
+    return chosen
+
+
+def _wanted(config: Config) -> tuple[str, ...]:
+    """Return the slots to fill; odometers and heading first, for what they leave to others."""
+    two = 'topic' in (config.odometer.left, config.odometer.right)
+    surveyed = config.reference.start and config.reference.end
+    return (*(('odometer_right',) if two else ()), 'odometer',
+            *(('heading',) if config.alignment.heading_source in ('auto', 'heading_topic')
+              else ()),
+            'imu', *(() if surveyed else ('fix',)),
+            *(('fix_velocity',) if config.gnss.use_velocity else ()))
+
+
+def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]) -> list[str]:
+    """Return the topics that could be a slot, given what the others are."""
+    types = _types(slot, config)
+    taken = set(chosen.values())
+    found = [t.name for t in topics.values()
+             if t.count and t.msgtype in types and t.name not in NEVER and t.name not in taken
+             and '/calibrator/' not in t.name]
+    if slot in ('odometer', 'odometer_right'):
+        found = [name for name in found if not _has(name, COMMANDS)]
+        found = _unless_all(found, FUSED)
+        if 'topic' in (config.odometer.left, config.odometer.right):
+            found = [name for name in found if ('right' in _last(name)) == (slot != 'odometer')]
+    elif slot == 'heading':
+        if config.alignment.heading_source == 'auto':    # by the name the node listens to
+            return [name for name in found if _last(name) == 'heading']
+        found = [name for name in found if 'heading' in name] or found
+    elif slot == 'imu':
+        found = _unless_all(found, ('heading',))
+    elif slot == 'fix':
+        found = _unless_all(found, ('filtered', 'fused'))
+    elif slot == 'fix_velocity':
+        found = [name for name in found if _has(name, GNSS)] or found
+    return found
+
+
+def _types(slot: str, config: Config) -> Iterable[str]:
+    if slot in ('odometer', 'odometer_right'):
+        wanted = config.odometer.type
+        return ODOMETERS if wanted == 'auto' else (full_type(wanted),)
+    return VELOCITY if slot == 'fix_velocity' else (FIX,) if slot == 'fix' else (IMU,)
+
+
+def _named(topics: Topics, slot: str, topic: str) -> str:
+    """Return the topic that a user named, with or without its leading slash."""
+    for name in (topic, f'/{topic}'):
+        if name in topics:
+            if not topics[name].count:
+                raise BadUsage(f'{OPTION[slot]} {topic}: the topic has no message; the bag has '
+                               f'{_described(topics, topics)}')
+            return name
+    raise BadUsage(f'{OPTION[slot]} {topic}: no such topic; the bag has '
+                   f'{_described(topics, topics)}')
+
+
+def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str:
+    """Say why a slot is open and what settles it."""
+    if found:
+        hint = ''
+        if slot == 'odometer' and {'left', 'right'} <= {
+                side for name in found for side in ('left', 'right') if side in _last(name)}:
+            hint = ', or set odometer.left and odometer.right to topic for two wheels'
+        return (f'{len(found)} topics could be the {_label(slot)}: name one with {OPTION[slot]} '
+                f'of {_described(topics, found)}{hint}')
+    types = tuple(_types(slot, config))
+    what = ' or '.join(types) if len(types) < 3 else 'a type that odometers have'
+    return f'no {_label(slot)} (a topic of {what}) in the bag'
+
+
+def _described(topics: Topics, names: Iterable[str]) -> str:
+    """List topics with their types for people; those without a message are none."""
+    return ', '.join(f'{name} ({topics[name].msgtype})' for name in names
+                     if topics[name].count and name not in NEVER) or 'no topic with messages'
+
+
+def _label(slot: str) -> str:
+    return {'imu': 'Imu', 'odometer_right': 'right odometer', 'fix_velocity': 'GNSS velocity'
+            }.get(slot, slot)
+
+
+def _last(name: str) -> str:
+    """Return the end of a topic's name that tells wheels apart: all of it but a namespace."""
+    return name.rstrip('/').rpartition('/')[2]
+
+
+def _has(name: str, words: Iterable[str]) -> bool:
+    return any(word in name.lower() for word in words)
+
+
+def _unless_all(found: list[str], words: Iterable[str]) -> list[str]:
+    """Leave out topics with such a word in their name, unless that leaves none."""
+    return [name for name in found if not _has(name, words)] or found

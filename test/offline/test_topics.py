@@ -1,0 +1,114 @@
+"""Topics by message type: one candidate is taken, several or none are told with the remedy."""
+
+import pytest
+
+from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.config import Config, with_settings
+from odocal_ros.errors import BadUsage
+from odocal_ros.offline.topics import choose_topics
+
+IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
+INT, TWIST = 'std_msgs/msg/Int64', 'geometry_msgs/msg/TwistStamped'
+BASE = {'/imu/data': IMU, '/odometer': INT, '/fix': FIX}
+ODD = {'/rosout': 'rcl_interfaces/msg/Log', '/cmd_vel': 'geometry_msgs/msg/Twist',
+       '/calibrator/odometer': INT, '/tf': 'tf2_msgs/msg/TFMessage'}
+
+
+def topics(**types):
+    """Return the base topics and more; a name's __ is a slash; None takes one away."""
+    named = BASE | {'/' + name.replace('__', '/'): t for name, t in types.items()}
+    return {n: TopicInfo(n, t, 5) for n, t in named.items() if t}
+
+
+def choose(found, overrides=None, **settings):
+    config = with_settings(Config(), {k.replace('__', '.'): v for k, v in settings.items()})
+    return choose_topics(found, config, overrides or {})
+
+
+def test_one_of_each():
+    wanted = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
+    assert choose(topics()) == wanted
+    assert choose(topics() | {n: TopicInfo(n, t, 5) for n, t in ODD.items()}) == wanted
+    # without a message a topic is none
+    assert choose(topics() | {'/imu/raw': TopicInfo('/imu/raw', IMU, 0)}) == wanted
+
+
+def test_several_are_listed_with_their_option():
+    with pytest.raises(BadUsage, match=r'3 topics could be the odometer: name one with '
+                       r'--odometer-topic of /odometer \(std_msgs/msg/Int64\), /speed'):
+        choose(topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'))
+    with pytest.raises(BadUsage, match='could be the Imu.*--imu-topic.*could be the fix.*'
+                       '--fix-topic'):
+        choose(topics(imu__raw=IMU, phone=FIX))       # all at once
+    assert choose(topics(speed=TWIST), {'odometer': 'speed'})['odometer'] == '/speed'
+    assert choose(topics(speed=TWIST), odometer__type=TWIST)['odometer'] == '/speed'
+    assert choose(topics(odometry__filtered='nav_msgs/msg/Odometry'))['odometer'] == '/odometer'
+
+
+def test_missing_lists_what_there_is():
+    with pytest.raises(BadUsage, match=r'no Imu \(a topic of sensor_msgs/msg/Imu\) in the bag; '
+                       r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'):
+        choose(topics(imu__data=None))
+    with pytest.raises(BadUsage, match='--fix-topic /gps: no such topic; the bag has /imu/data'):
+        choose(topics(), {'fix': '/gps'})
+    with pytest.raises(BadUsage, match='the topic has no message'):
+        choose(topics() | {'/gps': TopicInfo('/gps', FIX, 0)}, {'fix': '/gps'})
+    with pytest.raises(BadUsage, match='no odometer'):
+        choose(topics(), odometer__type='my_msgs/msg/Ticks')
+
+
+def test_only_a_fused_odometer_is_better_than_none_but_a_command_is_not():
+    found = topics(odometer=None, localization__fused='nav_msgs/msg/Odometry')
+    assert choose(found)['odometer'] == '/localization/fused'
+    with pytest.raises(BadUsage, match='no odometer'):
+        choose(topics(odometer=None, cmd_vel='geometry_msgs/msg/Twist'))
+
+
+def test_fixes_are_not_needed_when_the_ends_are_surveyed():
+    found = choose(topics(fix=None), reference__start=[48.0, 11.0, 500.0, 0.01],
+                   reference__end=[48.1, 11.0, 500.0, 0.01])
+    assert 'fix' not in found
+
+
+def test_velocity_of_the_receiver_only_when_asked_for():
+    found = topics(gps__vel=TWIST)
+    assert choose(found) == choose(topics())
+    assert choose(found, gnss__use_velocity=True)['fix_velocity'] == '/gps/vel'
+    with pytest.raises(BadUsage, match='no GNSS velocity'):
+        choose(topics(), gnss__use_velocity=True)
+
+
+def test_heading():
+    found = topics(heading=IMU)
+    assert choose(found)['heading'] == '/heading'      # as the node, which tries it first
+    assert choose(found)['imu'] == '/imu/data'
+    assert 'heading' not in choose(found, alignment__heading_source='course')
+    found = topics(gnss__heading_imu=IMU)
+    assert choose(found, alignment__heading_source='heading_topic')['heading'] == \
+        '/gnss/heading_imu'
+    with pytest.raises(BadUsage, match='no heading'):
+        choose(topics(imu__data=None, imu=IMU), {'imu': '/imu'},
+               alignment__heading_source='heading_topic')
+    assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
+
+
+def test_wheels_on_two_topics():
+    sides = topics(odometer=None, ticks_left=INT, ticks_right=INT)
+    two = {'odometer__left': 'topic', 'odometer__right': 'topic'}
+    assert choose(sides, **two)['odometer'] == '/ticks_left'
+    assert choose(sides, **two)['odometer_right'] == '/ticks_right'
+    assert choose(topics(odometer_right=INT), **two)['odometer_right'] == '/odometer_right'
+    assert choose(topics(a=INT), {'odometer': '/odometer', 'odometer_right': 'a'},
+                  **two)['odometer_right'] == '/a'
+    with pytest.raises(BadUsage, match='odometer.left and odometer.right to topic'):
+        choose(sides)
+    with pytest.raises(BadUsage, match='no right odometer'):
+        choose(topics(), **two)
+
+
+def test_the_journal_of_a_namespaced_node_is_found():
+    found = {n: TopicInfo(n, t, 9) for n, t in {
+        '/car/imu/data': IMU, '/car/odometer': INT, '/car/fix': FIX,
+        '/car/calibrator/status': 'diagnostic_msgs/msg/DiagnosticArray'}.items()}
+    assert choose(found) == {'odometer': '/car/odometer', 'imu': '/car/imu/data',
+                             'fix': '/car/fix'}
