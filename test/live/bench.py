@@ -79,6 +79,7 @@ class Client:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.statuses: list[dict] = []
+        self.arrays: list = []       # the same, as messages
         self.health: dict[str, dict] = {}
         self.paths: dict[str, object] = {}
         self.events: list = []
@@ -108,6 +109,7 @@ class Client:
         subscribe(ParameterEvent, '/parameter_events', self.events.append, 100)
 
     def _on_status(self, array) -> None:
+        self.arrays.append(array)
         status, = array.status
         self.statuses.append({'level': status.level, 'name': status.name,
                               'message': status.message,

@@ -7,6 +7,7 @@ from player import messages_of, part, Player
 import pytest
 
 from odocal_ros.live import jobs, operation
+from odocal_ros.live.inputs import Input
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 
@@ -53,6 +54,18 @@ def test_name_overrides_and_remaps_pass_through(embedded):
     client.until(state='waiting')
     wait_for(lambda: '/gps/fix' in client.status['missing'], 'the remapped topic')
     wait_for(lambda: 'second: imu' in client.health, "diagnostics under the node's name")
+
+
+def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
+    node, client = embedded
+    client.until(state='waiting')
+    imu = Input(node, 'imu', ('sensor_msgs/msg/Imu',))
+    assert not imu.gate.can_execute(imu)   # the executor is not woken for each message
+    info = {'received_timestamp': 9, 'publication_sequence_number': 1}
+    imu._receive(b'first', info | {'source_timestamp': 5})
+    imu._receive(b'second', info | {'source_timestamp': 0})   # a middleware that does not tell
+    assert imu.take() == ([b'first', b'second'], [5, 9])
+    assert imu.take() == ([], [])
 
 
 def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):

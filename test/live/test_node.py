@@ -2,11 +2,17 @@
 
 import json
 import math
+from pathlib import Path
+import subprocess
+import sys
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, wait_for
+from bench import answer_of, Client, NodeProcess, ROOT, wait_for
 from player import messages_of, part, Player
 import pytest
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
 
 from odocal_ros.config import Config, with_settings
 from odocal_ros.leg import LegRecorder
@@ -91,6 +97,7 @@ def _first_leg(seen, client, player, sent):
     seen.paths = dict(client.paths)
     seen.result_events = [e for e in client.events if any(
         p.name.startswith('result.') for p in e.changed_parameters)]
+    seen.marks = [serialize_message(array) for array in client.arrays]
     seen.idle_stop = client.call('stop_leg')
     seen.set_result = client.set(result__scale_factor=2.0)
     seen.set_between = client.set(leg__min_distance=50.0)
@@ -145,10 +152,45 @@ def test_live_and_recorded_agree_in_every_digit(session, drive):
         for key, value in ((name, estimate.value), (f'{name}_sigma', estimate.sigma)):
             live = results[f'result.{key}']
             assert live == value or math.isnan(live) and value is None, key
-    written = json.loads((session.folder / 'latest' / 'calibration.json').read_text())
+    written = json.loads((Path(session.saved['saved']) / 'calibration.json').read_text())
     offline = json.loads(json.dumps(as_json(calibration, config, [], '')))
     for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
         assert written[part_of] == offline[part_of], part_of
+
+
+@pytest.fixture(scope='module')
+def recorded(session, drive, tmp_path_factory):
+    """Write what the node heard and said in the first leg into a bag, as a recorder would."""
+    path = tmp_path_factory.mktemp('bags') / 'leg'
+    store = get_typestore(Stores.ROS2_JAZZY)
+    names = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics = {slot: bag.add_connection(names[slot], msgtype, typestore=store)
+                  for slot, msgtype in drive.types.items()}
+        status = bag.add_connection('/calibrator/status', 'diagnostic_msgs/msg/DiagnosticArray',
+                                    typestore=store)
+        for one in part(drive.sent, 45, 117):
+            bag.write(topics[one.slot], one.stamp_ns + 1_000_000, one.raw)
+        for count, raw in enumerate(session.marks):
+            bag.write(status, drive.sent[-1].stamp_ns + count, raw)
+    return path
+
+
+def test_odocal_replay_finds_the_mark_and_agrees_in_every_digit(session, drive, recorded):
+    settings = SETTINGS | {'alignment.heading': repr(drive.heading)}
+    options = [x for name, value in settings.items() for x in ('--set', f'{name}={value}')]
+    run = subprocess.run(
+        [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(recorded), '--json',
+         '--output', str(recorded.parent / 'replayed'), *options], cwd=ROOT, text=True,
+        capture_output=True, check=False)
+    assert run.returncode == 0, run.stderr
+    offline = json.loads(run.stdout)
+    written = json.loads((Path(session.saved['saved']) / 'calibration.json').read_text())
+    for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
+        assert written[part_of] == offline[part_of], part_of
+    live, = written['legs']
+    replay, = offline['legs']
+    assert live | {'bag': 'leg'} == replay
 
 
 def test_the_result_is_the_truth(session, drive):
@@ -265,6 +307,6 @@ def test_save_and_reset(session):
     saved = session.save.message.removeprefix('saved to ')
     assert (session.folder / 'latest').resolve() == type(session.folder)(saved).resolve()
     assert session.reset.message == 'reset: 1 leg dropped'
-    assert session.after_reset['leg_event'] == 'undone'
+    assert (session.after_reset['leg_event'], session.after_reset['leg_id']) == ('undone', '1')
     assert session.results_after_reset['result.valid'] is False
     assert math.isnan(session.results_after_reset['result.scale_factor'])
