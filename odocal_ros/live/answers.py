@@ -20,7 +20,8 @@ def outcome(calibration: Calibration, leg: LegResult | None = None,
     if leg is not None and len(calibration.legs) > 1:
         text = f'leg {leg_id}, {leg.distance:.0f} m, {leg.verdict.value}; all legs {text}'
     for reason in reasons[:MOST_REASONS]:
-        text += f' {reason.code.name}: {reason.text.rstrip(".")}. {reason.remedy}'
+        text = (f'{text.rstrip(".")}. {reason.code.name}: {reason.text.rstrip(".")}. '
+                f'{reason.remedy}')
     return calibration.verdict is not Verdict.REJECTED, text
 
 

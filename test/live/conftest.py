@@ -8,7 +8,6 @@ import socket
 from bench import Client, NodeProcess
 import pytest
 
-
 HAVE_ROS = find_spec('rclpy') is not None
 # what needs a real node; the pure parts of live/ are tested everywhere
 collect_ignore = [] if HAVE_ROS else [
