@@ -43,9 +43,11 @@ setup(
             'ros-jazzy-rclpy',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        'plot': ['matplotlib>=3.6'],
         'dev': [
             'colcon-common-extensions',
             'hypothesis>=6',
+            'matplotlib>=3.6',
             'mpmath>=1.3',
             'mypy>=1.8',
             'pytest>=7.4',
