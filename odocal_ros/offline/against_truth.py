@@ -83,7 +83,7 @@ def _row(name, result, truth, factor) -> Row:
 
 def table(found: list[Row]) -> str:
     """Return the rows as text for a terminal."""
-    lines = [f'{"":<28}{"found":<32}{"truth":<20}{"off by":<14}']
+    lines = [f'{"":<28}{"found":<32}{"truth":<20}off by']
     for row in found:
         if row.value is None:
             lines.append(f'{row.name:<28}{"not determined":<32}{_truth(row)}')
