@@ -14,11 +14,12 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 
 from odocal_ros.config import Config
 from odocal_ros.errors import BadConfig, BadData, OdocalError
 from odocal_ros.live.health import Health
-from odocal_ros.messages import make_reader
+from odocal_ros.messages import make_reader, Reader
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
@@ -73,7 +74,7 @@ class Input:
         self.name = TOPICS[slot]
         self.topic = node.resolve_topic_name(self.name)
         self.msgtype = ''
-        self.reader = None
+        self.reader: Reader | None = None
         self.health = Health()
         self.trouble = ''
         self.frame = ''        # of the Imu's header, once a message has come
@@ -82,10 +83,10 @@ class Input:
         self._node = node
         self._pending: deque = deque()
         self._deserialize: Callable | None = None
-        self._subscription = None
+        self._subscription: Subscription | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         # in sim time a message is stamped with the node clock as it arrives: no queueing then
-        self.gate = Gate(node.get_clock().ros_time_is_active)
+        self.gate = Gate(node.get_clock().ros_time_is_active)  # type: ignore[attr-defined]
 
     def check(self, config: Config) -> None:
         """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
@@ -126,7 +127,8 @@ class Input:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
         self._deserialize = partial(deserialize_message, message_type=kind)
         self._subscription = self._node.create_subscription(
-            kind, self.name, self._receive, qos, raw=True, callback_group=self.gate,
+            kind, self.name, self._receive,  # type: ignore[arg-type]
+            qos, raw=True, callback_group=self.gate,
             # each event handler costs time in every turn of the executor; find() sees as much
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
@@ -146,9 +148,9 @@ class Input:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))
 
-    def _fetch(self) -> None:
+    def _fetch(self, subscription: Subscription) -> None:
         """Take what waits in the middleware's queue, as the executor would."""
-        handle, kind = self._subscription.handle, self._subscription.msg_type
+        handle, kind = subscription.handle, subscription.msg_type
         with handle:
             for _ in range(DEPTH[self.slot]):
                 message_and_info = handle.take_message(kind, True)
@@ -159,7 +161,7 @@ class Input:
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages that came since the last call, and when they were sent, ns."""
         if self._subscription is not None and not self.gate.is_open:
-            self._fetch()
+            self._fetch(self._subscription)
         pending, self._pending = self._pending, deque()
         if pending:
             self.health.arrived([i['publication_sequence_number'] for _, i in pending],
@@ -169,17 +171,20 @@ class Input:
 
     def decode(self, raws: list[bytes], received_ns: list[int], max_gap_s: float | None) -> list:
         """Return (slot, block) pairs of messages; those that cannot be read are counted."""
+        reader, deserialize = self.reader, self._deserialize
+        if reader is None or deserialize is None:
+            return []
         if not self.frame and self.slot == 'imu':
-            self.frame = self._deserialize(raws[0]).header.frame_id
+            self.frame = deserialize(raws[0]).header.frame_id
         try:
-            pairs = self.reader.rows(raws, received_ns, self._deserialize)
+            pairs = reader.rows(raws, received_ns, deserialize)
         except Exception as error:  # whatever a foreign message does, the node lives on
             self._failed += len(raws)
             self.trouble = f'{self.topic}: {" ".join(str(error).split())}'
             pairs = []
-        self.health.unusable = self._failed + self.reader.unreadable
-        if not pairs and self.reader.trouble:
-            self.trouble = f'{self.topic}: {self.reader.trouble}'
+        self.health.unusable = self._failed + reader.unreadable
+        if not pairs and reader.trouble:
+            self.trouble = f'{self.topic}: {reader.trouble}'
         for slot, block in pairs:
             if slot == self.slot:
                 self.health.decoded(block, max_gap_s)
@@ -265,8 +270,8 @@ class Inputs:
 
 def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""
-    odometer = () if config.odometer.type == 'auto' else (config.odometer.type,)
-    wanted = {'imu': (IMU,), 'odometer': odometer, 'fix': (FIX,)}
+    odometer: tuple[str, ...] = () if config.odometer.type == 'auto' else (config.odometer.type,)
+    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer, 'fix': (FIX,)}
     if config.odometer.right == 'topic':
         wanted['odometer_right'] = odometer
     if config.gnss.use_velocity:

@@ -7,7 +7,9 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.task import Future
 
+from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
+from odocal_ros.leg import LegRecorder
 from odocal_ros.live import answers, jobs, outputs
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.recording import Recording
@@ -37,7 +39,7 @@ class Operation:
         self._waiting: list[Future] = []
         self._job: object | None = None       # token of the computation awaited
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
-        self._snapshot = None
+        self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
         self._saved = ''
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -113,12 +115,12 @@ class Operation:
         if late or self._recording.passed(self.session.stop_ns):
             self._close_by_ns = None
             self._snapshot = self._recording.snapshot()
-            self._compute()
+            self._compute(self._snapshot)
 
-    def _compute(self) -> None:
+    def _compute(self, samples: LegRecorder) -> None:
         session = self.session
         kept = [leg.result for leg in session.legs]
-        self._submit(partial(jobs.compute, self._snapshot, session.start_ns, session.stop_ns,
+        self._submit(partial(jobs.compute, samples, session.start_ns, session.stop_ns,
                              kept, session.config), self._take_leg)
 
     def _submit(self, job, take) -> None:
@@ -150,7 +152,7 @@ class Operation:
         self._snapshot, self._distance_m = None, result.distance
         success, text = self._take_result(calibration, paths, result)
         if success and self._config().output.autosave:
-            self._save()
+            self._save(calibration)
 
     def _take_result(self, calibration, paths, leg=None) -> tuple[bool, str]:
         """Publish a result and answer those who wait for it."""
@@ -167,7 +169,7 @@ class Operation:
         self.show_status()
         self._answer(False, text)
 
-    def _save(self) -> Future:
+    def _save(self, calibration: Calibration) -> Future:
         """Write the result files in the worker; the future has the answer."""
         future = Future()
 
@@ -183,7 +185,7 @@ class Operation:
         inputs = self._recording.inputs.by_slot
         topics = {slot: one.topic for slot, one in inputs.items() if one.reader is not None}
         self._worker.submit(partial(
-            outputs.save, self.session.calibration, self.session.config,
+            outputs.save, calibration, self.session.config,
             [{'bag': '', 'sha256': None, 'topics': topics}], inputs['imu'].frame,
             self._clock.now().nanoseconds), then)
         return future
@@ -224,9 +226,9 @@ class Operation:
         session = self.session
         if session.state is State.RECORDING:
             self._end_leg()
-        elif session.state is State.FAILED and session.open_leg:
+        elif session.open_leg and session.state is State.FAILED and self._snapshot is not None:
             session.retry(self._config())
-            self._compute()
+            self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             if session.calibration is None:
                 raise Refused('no leg is running and there is no result yet: call ~/start_leg '
@@ -280,4 +282,4 @@ class Operation:
         if self.session.calibration is None:
             raise Refused('nothing to save: no leg has been computed yet; call ~/start_leg, '
                           'drive, ~/stop_leg')
-        return self._save()
+        return self._save(self.session.calibration)

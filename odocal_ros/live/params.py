@@ -40,7 +40,7 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     limits = []
     if setting.choices:
         limits.append('one of ' + ', '.join(setting.choices))
-    if setting.low is not None:
+    if setting.low is not None and setting.high is not None:
         limits.append(f'{setting.low:g} to {setting.high:g}')
         if setting.kind == 'int':
             result.integer_range = [IntegerRange(from_value=setting.low, to_value=setting.high)]
