@@ -1,0 +1,113 @@
+"""Tables 3 and 4 of source A from the simulated drive, and all four of them as one thing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.paper.cells import Cell, CONVENTION, TABLE_3, TABLE_4
+from odocal_ros.paper.coefficients import DRIFT, HEADING, table_1, table_2
+from odocal_ros.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
+
+SCALE_REMARK = ('alike to 2e-11 in every printed row, which plane and tilt are not: a constant of '
+                "the paper's numerics, no target")
+FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) beside the ellipsoid's C0 and C in "
+                  '(13), (14): phi_U / 2 times 0.0059')
+SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """
+    A row of table 3.
+
+    yaw_deg, scale : ours beside the printed ones, deg and relative to K.
+    model_deg : yaw error by the linear error model, deg.
+    noise_sigmas : printed less ours in sigmas of the yaw error by gyro noise; None: not printed.
+    """
+
+    yaw_deg: Cell
+    scale: Cell
+    model_deg: float
+    noise_sigmas: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class PaperTables:
+    """
+    The four tables, and what they were made of.
+
+    noise_deg : 1 sigma of the yaw error by the paper's gyro noise over the drive, deg.
+    sigma_deg : 1 sigma of the yaw that the pipeline itself states for the drive, deg.
+    """
+
+    table_1: dict[str, dict[str, Cell]]
+    table_2: dict[str, dict[str, Cell]]
+    table_3: dict[str, Row]
+    table_4: dict[str, dict[str, dict[str, Cell]]]
+    outcomes: dict[str, Outcome]
+    growths: dict[str, Growth]
+    noise_deg: float
+    sigma_deg: float
+
+    def as_dict(self) -> dict:
+        """Return what --json prints."""
+        third = {source: {
+            'yaw_deg': row.yaw_deg.as_dict() | {'model': row.model_deg,
+                                                'noise_sigmas': row.noise_sigmas},
+            'scale': row.scale.as_dict()} for source, row in self.table_3.items()}
+        return {
+            'error_convention': CONVENTION,
+            'gyro_noise_yaw_sigma_deg': self.noise_deg,
+            'stated_yaw_sigma_deg': self.sigma_deg,
+            'tables': {'1': _plain(self.table_1), '2': _plain(self.table_2), '3': third,
+                       '4': _plain(self.table_4)}}
+
+
+def _plain(table):
+    return table.as_dict() if isinstance(table, Cell) else {k: _plain(v) for k, v in table.items()}
+
+
+def compute() -> PaperTables:
+    """Return the four tables; the drive of section 3 goes through the pipeline eight times."""
+    drive = PaperDrive()
+    outcomes = {source: drive.outcome(source) for source in SOURCES}
+    growths = {source: drive.growth(source) for source in SOURCES}
+    profile = drive.profile()
+    noise_deg = float(np.rad2deg(profile.noise_sigma(GYRO_NOISE)))
+    third = {source: _row(source, outcomes[source], growths[source], noise_deg)
+             for source in SOURCES}
+    return PaperTables(table_1(), table_2(), third, _table_4(third, profile), outcomes, growths,
+                       noise_deg, float(np.rad2deg(outcomes['all'].yaw_sigma)))
+
+
+def _row(source, outcome, growth, noise_deg):
+    printed_scale, printed_yaw = TABLE_3[source]
+    yaw = float(np.rad2deg(outcome.yaw))
+    sigmas, remark = None, ''
+    if printed_yaw is not None:
+        sigmas = (printed_yaw + yaw) / noise_deg
+        if abs(yaw) < noise_deg:
+            remark = 'below the gyro noise of the paper: proves nothing'
+    return Row(Cell(printed_yaw, yaw, sense=-1, remark=remark),
+               Cell(printed_scale, outcome.scale, remark=SCALE_REMARK if printed_scale else ''),
+               float(np.rad2deg(growth.yaw[-1])), sigmas)
+
+
+def _table_4(third, profile):
+    formula = {'eps_z': profile.heading_and_drift(0.0, DRIFT),
+               'phi_U0': profile.heading_and_drift(HEADING, 0.0)}
+
+    def line(source, name):
+        if name == 'simulated':
+            yaw_deg, scale = third[source].yaw_deg.value, third[source].scale.value
+            remarks = '', SCALE_REMARK
+        else:
+            dalpha, scale = formula[source]
+            scale = round(scale, 20)      # below is round-off of a variance that is nothing
+            yaw_deg, remarks = float(np.rad2deg(dalpha)), (SIGN_REMARK, FORMULA_REMARK)
+        printed_scale, printed_yaw = TABLE_4[source][name]
+        return {'yaw_deg': Cell(printed_yaw, yaw_deg, sense=-1, remark=remarks[0]),
+                'scale': Cell(printed_scale, scale, remark=remarks[1])}
+
+    return {source: {name: line(source, name) for name in lines}
+            for source, lines in TABLE_4.items()}
