@@ -69,7 +69,7 @@ def _edge(text, whole):
 
 def marked_legs(bag) -> list[tuple[int, int]]:
     """Return the legs that a node marked in the bag by its status; cancelled ones are left out."""
-    last: dict[str, dict] = {}
+    last: dict[tuple, dict] = {}
     for topic in bag.topics.values():
         if topic.msgtype != STATUS_TYPE:
             continue
@@ -87,14 +87,15 @@ def marked_legs(bag) -> list[tuple[int, int]]:
 
 
 def _remember(last, values):
-    leg_id = values.get('leg_id', '')
-    if not leg_id or leg_id == '0':
-        return
-    before = last.get(leg_id, {})
     try:
-        int(values['leg_start_ns']), int(values['leg_stop_ns'])
+        start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
     except (KeyError, ValueError):
         return
+    # ids begin again with each run of the node: a leg is told by its start too
+    leg_id = values.get('leg_id', ''), start
+    if leg_id[0] in ('', '0'):
+        return
+    before = last.get(leg_id, {})
     if before.get('leg_event') in ('cancelled', 'undone'):
         return
     event = values.get('leg_event') or before.get('leg_event', '')

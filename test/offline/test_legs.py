@@ -70,6 +70,12 @@ def test_marks_of_the_node_are_found_and_cancelled_legs_are_not():
     assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
 
 
+def test_legs_of_two_runs_of_the_node_are_kept_apart():
+    bag = StatusBag([('1', 5 * S, 9 * S, 'stopped'), ('1', 20 * S, 0, 'started'),
+                     ('1', 20 * S, 30 * S, 'stopped')])
+    assert marked_legs(bag) == [(5 * S, 9 * S), (20 * S, 30 * S)]
+
+
 def recorded(drive):
     """Return a recorder fed with a drive, and a bag of its span."""
     recorder = LegRecorder()
