@@ -4,15 +4,16 @@ Alignment of a leg: which standstill, which heading source, in the order of desi
 Pure: takes screened inputs, returns an Alignment and what was found on the way.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.config import Config
 from odocal_ros.grades import Grade, grade_of
-from odocal_ros.nav.alignment import (
-    complete, gyrocompass, level_at_rest, level_in_motion, Level)
+from odocal_ros.nav.alignment import complete, gyrocompass, Level, level_at_rest, level_in_motion
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.earth import C_en, earth_rate_n
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
@@ -22,6 +23,7 @@ MOTION_LEVEL = 30.0       # s of driving that a level without standstill is take
 COURSE_DISTANCE = 30.0    # m of track for a course
 COURSE_TIME = 300.0       # s within which it must be driven
 COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
+HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
 NEAR = 0.5                # s: a heading sample this near to a moving start is taken
 
 
@@ -51,6 +53,7 @@ def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Confi
     """
     grade = grade_of(config.imu)
     level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
+    level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
     reasons += why
     if source == 'course':
@@ -65,6 +68,22 @@ def choose_standstill(spans):
     return before[-1] if before else None
 
 
+def _from_place(inputs, span, fixes_n, origin):
+    """
+    Return C_np of the place of a standstill: east, north and up differ from those at the origin.
+
+    By 0.16 mrad for each kilometre of the way from there to the mark.
+    """
+    if span is None or not len(fixes_n):
+        return np.eye(3)
+    near = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
+    if not near.any():
+        near = np.argmin(np.abs(inputs.t_fix - span[1]), keepdims=True)
+    place_n = np.nan_to_num(np.median(fixes_n[near], axis=0))
+    latitude, longitude, _ = origin.to_geodetic(place_n)
+    return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
+
+
 def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
     span = choose_standstill(spans)
     if span is not None:
@@ -73,6 +92,8 @@ def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
     pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
+    if pick.sum() < 2:      # the Imu falls silent at the mark: IMU_GAP will say so
+        pick = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
     _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     ends = t[pick][[0, -1]]
     speed = (inputs.travel.at(ends + 0.5) - inputs.travel.at(ends - 0.5)) * metres_per_unit
@@ -120,9 +141,11 @@ def _fixed(inputs, level, latitude, grade, config):
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
-    # the heading holds at the mark: carry it back over the turn since the standstill
-    turned = _turn_since(inputs, level) if level.standstill and level.t < -0.5 else 0.0
-    return (mark_yaw - turned, config.alignment.heading_sigma), ''
+    # the heading holds at the mark: carry it back over the turn since the standstill, and to
+    # the north of where that was
+    turned = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
+    turned += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
+    return (float(wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
 
 
 def _turn_since(inputs, level):
@@ -149,18 +172,20 @@ def _heading_topic(inputs, level, latitude, grade, config):
 
 def _from_quaternions(t, q, variance, level, config, to_b, offset):
     """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
+    pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     if level.standstill:
-        pick = (t >= level.standstill[0]) & (t <= level.standstill[1])
+        pick &= (t >= level.standstill[0]) & (t <= level.standstill[1])
     else:
-        pick = np.abs(t - level.t) <= NEAR
-        pick &= np.abs(t - level.t) == np.abs(t[pick] - level.t).min() if pick.any() else pick
-    pick = pick & ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+        away = np.where(pick, np.abs(t - level.t), np.inf)
+        pick = (away <= NEAR) & (away == away.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
     C = to_b(matrix_from_quat(q[pick]))
     yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    if sigma > HEADING_LIMIT:
+        return None, f'its covariance says +-{np.rad2deg(sigma):.3g} deg'
     return (float(wrap(yaw)), float(sigma)), ''
 
 

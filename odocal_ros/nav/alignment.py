@@ -4,11 +4,12 @@ Alignment: level, gyro bias and heading at the start of a leg, each with its sig
 An ``Alignment`` is an input of the pure pipeline, so that a simulation can put errors in it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
@@ -52,22 +53,31 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Level and turn rate before heading is known: L is level, its x axis below b's x axis."""
+    """
+    Level and turn rate before heading is known: L is level, its x axis below b's x axis.
+
+    Level where the vehicle is, at p: C_np takes the east, north and up of p to those of n.
+    """
 
     t: float
     C_Lb: NDArray[np.float64]           # (3, 3)
     level_sigma: float                  # rad, each axis
     mean_rate_b: NDArray[np.float64]    # (3,) rad/s over the standstill, zero in motion
-    rate_sigma: float                   # rad/s, of the mean from noise
+    rate_sigma: float                   # rad/s, of the mean against the bias at t
     standstill: tuple[float, float] | None
+    C_np: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
 
 
 def level_frame(up_b):
-    """Return C_Lb for the up direction in b: x of L is b's x axis projected on the level."""
+    """
+    Return C_Lb for the up direction in b: x of L is b's x axis projected on the level.
+
+    Where b's x axis is upright, b's y axis is that of L.
+    """
     u = up_b / np.linalg.norm(up_b)
-    x = np.array([1.0, 0.0, 0.0]) - u[0] * u
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(u, x), u])
+    level = np.hypot(u[1], u[2])
+    y = np.array([0.0, u[2], -u[1]]) / level if level else np.array([0.0, 1.0, 0.0])
+    return np.stack([np.cross(y, u), y, u])
 
 
 def C_nL(yaw):
@@ -93,7 +103,8 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
 
     Returns
     -------
-    Level at the end of the standstill; an accelerometer bias tilts it by bias / g.
+    Level at the end of the standstill; an accelerometer bias tilts it by bias / g. The bias walks
+    while its mean is taken: by a third of its variance over the standstill from the last value.
 
     """
     inside = (t >= span[0]) & (t <= span[1])
@@ -102,8 +113,9 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
     g = np.linalg.norm(up_b)
     sigma = np.hypot(grade.accel_bias, grade.accel_noise / np.sqrt(length)) / g
     end = t[inside][-1]
+    rate_sigma = np.hypot(gyro_noise / np.sqrt(length), grade.gyro_bias_walk * np.sqrt(length / 3))
     return Level(float(end), level_frame(up_b), float(sigma), w_b[inside].mean(axis=0),
-                 gyro_noise / np.sqrt(length), (float(span[0]), float(span[1])))
+                 float(rate_sigma), (float(span[0]), float(span[1])))
 
 
 def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
@@ -124,7 +136,8 @@ def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
     latitude : float
         rad.
     grade : Grade
-        Sensor figures: without a standstill the turn-on gyro bias is still in the attitude.
+        Sensor figures: without a standstill the turn-on gyro bias is still in the attitude, and
+        the Earth's turn cannot be taken out before heading is known.
 
     """
     T = t[-1] - t[0]
@@ -134,8 +147,9 @@ def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
     change = C_0b[-1][:, 0] * speed[1] - C_0b[0][:, 0] * speed[0]
     up_0 = lift - change
     g = gravity(latitude, 0.0)
-    parts = (grade.accel_bias / g, grade.gyro_bias * T / 2,
-             np.abs(speed).max() * 0.05 / (g * T))
+    fastest = np.abs(speed).max()
+    earth = OMEGA * (T / 2 + 2 * fastest / g)       # the level turning away, and Coriolis
+    parts = (grade.accel_bias / g, grade.gyro_bias * T / 2, earth, fastest * 0.05 / (g * T))
     return Level(float(t[0]), level_frame(up_0), float(np.linalg.norm(parts)), np.zeros(3),
                  0.0, None)
 
@@ -145,34 +159,45 @@ def gyrocompass(level: Level, latitude, grade) -> tuple[float, float]:
     Return the ENU yaw of L's x axis and its sigma, rad, from the Earth rate seen at rest.
 
     The level part of the mean rate points north. A gyro bias east turns it by
-    bias / (Omega cos latitude): the sigma is that of the turn-on bias and the noise.
+    bias / (Omega cos latitude), and a level tilted about north by tilt * tan latitude.
     """
     rate_L = level.C_Lb @ level.mean_rate_b
-    yaw = np.pi / 2 - np.arctan2(rate_L[1], rate_L[0])
-    sigma = np.hypot(grade.gyro_bias, level.rate_sigma) / (OMEGA * np.cos(latitude))
-    return float(yaw), float(sigma)
+    yaw = wrap(np.pi / 2 - np.arctan2(rate_L[1], rate_L[0]))
+    gyro = np.hypot(grade.gyro_bias, level.rate_sigma) / (OMEGA * np.cos(latitude))
+    return float(yaw), float(np.hypot(gyro, level.level_sigma * np.tan(latitude)))
 
 
 def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro_noise):
     """
-    Return the Alignment of a level and a heading; the gyro bias from rest, Earth rate taken out.
+    Return the Alignment of a level and a heading, rad; the gyro bias from rest where there is one.
 
-    With a heading of its own source all three axes are found; a gyrocompass has already used up
-    the east part, which keeps the turn-on sigma.
+    yaw is that of L's x axis where the level is taken, its sigma holds for that too.
     """
-    C_nb = C_nL(yaw) @ level.C_Lb
+    C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
+    bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, source == 'gyrocompass', latitude,
+                                   grade)
+    sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
+    return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
+                     sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill)
+
+
+def _gyro_bias_n(level, C_nb, yaw_sigma, compass, latitude, grade):
+    """
+    Return gyro bias and its sigma, ENU: the mean rate at rest less the Earth's.
+
+    A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
+    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. A gyrocompass has
+    used up the east part and knows nothing of it. Where that leaves less than the grade says
+    of the turn-on bias, or without a standstill, the bias is taken as zero.
+    """
     if level.standstill is None:
-        bias, sigma = np.zeros(3), np.full(3, grade.gyro_bias)
-    else:
-        bias = level.mean_rate_b - transpose(C_nb) @ earth_rate_n(latitude)
-        noise = np.hypot(level.rate_sigma, 1e-12)
-        if source == 'gyrocompass':
-            along_n = np.array([grade.gyro_bias, noise, noise])
-            sigma = np.sqrt(np.einsum('ni,n->i', C_nb**2, along_n**2))
-        else:
-            turn = yaw_sigma * OMEGA * np.cos(latitude)      # Earth rate put on a wrong axis
-            level_part = np.hypot(noise, min(turn, grade.gyro_bias))
-            sigma = np.sqrt(np.einsum('ni,n->i', C_nb**2,
-                                      np.array([level_part, level_part, noise])**2))
-    return Alignment(level.t, C_nb, bias, level.level_sigma, float(yaw_sigma), sigma,
-                     gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill)
+        return np.zeros(3), np.full(3, grade.gyro_bias)
+    level_rate, up_rate = OMEGA * np.cos(latitude), abs(OMEGA * np.sin(latitude))
+    # rms of psi^2 / 2 for a normal psi: sqrt(3) / 2 sigma^2; of an unknown one sqrt(3 / 2)
+    by_yaw = np.array([np.inf if compass else min(yaw_sigma, 1.0),
+                       min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0]) * level_rate
+    by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
+    sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
+    measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)
+    known = sigma < grade.gyro_bias
+    return np.where(known, measured, 0.0), np.where(known, sigma, grade.gyro_bias)

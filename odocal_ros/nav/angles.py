@@ -4,8 +4,11 @@ import numpy as np
 
 
 def wrap(angle):
-    """Bring an angle into (-pi, pi]."""
-    return -((np.pi - np.asarray(angle)) % (2 * np.pi) - np.pi)
+    """Bring an angle into (-pi, pi]; one that is there already keeps every bit."""
+    angle = np.asarray(angle, dtype=float)
+    wrapped = np.pi - (np.pi - angle) % (2 * np.pi)
+    wrapped = np.where(wrapped > -np.pi, wrapped, np.pi)     # the remainder may round to 2 pi
+    return np.where((angle > -np.pi) & (angle <= np.pi), angle, wrapped)[()]
 
 
 def yaw_from_heading(heading):
@@ -15,4 +18,5 @@ def yaw_from_heading(heading):
 
 def heading_from_yaw(yaw):
     """Turn ENU yaw into compass heading, rad, in [0, 2 pi)."""
-    return (np.pi / 2 - yaw) % (2 * np.pi)
+    heading = (np.pi / 2 - np.asarray(yaw, dtype=float)) % (2 * np.pi)
+    return np.where(heading < 2 * np.pi, heading, 0.0)[()]   # the remainder may round to 2 pi

@@ -16,6 +16,8 @@ from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
+TINY = 1e-9     # s, no two epochs are nearer
+
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -53,10 +55,13 @@ class Track:
     P: NDArray[np.float64]
 
     def at(self, t):
-        """Return P at times t, linear between epochs: (...) to (..., 3, 3)."""
-        k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, len(self.t) - 2)
-        x = np.clip((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0, 1.0)[..., None, None]
-        return self.P[k] * (1 - x) + self.P[k + 1] * x
+        """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""
+        last = len(self.t) - 1
+        k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
+        after = np.minimum(k + 1, last)         # a track of one epoch has but that
+        step = np.maximum(self.t[after] - self.t[k], TINY)
+        x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
+        return self.P[k] * (1 - x) + self.P[after] * x
 
     def C_nb_at(self, t):
         """Return attitude at the epoch nearest to t: (...) to (..., 3, 3)."""
@@ -95,30 +100,36 @@ def forward_b(yaw, pitch):
 
 
 def mounting_from_forward(d_b):
-    """Return yaw and pitch mounting angle, rad, of a forward axis in b: inverse of forward_b."""
-    return (np.arctan2(-d_b[..., 1], np.hypot(d_b[..., 0], d_b[..., 2])),
-            np.arctan2(d_b[..., 2], d_b[..., 0]))
+    """
+    Return yaw and pitch mounting angle, rad, of a forward axis in b: inverse of forward_b.
+
+    Yaw in [-pi, pi], pitch within 90 deg: an odometer that counts backwards is a yaw of pi.
+    """
+    d_b = np.asarray(d_b, dtype=float)
+    x, y, z = d_b[..., 0], d_b[..., 1], d_b[..., 2]
+    side = np.where(x < 0, -1.0, 1.0)
+    return np.arctan2(-y, side * np.hypot(x, z)), np.arctan2(side * z, side * x)
 
 
 def rough_scale(travel: Travel, t_fix, fixes_n, sigma):
     """
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 
-    The median over stretches at least 20 m and eight sigmas long: good to a per cent or so, for
-    thresholds and for scales that have no nominal value.
+    The way is cut into equal pieces, as short as they may be for the fixes to be 20 m and eight
+    sigmas apart, and the median of the pieces taken: good to some per cent though fixes stray,
+    for thresholds and for scales that have no nominal value.
     """
-    need = max(20.0, 8 * sigma)
-    s = travel.at(t_fix)
-    inside = np.flatnonzero((t_fix >= travel.t[0]) & (t_fix <= travel.t[-1])) \
-        if len(travel.t) else []
-    ratios, last = [], None
-    for k in inside:
-        if last is None:
-            last = k
-            continue
-        chord = np.hypot(*(fixes_n[k, :2] - fixes_n[last, :2]))
-        if chord >= need:
-            if s[k] != s[last]:
-                ratios.append(chord / abs(s[k] - s[last]))
-            last = k
-    return float(np.median(ratios)) if ratios else None
+    inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
+    if not np.any(inside):
+        return None
+    s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
+    pieces = len(s) // 2
+    while pieces and way[-1] > 0:
+        k = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], pieces + 1)))
+        chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
+        onward = run >= way[-1] / pieces / 2      # no flicker of counts at rest, no to and fro
+        if onward.any() and np.median(chord[onward]) >= max(20.0, 8 * sigma):
+            return float(np.median(chord[onward] / run[onward]))
+        pieces //= 2
+    return None

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.reasons import Code, Reason
 
-RESET_FACTOR = 5.0   # a step this many times the 99th percentile of the rate is no motion
+RESET_FACTOR = 5.0   # a step this many times the 95th percentile of the moving rate is no motion
+ENOUGH = 20          # steps below which no reset is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,49 +64,71 @@ def travel(t, value, form, reversed_counts=False) -> tuple[Travel, tuple[Reason,
 
 
 def mean_travel(left: Travel, right: Travel) -> Travel:
-    """Return the travel of the middle of the axle, on the left wheel's rows both have."""
+    """
+    Return the travel of the middle of the axle, on the left wheel's rows both have.
+
+    The wheels round independently: their mean errs like a count of 1 / sqrt(2) of either.
+    """
+    if not len(right.t):
+        return Travel(left.t[:0], left.s[:0], left.quantum)
     both = (left.t >= right.t[0]) & (left.t <= right.t[-1])
     t = left.t[both]
     s = (left.s[both] + right.at(t)) / 2
-    return Travel(t, s - (s[0] if len(s) else 0.0), left.quantum / 2)
+    return Travel(t, s - (s[0] if len(s) else 0.0), left.quantum / np.sqrt(2))
 
 
 def _counter_steps(t, value, modulus):
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
-    if not np.issubdtype(value.dtype, np.integer):
-        return _bridge_resets(t, value, np.diff(value))
-    with np.errstate(over='ignore'):
-        raw = np.diff(value)                       # wraps at 2^64 by itself
-    step = raw
-    if 0 < modulus < 2**63:
+    whole = np.issubdtype(value.dtype, np.integer)
+    raw = step = np.diff(value)                    # integers wrap at 2^64 by themselves
+    if whole and 0 < modulus < 2**63:
         half = modulus // 2
         step = (raw + half) % modulus - half
-    rolled = np.flatnonzero(step != raw)
-    step, reasons = _bridge_resets(t, value, step.astype(float))
-    if len(rolled):
-        reasons += (Reason(Code.COUNTER_ROLLOVER, f'the counter rolled over {len(rolled)} '
-                           f'time{"s" * (len(rolled) > 1)} (modulus {modulus}), first at '
-                           f't = {t[rolled[0] + 1]:.2f} s; undone'),)
+    rolled = step != raw
+    step = step.astype(float)
+    resets = _resets(t, step, whole)
+    reasons: tuple[Reason, ...] = ()
+    if resets.any():
+        first = int(np.argmax(resets))
+        step, count = _bridged(t, step, resets), int(resets.sum())
+        jump = value[first + 1].item() - value[first].item()
+        reasons += (Reason(Code.COUNTER_RESET, f'the counter jumps by {jump:+.6g} at '
+                           f't = {t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
+                           'reset, not motion; bridged at the speed beside it'),)
+    rolled &= ~resets
+    if rolled.any():
+        first, count = int(np.argmax(rolled)), int(rolled.sum())
+        reasons += (Reason(Code.COUNTER_ROLLOVER, f'the counter rolled over {count} '
+                           f'time{"s" * (count > 1)} (modulus {modulus}), first at '
+                           f't = {t[first + 1]:.2f} s; undone'),)
     return step, reasons
 
 
-def _bridge_resets(t, value, step):
-    """Replace steps no wheel can make by the rate beside them."""
-    if len(step) < 20:
-        return step, ()
+def _resets(t, step, whole):
+    """Tell which steps no wheel can make: far above the drive's speed, alone or in pairs."""
     dt = np.diff(t)
-    dt = np.maximum(dt, np.median(dt))             # bursts of stamps are no speed
-    rate = step / dt
-    limit = RESET_FACTOR * np.percentile(np.abs(rate), 99)
-    limit = max(limit, 3 / np.median(dt)) if np.issubdtype(value.dtype, np.integer) else limit
-    bad = np.flatnonzero(np.abs(rate) > limit)
-    if not len(bad) or limit == 0:
-        return step, ()
-    good = np.setdiff1d(np.arange(len(step)), bad)
+    if len(step) < ENOUGH or not step.any():
+        return np.zeros(len(step), bool)
+    usual = np.median(dt)
+    size = np.abs(step) / np.maximum(dt, usual)    # bursts of stamps are no speed
+    limit = RESET_FACTOR * np.percentile(size[size > 0], 95)
+    far = size > (max(limit, 3 / usual) if whole else limit)
+    # motion of a drive that mostly stands comes in long runs, a reset or a false row does not
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - begin > 2:
+            far[begin:end] = False
+    return far
+
+
+def _bridged(t, step, resets):
+    """Return steps with the resets replaced by the rate beside them."""
+    dt = np.diff(t)
     step = step.copy()
-    step[bad] = np.interp(bad, good, rate[good]) * np.diff(t)[bad]
-    jump = value[bad[0] + 1].item() - value[bad[0]].item()
-    return step, (Reason(Code.COUNTER_RESET, f'the counter jumps by {jump:+.6g} at '
-                         f't = {t[bad[0] + 1]:.2f} s ({len(bad)} such step'
-                         f'{"s" * (len(bad) > 1)}): a reset, not motion; bridged at the speed '
-                         'beside it'),)
+    good = np.flatnonzero(~resets & (dt > 0))
+    if len(good):
+        bad = np.flatnonzero(resets)
+        step[bad] = np.interp(bad, good, step[good] / dt[good]) * dt[bad]
+    else:
+        step[resets] = 0.0
+    return step

@@ -5,8 +5,9 @@ import numpy as np
 CELL = 0.1            # s, grid of the detector
 WINDOW = 0.5          # s, each side
 MOVE = 0.03           # m, travel within the window that still counts as standing
-TURN = 0.02           # rad/s, wander of the gyro that still counts as standing
 CREEP = 0.02          # m/s, mean speed at which a long slow stretch is no standstill
+TURN = 0.02           # rad/s, wander of the gyro that still counts as standing
+MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
 
 
 def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
@@ -27,7 +28,8 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
     Returns
     -------
     (k, 2) array of begin and end times, s, in order. The edges lie inside the true standstill by
-    up to the window: a slow start is cut off, never included.
+    up to the window; a start so slow that it takes longer than that to move MOVE, or a count and
+    a half, is included as far.
 
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
@@ -37,30 +39,62 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
         return np.empty((0, 2))
     edges = np.linspace(t0, t1, max(2, round((t1 - t0) / CELL)) + 1)
     middle = (edges[:-1] + edges[1:]) / 2
-    quiet = _still_wheels(middle, travel, metres_per_unit) & _still_gyro(edges, t_imu, w_b)
+    rate, steady = _gyro(edges, t_imu, w_b)
+    quiet = _still_wheels(middle, travel, metres_per_unit) & steady
+    quiet &= _not_turning(rate, quiet, edges, shortest)
+    spans = _spans(quiet, edges, shortest)
+    moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * abs(metres_per_unit)
+    return spans[moved <= CREEP * (spans[:, 1] - spans[:, 0]) + _allowed(travel, metres_per_unit)]
+
+
+def _allowed(travel, metres_per_unit):
+    """Return the travel, m, of one that stands: MOVE, or a count or so of jitter."""
+    return max(MOVE, 1.5 * travel.quantum * abs(metres_per_unit))
+
+
+def _spans(quiet, edges, shortest):
+    """Return begin and end of the runs of quiet cells that last: (k, 2)."""
     steps = np.diff(np.concatenate([[False], quiet, [False]]).astype(int))
     spans = np.stack([edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)]], -1)
-    moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
-    length = spans[:, 1] - spans[:, 0]
-    return spans[(length >= shortest) & (moved <= CREEP * length + MOVE)]
+    return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 
 def _still_wheels(middle, travel, metres_per_unit):
-    """Tell where travel within the window stays within MOVE and a count or so of jitter."""
-    allowed = max(MOVE, 1.5 * travel.quantum * metres_per_unit)
+    """Tell where travel in the window is that of one that stands."""
     # range of the travel in the window by a few probes, so that rocking to and fro is seen
     probes = [travel.at(middle + x) for x in np.linspace(-WINDOW, WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
-    return reach * abs(metres_per_unit) <= allowed
+    return reach * abs(metres_per_unit) <= _allowed(travel, metres_per_unit)
 
 
-def _still_gyro(edges, t_imu, w_b):
-    """Tell where the mean turn rate of the cells around wanders by less than TURN."""
+def _gyro(edges, t_imu, w_b):
+    """Return the mean turn rate about each cell, (m, 3), and where it wanders less than TURN."""
+    dt = np.diff(t_imu)
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(
-        (w_b[:-1] + w_b[1:]) / 2 * np.diff(t_imu)[:, None], axis=0)])
+        (w_b[:-1] + w_b[1:]) / 2 * dt[:, None], axis=0)])
     angle = np.stack([np.interp(edges, t_imu, total[:, k]) for k in range(3)], -1)
     rate = np.diff(angle, axis=0) / np.diff(edges)[:, None]
     reach = round(WINDOW / CELL)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
-    return (windows.std(axis=-1) < TURN).all(axis=-1)
+    unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > WINDOW, dt, 0.0))])
+    seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing is known within a gap
+    return windows.mean(axis=-1), (windows.std(axis=-1) < TURN).all(axis=-1) & seen
+
+
+def _not_turning(rate, quiet, edges, shortest):
+    """
+    Tell where the gyro reads what it reads at rest.
+
+    A vehicle that turns on the spot at an even rate holds wheels (their mean) and gyro as steady
+    as one that stands. The slowest of the steady stretches is taken for rest: its reading is the
+    bias, and the others must agree with it.
+    """
+    means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)
+             for a, b in _spans(quiet, edges, shortest)]
+    if not means:
+        return quiet
+    rest = min(means, key=np.linalg.norm)
+    if np.abs(rest).max() > MOST_BIAS:
+        return np.zeros_like(quiet)
+    return (np.abs(rate - rest) < TURN).all(axis=-1)

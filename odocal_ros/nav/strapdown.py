@@ -8,9 +8,10 @@ without any per-sample loop.
 
 import numpy as np
 
-from odocal_ros.nav.rotations import quat_from_rotvec, quat_multiply
-
-BLOCK = 64   # quaternions a scan multiplies up in step; 40 to 800 make no difference
+BLOCK = 64       # quaternions a scan multiplies up in step; 40 to 800 make no difference
+CHUNK = 16384    # intervals worked on at a time: their arrays stay in the cache
+EVEN = 2.0       # ratio of neighbouring intervals up to which a cubic is laid through them
+TINY = 1e-9      # s, of the stamps: keeps the slope of equal stamps finite
 
 
 def rotation_increments(t, w_b):
@@ -22,41 +23,52 @@ def rotation_increments(t, w_b):
     than a factor of two, as a straight line (the classic two-sample form). Algorithm error
     falls with the fourth power of the step, two-sample with the second.
     """
-    h = np.diff(t)
-    w = np.ascontiguousarray(np.asarray(w_b, dtype=float).T)
-    mean = (w[:, :-1] + w[:, 1:]) / 2
-    mid, slope = mean.copy(), (w[:, 1:] - w[:, :-1]) / h
-    if len(t) > 3:
-        before, after = h[:-2] / h[1:-1], h[2:] / h[1:-1]
-        even = (before > 0.5) & (before < 2.0) & (after > 0.5) & (after < 2.0)
-        weights = _cubic_weights(h[:-2], h[1:-1], h[2:])
-        for line, weight in zip((mean, mid, slope), weights, strict=True):
-            for axis in range(3):
-                v = w[axis]
-                fit = (weight[0] * v[:-3] + weight[1] * v[1:-2]
-                       + weight[2] * v[2:-1] + weight[3] * v[3:])
-                np.copyto(line[axis, 1:-1], fit, where=even)
-    phi = mean * h
-    h3 = h**3 / 12
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        phi[i] += (mid[j] * slope[k] - mid[k] * slope[j]) * h3
+    t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
+    n = max(len(t) - 1, 0)
+    phi = np.empty((3, n))
+    for first in range(0, n, CHUNK):
+        phi[:, first:first + CHUNK] = _increments(t, w_b, first, min(first + CHUNK, n))
     return phi
 
 
-def _cubic_weights(ha, h, hb):
-    """Return the weights of four uneven samples in mean, middle and middle slope over h."""
-    x = (-h / 2 - ha, -h / 2, h / 2, h / 2 + hb)      # abscissae about the middle
+def _increments(t, w_b, first, last):
+    """Return the rotation vectors of the intervals from first up to last: (3, last - first)."""
+    low, high = max(first - 1, 0), min(last + 1, len(t) - 1)     # with a neighbour each side
+    h = np.diff(t[low:high + 1])
+    w = np.ascontiguousarray(w_b[low:high + 1].T)
+    rise = w[:, 1:] - w[:, :-1]
+    mid = w[:, :-1] + w[:, 1:]
+    mid *= 0.5
+    mean = mid * h
+    if len(h) > 2:
+        bow, twist = _bow(h, rise)
+        mid[:, 1:-1] -= bow
+        rise[:, 1:-1] -= twist
+        bow *= h[1:-1] * (2 / 3)        # mean of the parabola: 2/3 of its bow, not all
+        mean[:, 1:-1] -= bow
     h2 = h**2 / 12
-    mean, mid, slope = [], [], []
-    for i in range(4):
-        p, q, r = (x[j] for j in range(4) if j != i)
-        scale = 1 / ((x[i] - p) * (x[i] - q) * (x[i] - r))
-        # basis (x-p)(x-q)(x-r) = x^3 - (p+q+r) x^2 + (pq+pr+qr) x - pqr
-        pq = p * q
-        mid.append(-scale * pq * r)
-        mean.append(mid[-1] - scale * (p + q + r) * h2)
-        slope.append(scale * (pq + (p + q) * r))
-    return mean, mid, slope
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        mean[i] += (mid[j] * rise[k] - mid[k] * rise[j]) * h2
+    return mean[:, first - low:first - low + last - first]
+
+
+def _bow(h, rise):
+    """
+    Return what a cubic has over its chord in each inner interval, zero where uneven: (3, m - 2).
+
+    bow : how far the middle lies under the middle of the chord.
+    twist : how much less the middle slope, times the interval, rises than the chord.
+    From divided differences of the rates over intervals h, (m,), with rises (3, m) over them.
+    """
+    safe = np.maximum(h, TINY)
+    curve = np.diff(rise / safe) / (safe[:-1] + safe[1:])       # half the second derivative
+    before, own, after = safe[:-2], safe[1:-1], safe[2:]
+    even = ((EVEN * before > own) & (before < EVEN * own)
+            & (EVEN * after > own) & (after < EVEN * own))
+    weight = np.where(even, own**2 / 4 / (before + own + after), 0.0)
+    left, right = curve[:, :-1], curve[:, 1:]
+    bow = left * (weight * (own / 2 + after)) + right * (weight * (own / 2 + before))
+    return bow, (right - left) * (weight * own)
 
 
 def _pairs_from_rotvec(phi):
@@ -68,20 +80,27 @@ def _pairs_from_rotvec(phi):
     return a, b
 
 
-def prefix_product(q):
-    """Return q_0, q_0 q_1, q_0 q_1 q_2 ...: (n, 4) to (n, 4), unit quaternions x y z w."""
+def _pairs(q):
+    """Return quaternions x y z w as two complex rows: w + x i and y + z i."""
     q = np.asarray(q, dtype=float)
-    return _quats(*_scan(q[:, 3] + 1j * q[:, 0], q[:, 1] + 1j * q[:, 2]))
+    return q[..., 3] + 1j * q[..., 0], q[..., 1] + 1j * q[..., 2]
 
 
 def _quats(a, b):
+    """Return the unit quaternions x y z w of two complex rows: (n, 4)."""
     out = np.stack([a.imag, b.real, b.imag, a.real], axis=-1)
-    return out / np.linalg.norm(out, axis=-1)[:, None]
+    out /= np.sqrt(np.einsum('ij,ij->i', out, out))[:, None]
+    return out
 
 
 def _times(a, b, c, d):
     """Multiply quaternions a + b j and c + d j: with z = w + x i, y + z i for (a, b)."""
     return a * c - b * np.conj(d), a * d + b * np.conj(c)
+
+
+def prefix_product(q):
+    """Return q_0, q_0 q_1, q_0 q_1 q_2 ...: (n, 4) to (n, 4), unit quaternions x y z w."""
+    return _quats(*_scan(*_pairs(q)))
 
 
 def _scan(a, b):
@@ -101,8 +120,29 @@ def _scan(a, b):
         A[k], B[k] = _times(A[k - 1], B[k - 1], A[k], B[k])
     if rows > 1:
         ends_a, ends_b = _scan(A[-1, :-1], B[-1, :-1])
-        A[:, 1:], B[:, 1:] = _times(ends_a, ends_b, A[:, 1:], B[:, 1:])
+        for k in range(width):
+            A[k, 1:], B[k, 1:] = _times(ends_a, ends_b, A[k, 1:], B[k, 1:])
     return A.T.reshape(-1)[:n], B.T.reshape(-1)[:n]
+
+
+def _products(t, w_b, every):
+    """Return the rotation over each ``every`` intervals, the last group may be short: pairs."""
+    n = len(t) - 1
+    groups = -(-n // every)
+    a, b = np.empty(groups, complex), np.empty(groups, complex)
+    step = max(1, CHUNK // every)
+    for g in range(0, groups, step):
+        first, last = g * every, min((g + step) * every, n)
+        c, d = _pairs_from_rotvec(_increments(t, w_b, first, last))
+        if missing := -(last - first) % every:
+            c = np.concatenate([c, np.ones(missing)])
+            d = np.concatenate([d, np.zeros(missing)])
+        C, D = c.reshape(-1, every), d.reshape(-1, every)
+        c, d = C[:, 0], D[:, 0]
+        for k in range(1, every):
+            c, d = _times(c, d, C[:, k], D[:, k])
+        a[g:g + step], b[g:g + step] = c, d
+    return a, b
 
 
 def attitude(t, w_b, q_nb0, earth_rate_n, every=1):
@@ -120,30 +160,23 @@ def attitude(t, w_b, q_nb0, earth_rate_n, every=1):
     earth_rate_n : (3,) array
         Earth rate in n, rad/s (n is fixed to the Earth).
     every : int
-        Keep each so-manieth epoch.
+        Keep one epoch in this many.
 
     Returns
     -------
     t_out : (m,) array
-        Times of t[0], t[every], ...; the last sample is always kept.
+        Times of t[0], t[every], ...; the last sample is always kept. Empty where t is.
     q_nb : (m, 4) array
         Attitude there, unit quaternions.
 
     """
-    t = np.asarray(t, dtype=float)
-    a, b = _pairs_from_rotvec(rotation_increments(t, w_b))
-    n = len(a)
-    groups = -(-n // every)
-    A, B = np.ones(groups * every, complex), np.zeros(groups * every, complex)
-    A[:n], B[:n] = a, b
-    A, B = A.reshape(groups, every), B.reshape(groups, every)
-    a, b = A[:, 0], B[:, 0]
-    for k in range(1, every):
-        a, b = _times(a, b, A[:, k], B[:, k])
-    turned = _quats(*_scan(a, b)) if groups else np.empty((0, 4))
-    q = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], turned])
-    keep = np.append(np.arange(0, n, every), n) if n else np.array([0])
-    t_out = t[keep]
-    inertial = quat_multiply(q_nb0, q)
-    earth = quat_from_rotvec(-(t_out - t[0])[:, None] * np.asarray(earth_rate_n))
-    return t_out, quat_multiply(earth, inertial)
+    t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
+    if not len(t):
+        return t, np.empty((0, 4))
+    t_out = np.append(t[:-1:every], t[-1])
+    a0, b0 = _pairs(q_nb0)
+    a, b = _products(t, w_b, every)
+    a, b = _scan(np.append(a0, a), np.append(b0, b))
+    # n turns with the Earth under the inertial frame it was at t[0]
+    earth = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
+    return t_out, _quats(*_times(*earth, a, b))

@@ -1,0 +1,216 @@
+"""Dead reckoning: closed forms, order, symmetries, the ellipsoid; mounting angles; rough scale."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.nav.dead_reckoning import (
+    dead_reckon,
+    forward_b,
+    mounting_from_forward,
+    Origin,
+    rough_scale,
+    Track,
+)
+from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import (
+    matrix_from_rpy,
+    quat_from_matrix,
+    quat_from_rotvec,
+    quat_multiply,
+)
+
+RADIUS = 20.0
+X = np.array([1.0, 0.0, 0.0])
+
+
+def quarter_turn(n):
+    """Return the track of a left turn on the level in n epochs; its true end is (R, R, 0)."""
+    t = np.linspace(0.0, 10.0, n + 1)
+    q_nb = quat_from_rotvec(np.outer(t / 10 * np.pi / 2, [0, 0, 1]))
+    return dead_reckon(t, q_nb, Travel(t, RADIUS * np.pi / 2 * t / 10, 0.0))
+
+
+def test_quarter_turn_ends_where_the_circle_does():
+    track = quarter_turn(1000)
+    # trapezoids cut the corners by dpsi^2 / 12 of the way: 28 m * (1.57e-3)^2 / 12 = 5.8e-6 m
+    assert_allclose(track.P[-1] @ X, [RADIUS, RADIUS, 0], atol=6e-6)
+    assert_allclose(track.P[-1] @ [0, 0, 1], [0, 0, RADIUS * np.pi / 2], atol=1e-12)
+
+
+@pytest.mark.parametrize('n', [50, 100, 200])
+def test_second_order(n):
+    def miss(n):
+        return np.linalg.norm(quarter_turn(n).P[-1] @ X - [RADIUS, RADIUS, 0])
+
+    assert miss(n) / miss(2 * n) == pytest.approx(4, rel=1e-3)
+    dpsi = np.pi / 2 / n       # closed form of the trapezoid: x cot x, x = dpsi / 2
+    assert miss(n) == pytest.approx(RADIUS * np.sqrt(2) * (1 - dpsi / 2 / np.tan(dpsi / 2)),
+                                    rel=1e-9)
+
+
+ANGLE = st.floats(-3.0, 3.0)
+
+
+@given(yaw=ANGLE, pitch=ANGLE, roll=ANGLE, scale=st.floats(-2, 2))
+def test_track_turns_and_stretches_with_its_inputs(yaw, pitch, roll, scale):
+    plain = quarter_turn(30)
+    C = matrix_from_rpy([roll, pitch, yaw])
+    turned = dead_reckon(plain.t, quat_multiply(quat_from_matrix(C), plain.q_nb),
+                         Travel(plain.t, scale * plain.s, 0.0))
+    # 31 m in 30 steps: a few ulp of 3.6e-15 each
+    assert_allclose(turned.P, scale * (C @ plain.P), atol=1e-12)
+
+
+@given(a=st.tuples(ANGLE, ANGLE, ANGLE), b=st.tuples(ANGLE, ANGLE, ANGLE))
+def test_track_is_linear_in_scale_and_forward_axis(a, b):
+    P = quarter_turn(30).P
+    a, b = np.array(a), np.array(b)
+    assert_allclose(P @ (a + b), P @ a + P @ b, atol=1e-11)
+
+
+def test_there_and_back_again():
+    """Reversing along the same path ends at the start, exactly."""
+    t = np.linspace(0, 20, 401)
+    out = np.minimum(t, 20 - t)
+    track = dead_reckon(t, quat_from_rotvec(np.outer(out / 7, [0, 0.1, 1])), Travel(t, out, 0.0))
+    assert_allclose(track.P[-1], 0, atol=1e-13)
+    assert np.linalg.norm(track.P[200] @ X) > 5
+
+
+def test_odometer_between_epochs_is_interpolated():
+    t = np.array([0.0, 1.0, 2.0])
+    track = dead_reckon(t, np.tile([0, 0, 0, 1.0], (3, 1)), Travel(
+        np.array([-1.0, 0.5, 4.0]), np.array([0.0, 3.0, 10.0]), 1.0))
+    assert_allclose(track.s, [2, 4, 6], atol=1e-14)
+    assert_allclose(track.P[-1], 4 * np.eye(3), atol=1e-14)
+
+
+def test_eleven_kilometres_on_the_ellipsoid():
+    """A geodesic, its points, azimuths and lengths by pyproj alone; the end must be pyproj's."""
+    geod = pytest.importorskip('pyproj').Geod(ellps='WGS84')
+    s = np.linspace(0, 11_200, 1121)
+    lon, lat, back = geod.fwd(np.full_like(s, 116.0), np.full_like(s, 40.0),
+                              np.full_like(s, 45.0), s)
+    yaw = np.pi / 2 - np.deg2rad(np.append(45.0, back[1:] + 180.0))
+    lat, lon = np.deg2rad(lat), np.deg2rad(lon)
+    origin = Origin(lat[0], lon[0], 0.0)
+    C_nb = (C_en(lat[0], lon[0]).T @ C_en(lat, lon)
+            @ matrix_from_rpy(np.stack([0 * yaw, 0 * yaw, yaw], -1)))
+    track = dead_reckon(s, quat_from_matrix(C_nb), Travel(s, s, 0.0))
+    end = origin.to_geodetic(track.P[-1] @ X)
+    # the road bends by 10 m / R an epoch: (1.6e-6)^2 / 12 of 11 km is 2e-9 m; 1121 roundings of
+    # 1e-12 m, and pyproj's own 1e-8 m (its degrees carry 1.4e-14)
+    assert_allclose(origin.to_n(end), origin.to_n(np.array([lat[-1], lon[-1], 0.0])), atol=2e-8)
+    # a plane through the start would be off by s^2 / 2 R: nearly 10 m of height
+    assert (track.P[-1] @ X)[2] == pytest.approx(-11_200**2 / 2 / 6.378e6, rel=0.01)
+
+
+@pytest.mark.parametrize('place', [(0.7, 2.0, 50.0), (-1.2, np.pi, 0.0), (np.pi / 2, 0.3, 10.0)])
+def test_origin_there_and_back(place):
+    origin = Origin(*place)
+    n = np.random.default_rng(5).normal(0, 5e3, (20, 3))
+    # ulp of 6.4e6 m, twice over
+    assert_allclose(origin.to_n(origin.to_geodetic(n)), n, rtol=0, atol=5e-9)
+    assert_allclose(origin.to_n(np.array(place)), 0, atol=1e-9)
+    assert_allclose(origin.to_geodetic(np.array([0.0, 0.0, 7.0]))[2], place[2] + 7, atol=5e-9)
+
+
+def test_track_at_times():
+    track = quarter_turn(4)
+    assert_allclose(track.at(track.t), track.P, atol=1e-15)
+    assert_allclose(track.at(3.75), (track.P[1] + track.P[2]) / 2, atol=1e-15)
+    assert_allclose(track.at(np.array([-5.0, 50.0])), track.P[[0, -1]], atol=1e-15)
+    assert track.at(np.zeros((2, 3))).shape == (2, 3, 3, 3)
+    assert_allclose(track.C_nb_at(np.array([-5.0, 2.4, 2.6, 99.0])), matrix_from_rpy(
+        np.outer(np.deg2rad([0, 22.5, 22.5, 90]), [0, 0, 1])), atol=1e-15)
+
+
+def test_track_of_one_epoch():
+    track = dead_reckon(np.array([3.0]), np.array([[0, 0, 0, 1.0]]),
+                        Travel(np.array([0.0, 9.0]), np.array([0.0, 1.0]), 0.0))
+    assert isinstance(track, Track)
+    for t in (np.array(0.0), np.array(3.0), np.array([1.0, 5.0])):
+        assert_allclose(track.at(t), 0, atol=0)
+        assert_allclose(track.C_nb_at(t), np.broadcast_to(np.eye(3), (*t.shape, 3, 3)), atol=0)
+
+
+@given(yaw=st.floats(-3.14, 3.14), pitch=st.floats(-1.5, 1.5), K=st.floats(0.01, 100))
+def test_mounting_angles_and_forward_axis_undo_each_other(yaw, pitch, K):
+    d = forward_b(yaw, pitch)
+    assert_allclose(d, matrix_from_rpy([0, pitch, yaw])[0], atol=1e-15)   # C_bv e_x
+    found = mounting_from_forward(K * d)
+    if abs(abs(yaw) - np.pi / 2) > 1e-6:      # there forward lies along y: no pitch to be seen
+        # 1e-16 over cos yaw > 1e-6 for the pitch
+        assert_allclose(found, [yaw, pitch], atol=1e-9)
+    assert_allclose(forward_b(*found), d, atol=2e-15)
+
+
+def test_signs_of_the_mounting_angles():
+    """Yaw > 0: the Imu's x axis lies left of forward; pitch > 0: below it."""
+    assert forward_b(0.1, 0.0)[1] < 0
+    assert forward_b(0.0, 0.1)[2] > 0
+    assert_allclose(mounting_from_forward(np.array([1.0, -0.1, 0.0])), [np.arctan(0.1), 0])
+
+
+@pytest.mark.parametrize('pitch', [0.0, 0.02, -0.02])
+def test_an_odometer_that_counts_backwards_is_a_yaw_of_half_a_turn(pitch):
+    yaw, found = mounting_from_forward(-np.array([np.cos(pitch), 1e-9, np.sin(pitch)]))
+    assert yaw == pytest.approx(np.pi, abs=2e-9)
+    assert found == pytest.approx(-pitch, abs=1e-12) or found == pytest.approx(pitch, abs=1e-12)
+    assert_allclose(forward_b(yaw, found), -np.array([np.cos(pitch), 1e-9, np.sin(pitch)]),
+                    atol=1e-15)
+
+
+def test_forward_axes_of_many():
+    yaw, pitch = np.array([0.1, -2.0, 3.0]), np.array([0.0, 0.3, -0.2])
+    assert_allclose(mounting_from_forward(forward_b(yaw, pitch)), [yaw, pitch], atol=1e-14)
+    assert forward_b(yaw, 0.0).shape == (3, 3)
+
+
+def fixes(metres, rng, sigma):
+    p = np.zeros((len(metres), 3))
+    p[:, 0] = metres
+    return p + rng.normal(0, sigma, p.shape) * [1, 1, 2]
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('metres_per_count', [0.0213, 0.3])
+def test_rough_scale_survives_noise_outliers_standing_and_flicker(seed, metres_per_count):
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, 300, 0.2)
+    metres = 12 * np.clip(t - 60, 0, 180)
+    p = fixes(metres, rng, 1.5)
+    p[rng.uniform(size=len(t)) < 0.05] += rng.normal(0, 40, 3)
+    flicker = rng.integers(0, 2, len(t)) * ((t < 60) | (t > 240))
+    odometer = Travel(t, np.floor(metres / metres_per_count) + flicker, 1.0)
+    # a piece of 20 m carries sqrt(2) * 1.5 m of noise: 10 %, the median of 100 pieces 1.3 %;
+    # noise across the way adds (2.1 / 20)^2 / 2 = 0.6 %, outliers in a tenth move the median by
+    # 0.1 of a sigma
+    assert rough_scale(odometer, t, p, 1.5) == pytest.approx(metres_per_count, rel=0.05)
+    backwards = Travel(t, -odometer.s, 1.0)
+    assert rough_scale(backwards, t, p, 1.5) == rough_scale(odometer, t, p, 1.5)
+
+
+def test_rough_scale_of_a_loop_and_of_a_single_stretch():
+    """Round a block of 100 m for ever the chord of the whole drive says nothing."""
+    t = np.arange(0, 400, 0.2)
+    turns = 10 * t / (100 / 2 / np.pi)
+    p = 100 / 2 / np.pi * np.stack([np.cos(turns), np.sin(turns), 0 * t], -1)
+    # 20 m of a circle of 100 m: the chord is 6.5 % short, up to the double piece 24 %
+    assert rough_scale(Travel(t, 500 * t, 1.0), t, p, 0.0) == pytest.approx(0.02, rel=0.25)
+    few = np.array([0.0, 25.0])
+    assert rough_scale(Travel(few, 50 * few, 1.0), few, np.outer(few, [1, 0, 0]), 1.5) == 0.02
+
+
+def test_rough_scale_needs_motion_of_both():
+    rng, t = np.random.default_rng(12), np.arange(0, 60, 0.2)
+    still, moving = Travel(t, 0 * t, 1.0), Travel(t, 100 * t, 1.0)
+    assert rough_scale(moving, t, fixes(0 * t, rng, 1.5), 1.5) is None
+    assert rough_scale(still, t, fixes(10 * t, rng, 1.5), 1.5) is None
+    none = Travel(np.empty(0), np.empty(0), 1.0)
+    assert rough_scale(none, t, fixes(10 * t, rng, 1.5), 1.5) is None
+    assert rough_scale(moving, np.empty(0), np.empty((0, 3)), 1.5) is None
+    assert rough_scale(moving, t + 1e3, fixes(10 * t, rng, 1.5), 1.5) is None

@@ -1,0 +1,135 @@
+"""Planes and geodesics; the printed series of source A, eq. (1)-(5), as reference."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.config import ProjectionConfig
+from odocal_ros.nav.earth import ecef_from_geodetic
+from odocal_ros.nav.projection import geodesic_chord, Plane, plane_chord, plane_for
+
+pytest.importorskip('pyproj')
+MERIDIAN = 117.0
+
+
+def series(latitude, longitude, as_printed=False):
+    """Return x north, y east, m, by eq. (1)-(5) on Krassovsky's ellipsoid."""
+    C, C0, C1, C2 = 6399698.9018, 6367558.49686, 32005.79642, 133.86115
+    E2, Y0 = 0.006738525, 500000.0
+    s, c = np.sin(latitude), np.cos(latitude)
+    X = C0 * latitude - (C1 * s + C2 * s**3) * c
+    N = C / np.sqrt(1 + E2 * c**2)
+    m = (longitude - np.deg2rad(MERIDIAN)) * c
+    c_in_bracket = c if as_printed else c**2
+    t2 = np.tan(latitude)**2
+    x = X + N * np.tan(latitude) * (m**2 / 2 + m**4 / 24 * (5 - t2 + 9 * E2 * c_in_bracket))
+    return x, N * (m + m**3 / 6 * (1 - t2 + E2 * c_in_bracket)) + Y0
+
+
+def disagreement(latitudes_deg, within_deg, as_printed=False):
+    """Return the largest distances of the series from pyproj in x and y, m."""
+    lat, off = np.meshgrid(np.deg2rad(latitudes_deg), np.linspace(-within_deg, within_deg, 61))
+    lon = np.deg2rad(MERIDIAN + off)
+    x, y = series(lat, lon, as_printed)
+    north, east = Plane(MERIDIAN, 1.0, 'Krassovsky').forward(lat, lon)
+    return np.abs(x - north).max(), np.abs(y - east).max()
+
+
+BELT = np.linspace(20, 60, 41)
+
+
+# the figures of method.md 1.1, stated to two digits: so half of the last one more
+@pytest.mark.parametrize(('latitudes', 'within', 'x', 'y'), [
+    (BELT, 1.5, None, 1.5e-3), ([0.0], 1.5, None, 3.3e-3), ([20.0], 1.5, 1e-4, None),
+    ([40.0], 1.5, 0.063, None), ([50.0], 1.5, 0.13, None), (BELT, 3.0, None, 0.045)])
+def test_series_agrees_as_closely_as_stated(latitudes, within, x, y):
+    dx, dy = disagreement(latitudes, within)
+    for seen, stated in ((dx, x), (dy, y)):
+        if stated:
+            assert stated / 2 < seen < 1.06 * stated
+
+
+def test_series_as_printed_is_worse():
+    assert disagreement(BELT, 1.5, as_printed=True)[1] == pytest.approx(0.012, rel=0.1)
+    assert disagreement(BELT, 3.0, as_printed=True)[1] == pytest.approx(0.12, rel=0.1)
+
+
+def test_on_the_central_meridian_northing_is_the_meridian_arc():
+    """A quarter of the meridian: 10 001 965.729 m (WGS 84), eq. (1) with m = 0."""
+    north, east = Plane(9.0).forward(np.pi / 2, np.deg2rad(9.0))
+    assert north == pytest.approx(10_001_965.729, abs=5e-4)
+    assert east == pytest.approx(500_000.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(('east_km', 'percent'), [(50, 0.003), (150, 0.028)])
+def test_plane_scale_beside_the_meridian(east_km, percent):
+    lat = np.deg2rad(40.0)
+    off = east_km * 1e3 / (6.388e6 * np.cos(lat))       # 6.388e6 m: normal radius at 40 deg
+    start, end = np.array([lat, off, 0.0]), np.array([lat + 1e-4, off, 0.0])
+    length = plane_chord(Plane(0.0), start, end)[0]
+    # the stated figures have two digits
+    assert 100 * (length / geodesic_chord(start, end)[0] - 1) == pytest.approx(percent, rel=0.04)
+
+
+def test_utm_is_four_in_ten_thousand_short_on_its_meridian():
+    start, end = np.array([0.7, np.deg2rad(9.0), 0.0]), np.array([0.7001, np.deg2rad(9.0), 0.0])
+    plane = plane_for(ProjectionConfig(kind='utm'), np.deg2rad(9.3))
+    assert plane_chord(plane, start, end)[0] / geodesic_chord(start, end)[0] == pytest.approx(
+        0.9996, abs=1e-8)       # 0.1 mm of 637 m: what PROJ's series is good for
+
+
+@pytest.mark.parametrize(('degrees', 'zone'), [
+    (116.0, 117.0), (-0.1, -3.0), (0.0, 3.0), (5.99, 3.0), (6.0, 9.0), (-180.0, -177.0)])
+def test_zone_of_a_longitude(degrees, zone):
+    plane = plane_for(ProjectionConfig(kind='gauss_krueger'), np.deg2rad(degrees))
+    assert plane.central_meridian == pytest.approx(zone)
+    assert plane.scale == 1.0
+
+
+def test_plane_about_the_leg_and_about_a_given_meridian():
+    assert plane_for(ProjectionConfig(), np.deg2rad(116.3)).central_meridian == pytest.approx(
+        116.3)
+    asked = ProjectionConfig(kind='gauss_krueger', central_meridian=114.0, ellipsoid='Krassovsky')
+    assert plane_for(asked, np.deg2rad(116.3)) == Plane(114.0, 1.0, 'Krassovsky')
+
+
+@pytest.mark.parametrize('middle_deg', [0.0, 116.0, 179.999, 180.0, -180.0, -179.999])
+@pytest.mark.parametrize('latitude_deg', [-70.0, 0.0, 40.0, 84.0])
+def test_plane_about_a_leg_keeps_lengths_and_bearings_anywhere(middle_deg, latitude_deg):
+    """11 km, half each side of the meridian, the date line too: as the geodesic."""
+    lat, lon = np.deg2rad(latitude_deg), np.deg2rad(middle_deg)
+    dlat, dlon = 4e3 / 6.37e6, 4e3 / 6.37e6 / np.cos(lat)
+    start, end = np.array([lat - dlat, lon - dlon, 0.0]), np.array([lat + dlat, lon + dlon, 0.0])
+    start[1], end[1] = ((x + np.pi) % (2 * np.pi) - np.pi for x in (start[1], end[1]))
+    length, bearing = plane_chord(plane_for(ProjectionConfig(), lon), start, end)
+    geodesic, azimuth = geodesic_chord(start, end)
+    # scale: mean of (x / R)^2 / 2 over +-4 km: 6.6e-8
+    assert length / geodesic == pytest.approx(1 + (4e3 / 6.37e6)**2 / 6, abs=2e-8)
+    # the azimuth is against true north at the start, 4 km off the meridian:
+    convergence = -dlon * np.sin(lat - dlat)
+    assert bearing == pytest.approx(azimuth - convergence, abs=3e-6)
+
+
+def test_height_stretches_a_geodesic():
+    """1000 m of height left out is 0.016 % (method.md 1.1)."""
+    start, end = np.array([0.7, 2.0, 1000.0]), np.array([0.7003, 2.0002, 1000.0])
+    length, azimuth = geodesic_chord(start, end)
+    on_ground, same = geodesic_chord(start * [1, 1, 0], end * [1, 1, 0])
+    assert 100 * (length / on_ground - 1) == pytest.approx(0.016, rel=0.02)
+    assert azimuth == same
+    # a straight line in space is shorter than the arc by (L / R)^2 / 24 = 5e-9; the radius along
+    # the line is within 0.4 % of the mean one, and h / R 1.6e-4 of that: 6e-7
+    straight = np.linalg.norm(ecef_from_geodetic(*start) - ecef_from_geodetic(*end))
+    assert length == pytest.approx(straight, rel=7e-7)
+
+
+def test_no_distance():
+    here = np.array([0.7, 2.0, 30.0])
+    assert geodesic_chord(here, here)[0] == 0.0
+    assert plane_chord(Plane(115.0), here, here)[0] == 0.0
+
+
+def test_plane_of_arrays():
+    north, east = Plane(0.0).forward(np.array([0.1, 0.2]), np.array([0.0, 0.0]))
+    assert north.shape == east.shape == (2,)
+    assert_allclose(east, 500_000.0, atol=1e-6)

@@ -1,0 +1,141 @@
+"""Rotations against series, scipy, mpmath and each other, over all seams."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.nav.rotations import (
+    exp_so3,
+    matrix_from_quat,
+    matrix_from_rpy,
+    quat_conjugate,
+    quat_from_matrix,
+    quat_from_rotvec,
+    quat_multiply,
+    rpy_from_matrix,
+    skew,
+    transpose,
+)
+
+ROUND_OFF = 2e-15    # a dozen operations on numbers up to 2, an ulp of 2.2e-16 each
+AXIS = st.floats(-3.0, 3.0)
+VECTORS = st.tuples(AXIS, AXIS, AXIS).map(np.array)
+
+
+def same_rotation(p, q):
+    """Return the angle between two unit quaternions, rad, blind to their common sign."""
+    d = quat_multiply(quat_conjugate(p), q)
+    return 2 * np.arctan2(np.linalg.norm(d[..., :3], axis=-1), np.abs(d[..., 3]))
+
+
+@given(a=VECTORS, b=VECTORS)
+def test_skew_is_the_cross_product(a, b):
+    assert_allclose(skew(a) @ b, np.cross(a, b), atol=1e-14)
+
+
+@pytest.mark.parametrize('x', np.logspace(-12, np.log10(3.1), 40))
+def test_exp_and_quaternion_keep_all_digits_from_tiny_to_large(x):
+    mp = pytest.importorskip('mpmath')
+    with mp.workdps(40):
+        sin, versin, half = float(mp.sin(x)), float(1 - mp.cos(x)), float(mp.sin(mp.mpf(x) / 2))
+    C = exp_so3([x, 0.0, 0.0])
+    assert C[2, 1] == pytest.approx(sin, rel=1e-15)
+    # sinc squared: a few roundings, and one of the 1 it is taken from
+    assert 1 - C[1, 1] == pytest.approx(versin, rel=2e-15, abs=3e-16)
+    assert quat_from_rotvec([x, 0.0, 0.0])[0] == pytest.approx(half, rel=1e-15)
+
+
+def test_no_rotation():
+    assert_allclose(exp_so3(np.zeros(3)), np.eye(3), atol=0)
+    assert_allclose(quat_from_rotvec(np.zeros(3)), [0, 0, 0, 1], atol=0)
+    assert_allclose(matrix_from_rpy(np.zeros(3)), np.eye(3), atol=0)
+
+
+def test_yaw_turns_x_to_y_pitch_x_below_roll_y_to_z():
+    x, y, z = np.eye(3)
+    quarter = np.pi / 2
+    assert_allclose(matrix_from_rpy([0, 0, quarter]) @ x, y, atol=ROUND_OFF)
+    assert_allclose(matrix_from_rpy([0, quarter, 0]) @ x, -z, atol=ROUND_OFF)
+    assert_allclose(matrix_from_rpy([quarter, 0, 0]) @ y, z, atol=ROUND_OFF)
+    assert_allclose(exp_so3([0, 0, quarter]) @ x, y, atol=ROUND_OFF)
+    assert_allclose(matrix_from_quat(quat_from_rotvec([0, 0, quarter])) @ x, y, atol=ROUND_OFF)
+
+
+@given(phi=VECTORS)
+def test_matrix_and_quaternion_of_a_rotation_vector_agree(phi):
+    assert_allclose(matrix_from_quat(quat_from_rotvec(phi)), exp_so3(phi), atol=ROUND_OFF)
+
+
+@given(p=VECTORS, q=VECTORS)
+def test_products_of_quaternions_are_products_of_matrices(p, q):
+    p, q = quat_from_rotvec(p), quat_from_rotvec(q)
+    assert_allclose(matrix_from_quat(quat_multiply(p, q)),
+                    matrix_from_quat(p) @ matrix_from_quat(q), atol=ROUND_OFF)
+    assert_allclose(matrix_from_quat(quat_conjugate(p)), transpose(matrix_from_quat(p)),
+                    atol=ROUND_OFF)
+
+
+@given(phi=VECTORS, length=st.floats(0.01, 100.0))
+def test_matrix_of_a_quaternion_does_not_ask_for_unit_length(phi, length):
+    q = quat_from_rotvec(phi)
+    assert_allclose(matrix_from_quat(length * q), matrix_from_quat(q), atol=ROUND_OFF)
+
+
+# half-turns about the three axes (w = 0) and none: one for each row quat_from_matrix may take
+@pytest.mark.parametrize('turn', [*(np.eye(3) * np.pi), np.zeros(3)])
+@given(off=VECTORS)
+def test_quaternion_of_a_matrix_on_each_of_its_four_branches(turn, off):
+    q = quat_multiply(quat_from_rotvec(turn), quat_from_rotvec(0.2 * off))
+    found = quat_from_matrix(matrix_from_quat(q))
+    assert found[3] >= 0
+    assert np.linalg.norm(found) == pytest.approx(1, abs=ROUND_OFF)
+    assert same_rotation(found, q) < 2 * ROUND_OFF
+
+
+def test_quaternions_of_many_matrices_at_once():
+    phi = np.random.default_rng(2).normal(0, 2, (4, 5, 3))
+    one_by_one = [[quat_from_matrix(exp_so3(p)) for p in row] for row in phi]
+    assert_allclose(quat_from_matrix(exp_so3(phi)), one_by_one, atol=ROUND_OFF)
+
+
+ANGLE = st.floats(-3.1, 3.1)
+
+
+@given(roll=ANGLE, pitch=st.floats(-1.5, 1.5), yaw=ANGLE)
+def test_rpy_round_trip(roll, pitch, yaw):
+    # pitch 1.5 leaves cos = 0.07: round-off grows by its inverse
+    assert_allclose(rpy_from_matrix(matrix_from_rpy([roll, pitch, yaw])), [roll, pitch, yaw],
+                    atol=1e-13)
+
+
+@pytest.mark.parametrize('up', [1, -1])
+@pytest.mark.parametrize('off', [0.0, *np.logspace(-16, -1, 31)])
+def test_matrix_survives_rpy_at_and_beside_gimbal_lock(up, off):
+    """Roll and yaw are lost there, but together they must still give the same matrix."""
+    C = matrix_from_rpy([0.3, up * (np.pi / 2 - off), -1.1])
+    # within 1e-12 of the lock roll is taken as 0
+    assert_allclose(matrix_from_rpy(rpy_from_matrix(C)), C, atol=2e-12)
+    if not 1e-15 < off < 1e-11:
+        assert_allclose(matrix_from_rpy(rpy_from_matrix(C)), C, atol=ROUND_OFF)
+
+
+def test_roll_is_zero_in_gimbal_lock():
+    assert rpy_from_matrix(matrix_from_rpy([0.3, np.pi / 2, -1.1]))[0] == 0.0
+
+
+def test_against_scipy():
+    Rotation = pytest.importorskip('scipy.spatial.transform').Rotation
+    rng = np.random.default_rng(3)
+    theirs = Rotation.from_rotvec(rng.normal(0, 1.5, (200, 3)))
+    q = theirs.as_quat()
+    assert_allclose(matrix_from_quat(q), theirs.as_matrix(), atol=ROUND_OFF)
+    assert same_rotation(quat_from_matrix(theirs.as_matrix()), q).max() < 2 * ROUND_OFF
+    assert_allclose(quat_multiply(q[:100], q[100:]), (theirs[:100] * theirs[100:]).as_quat()
+                    * np.sign(np.einsum('ij,ij->i', quat_multiply(q[:100], q[100:]),
+                                        (theirs[:100] * theirs[100:]).as_quat()))[:, None],
+                    atol=ROUND_OFF)
+    # their lower-case xyz are fixed axes too; pitch near 90 deg loses digits on both sides
+    rpy = rpy_from_matrix(theirs.as_matrix())
+    assert_allclose(matrix_from_rpy(theirs.as_euler('xyz')), theirs.as_matrix(), atol=1e-14)
+    assert_allclose(rpy[:, 1], theirs.as_euler('xyz')[:, 1], atol=1e-7)

@@ -1,0 +1,157 @@
+"""Standstill: found where it is, not where a vehicle creeps, rocks or turns on the spot."""
+
+import numpy as np
+import pytest
+
+from odocal_ros.grades import GRADES
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.standstill import MOVE, standstills
+
+RATE = 100.0       # Hz
+K = 0.02           # m per count
+
+
+def gyro(t, noise=0.0, bias=(0.0, 0.0, 0.0), turn=None, seed=1):
+    """Return turn rates of a flat vehicle, rad/s: (n, 3)."""
+    w = np.array(bias) + noise * np.sqrt(RATE) * np.random.default_rng(seed).normal(
+        size=(len(t), 3))
+    w[:, 2] += 0.0 if turn is None else np.interp(t, *turn)
+    return w
+
+
+def counts(t, way, phase=0.3):
+    """Return travel as whole counts of K metres at the odometer's own 50 Hz."""
+    own = t[::2]
+    s = np.floor(np.interp(own, *way) / K + phase)
+    return Travel(own, s - s[0], 1.0)
+
+
+def ramp(begin, end, top=10.0, slope=1.0):
+    """Return (times, metres) of a drive from rest to rest, accelerations of slope, m/s^2."""
+    t = np.arange(0, 100, 0.01)
+    speed = np.clip(np.minimum((t - begin) * slope, (end - t) * slope), 0, top)
+    return t, np.concatenate([[0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.01)])
+
+
+T = np.arange(0, 100, 1 / RATE)
+DRIVE = ramp(20.0, 70.0)
+
+
+@pytest.mark.parametrize('grade', ['perfect', *GRADES])
+@pytest.mark.parametrize('bias', [0.0, 0.1, -0.1])
+def test_both_ends_of_a_drive_are_found_inside_the_truth(grade, bias):
+    noise = 0.0 if grade == 'perfect' else GRADES[grade].gyro_noise
+    found = standstills(T, gyro(T, noise, (bias, -bias, bias)), counts(T, DRIVE), K, 2.0)
+    assert len(found) == 2
+    (a, b), (c, d) = found
+    assert a == 0.0
+    assert 20.0 - 0.7 < b <= 20.0          # half a window, a cell, a count
+    assert 70.0 <= c < 70.0 + 0.7
+    assert d == pytest.approx(T[-2], abs=0.02)
+
+
+@pytest.mark.parametrize('slope', [0.02, 0.1, 0.5, 3.0])
+def test_a_slow_start_is_cut_off_before_it_has_moved_far(slope):
+    way = ramp(20.0, 90.0, slope=slope)
+    b = standstills(T, gyro(T), counts(T, way), K, 2.0)[0, 1]
+    assert np.interp(b, *way) <= MOVE
+    if slope >= 0.5:                        # 0.5 m/s^2 makes 3 cm within 0.35 s < the window
+        assert b <= 20.0
+
+
+@pytest.mark.parametrize('amplitude', [0.05, 0.2])
+@pytest.mark.parametrize('period', [0.5, 1.0, 3.0])
+def test_rocking_to_and_fro_is_no_standstill(amplitude, period):
+    way = T, amplitude * np.sin(2 * np.pi * T / period)
+    smooth = Travel(*way, 0.0)
+    assert len(standstills(T, gyro(T), smooth, 1.0, 2.0)) == 0
+
+
+@pytest.mark.parametrize('speed', [0.025, 0.05, 0.1])
+def test_creeping_is_no_standstill(speed):
+    assert len(standstills(T, gyro(T), Travel(T, speed * T, 0.0), 1.0, 2.0)) == 0
+
+
+@pytest.mark.parametrize('metres', [0.001, 0.02, 0.3])
+def test_a_count_that_flickers_at_rest_is_a_standstill(metres):
+    """A wheel that stands on the edge of a tooth, fine and coarse ones."""
+    flicker = Travel(T, np.random.default_rng(2).integers(0, 2, len(T)).astype(float), 1.0)
+    found = standstills(T, gyro(T), flicker, metres, 2.0)
+    assert found.tolist() == [[0.0, T[-1]]]
+
+
+def test_backwards_counts_of_a_reversed_odometer():
+    way = DRIVE[0], -DRIVE[1]
+    assert len(standstills(T, gyro(T), counts(T, way), K, 2.0)) == 2
+
+
+@pytest.mark.parametrize('bias', [0.0, 0.1, -0.1])
+@pytest.mark.parametrize('spin', [0.3, -0.5, 1.0])
+def test_turning_on_the_spot_is_no_standstill(bias, spin):
+    """Skid steer: the mean of the wheels stands, the gyro is steady, and yet it turns."""
+    turn = [0, 10, 10.3, 40, 40.3, 100], [0, 0, spin, spin, 0, 0]
+    found = standstills(T, gyro(T, 1e-4, (0.02, 0.0, bias), turn), Travel(T, 0 * T, 0.5), K, 2.0)
+    assert len(found) == 2
+    # the ramp of the turn begins at 10 and ends at 40.3: the window's deviation shows it
+    assert found[0, 0] == 0.0
+    assert 10 - 0.7 < found[0, 1] <= 10.2
+    assert 40.1 <= found[1, 0] < 40.3 + 0.7
+    assert found[1, 1] == T[-1]
+
+
+def test_turning_on_the_spot_all_the_time_is_no_standstill():
+    w = gyro(T, bias=(0.0, 0.0, 0.3))
+    assert len(standstills(T, w, Travel(T, 0 * T, 0.5), K, 2.0)) == 0
+
+
+def test_the_engine_shakes():
+    w = gyro(T, GRADES['consumer'].gyro_noise)
+    w += 0.05 * np.sin(2 * np.pi * np.outer(T, [27.0, 31.0, 23.0]))
+    assert len(standstills(T, w, counts(T, DRIVE), K, 2.0)) == 2
+
+
+def test_someone_walks_about_in_the_bus():
+    """Standing on its wheels, the body swings: that is no time to take a gyro bias from."""
+    w = gyro(T)
+    w[:, 0] += 0.06 * np.sin(2 * np.pi * 0.5 * T)
+    assert len(standstills(T, w, Travel(T, 0 * T, 1.0), K, 2.0)) == 0
+
+
+def test_a_gap_of_the_imu_is_no_standstill():
+    """Nothing is known of the turn in it; a shorter one is bridged."""
+    for gap, count in ((5.0, 2), (0.3, 1)):
+        keep = (T < 50) | (50 + gap < T)
+        found = standstills(T[keep], gyro(T)[keep], Travel(T, 0 * T, 1.0), K, 2.0)
+        assert len(found) == count
+        assert found[0, 0] == 0.0
+        assert found[-1, 1] == T[-1]
+        if count == 2:
+            assert found[0, 1] <= 50.0
+            assert found[1, 0] >= 55.0
+
+
+def test_an_odometer_silent_at_rest_still_stands():
+    """Some send only while they count."""
+    rows = counts(T, DRIVE)
+    own = (rows.t == 0) | ((rows.t > 20) & (rows.t < 70)) | (rows.t == rows.t[-1])
+    found = standstills(T, gyro(T), Travel(rows.t[own], rows.s[own], 1.0), K, 2.0)
+    assert len(found) == 2
+    assert found[0, 1] <= 20.0
+    assert found[1, 0] >= 70.0
+
+
+@pytest.mark.parametrize(('shortest', 'count'), [(1.0, 3), (4.0, 2), (25.0, 1), (40.0, 0)])
+def test_only_as_short_as_asked(shortest, count):
+    way = ramp(20.0, 40.0)
+    again = ramp(43.0, 70.0)
+    both = way[0], way[1] + again[1]
+    assert len(standstills(T, gyro(T), counts(T, both), K, shortest)) == count
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 3])
+def test_too_little_data(n):
+    few = np.arange(n) * 0.01
+    many = Travel(T, 0 * T, 1.0)
+    assert standstills(few, np.zeros((n, 3)), many, K, 2.0).shape == (0, 2)
+    assert standstills(T, gyro(T), Travel(few, few, 1.0), K, 2.0).shape == (0, 2)
+    assert standstills(T + 1e3, gyro(T), many, K, 2.0).shape == (0, 2)
