@@ -7,6 +7,8 @@ moves f by M^-1 e, and so ln K, yaw and pitch; each source is written as the e t
 makes. An attitude error phi(t) (computed = (I - [phi x]) true) makes e = sum of phi x dD, and a
 gyro error at time tau turns all that is still to come: r(tau) = D(end) - D(tau). Epochs may begin
 before the start mark, where the attitude was aligned: D is zero there and the gyros already err.
+The Earth's own turn, which carries an error of one axis to the others by 4 mrad a minute, is left
+out.
 """
 
 import numpy as np

@@ -14,6 +14,7 @@ COMMANDS = {
     'inspect': ('odocal_ros.offline.inspect_bag', 'tell what a bag holds and what it lacks'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
+    'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 

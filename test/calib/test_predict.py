@@ -17,7 +17,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.sim.motion import attitude
-from odocal_ros.sim.scenarios import motion_of, resolved, simulate, SimOptions
+from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
 from odocal_ros.sim.truth import settings
 
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
@@ -34,7 +34,7 @@ def config(**changes):
 
 
 def paper_drive(rest=30.0):
-    """The paper's leg: 300 s still, 0.5 m/s2 for 40 s, 20 m/s for 520 s, down in 40 s."""
+    """Return the paper leg: 300 s still, 0.5 m/s2 for 40 s, 20 m/s for 520 s, down in 40 s."""
     t = np.arange(0.0, 900.0 + rest + 0.05, 0.1)
     return from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]), np.zeros_like(t))
 
@@ -133,7 +133,7 @@ def row_names(predicted):
 
 
 def leg_from_motion(**changes):
-    """A drive without any noise, its start mark set while it moves, 100 s after it stood."""
+    """Return a drive without any noise and its leg, marked 100 s after it stood."""
     drive = simulate(resolved(SimOptions(scenario='town', imu_grade='perfect', fix_sigma=0.0,
                                          imu_rate=50.0, odometer='angle', seed=8, **changes)))
     leg = drive.leg()

@@ -1,0 +1,229 @@
+"""odocal plan: how good a calibration will be, before it is driven, and what would help."""
+
+import json
+import math
+from pathlib import Path
+import sys
+import textwrap
+
+from odocal_ros.errors import BadUsage
+
+HELP = 'predicted sigmas of a drive not yet driven'
+NOT_YET = ('wheels', 'smoother')
+NOISE = {'white': 0.0, 'correlated': 60.0}
+SHOWN = 1e-3       # share of a variance below which a source is not worth a line
+
+
+def add_arguments(parser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add('--scenario', metavar='NAME', help='drive of a scenario: paper, straight, out_and_back or '
+        'town')
+    add('--duration', type=float, metavar='S', help='seconds of the scenario')
+    add('--gpx', metavar='FILE', help='drive of a GPX track (one without times at --speed)')
+    add('--bag', metavar='BAG', help='drive of a recorded bag, with its own fix figures')
+    add('--distance', type=float, metavar='M', help='drive of so many metres, with --speed')
+    add('--speed', type=float, metavar='M/S', help='speed of the drive')
+    add('--standstill', type=float, metavar='S', help='rest before the start and at the end '
+        '(default 30)')
+    add('--turns', type=int, metavar='N', help='turns of 90 deg on the way, left and right by '
+        'turns (default 0)')
+    add('--acceleration', type=float, default=1.0, metavar='M/S2', help='default 1')
+    add('--imu-grade', metavar='GRADE', help='consumer, industrial, tactical or navigation')
+    add('--heading-source', metavar='SOURCE', help='auto, gyrocompass, imu_orientation, '
+        'heading_topic, course or fixed (default: fixed with --heading-sigma-deg, else auto)')
+    add('--heading-sigma-deg', type=float, metavar='DEG', help='how well the heading is known')
+    add('--fix-sigma', type=float, metavar='M', help='horizontal error of a fix, each axis '
+        '(default 1.5)')
+    add('--fix-noise', choices=tuple(NOISE), help='do fix errors stay alike for a minute or '
+        'change from fix to fix (default correlated: what receivers do)')
+    add('--fix-rate', type=float, metavar='HZ', help='fixes a second (default 5)')
+    add('--rtk', action='store_true', help='fixes of 0.02 m')
+    add('--pulse', type=float, default=0.0, metavar='M', help='metres a pulse, for the '
+        'quantisation (default 0)')
+    add('--config', metavar='FILE', help='ROS parameter file, as replay takes it')
+    add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
+        help='any setting by its parameter name; repeatable')
+    for slot in ('imu', 'odometer', 'fix', 'heading'):
+        add(f'--{slot}-topic', metavar='TOPIC', help=f'of --bag, topic of the {slot}')
+    add('--json', action='store_true', help='print JSON, nothing else')
+
+
+def run(args) -> int:
+    """Predict and print; return 0."""
+    from odocal_ros.calib.predict import predict
+    from odocal_ros.offline.what_helps import changes
+    config = _config(args)
+    drive, figures = _drive(args, config)
+    sigmas = _sigmas(args, config, figures)
+    before = predict(drive, sigmas)
+    found = changes(drive, sigmas, before)
+    if args.json:
+        json.dump(as_json(before, sigmas, found), sys.stdout, indent=2, allow_nan=False)
+        print()
+    else:
+        print(screen(before, sigmas, found))
+    return 0
+
+
+def _config(args):
+    """Return defaults < --config < --set < the options named for a plan."""
+    from odocal_ros.config import Config, with_settings
+    from odocal_ros.config_file import parse_set, read_config_file
+    config = Config()
+    if args.config:
+        config = with_settings(config, read_config_file(Path(args.config)))
+    asked = dict(parse_set(text) for text in args.settings)
+    if args.imu_grade:
+        asked['imu.grade'] = args.imu_grade
+    if args.heading_sigma_deg is not None:
+        if not (math.isfinite(args.heading_sigma_deg) and 0 < args.heading_sigma_deg <= 180):
+            raise BadUsage(f'--heading-sigma-deg {args.heading_sigma_deg:g}: want more than 0, '
+                           'up to 180')
+        asked['alignment.heading_sigma'] = math.radians(args.heading_sigma_deg)
+        asked.setdefault('alignment.heading_source', 'fixed')
+    if args.heading_source:
+        asked['alignment.heading_source'] = args.heading_source
+    if args.fix_noise:
+        asked['gnss.correlation_time'] = NOISE[args.fix_noise]
+    return with_settings(config, asked)
+
+
+def _drive(args, config):
+    """Return the planned drive and the figures of its fixes where a bag gives them."""
+    from odocal_ros.offline import profile
+    kinds = [k for k in ('scenario', 'gpx', 'bag', 'distance') if getattr(args, k) is not None]
+    if len(kinds) != 1:
+        raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
+                       f'--distance with --speed{"; not " if kinds else ""}'
+                       f'{" and ".join("--" + k for k in kinds)}')
+    if args.duration is not None and not args.scenario:
+        raise BadUsage('--duration goes with --scenario; elsewhere distance and speed give it')
+    if kinds[0] != 'distance' and (args.standstill is not None or args.turns is not None):
+        raise BadUsage(f'--standstill and --turns go with --distance, not with --{kinds[0]}')
+    if args.speed is not None and not (math.isfinite(args.speed) and args.speed > 0):
+        raise BadUsage(f'--speed {args.speed:g}: want a number above 0; a drive must move')
+    if args.scenario:
+        return profile.from_scenario(args.scenario, args.duration), {}
+    if args.gpx:
+        return profile.from_gpx(Path(args.gpx), args.speed), {}
+    if args.bag:
+        topics = {s: getattr(args, f'{s}_topic') for s in ('imu', 'odometer', 'fix', 'heading')}
+        return profile.from_bag(Path(args.bag), config, {s: t for s, t in topics.items() if t})
+    if args.speed is None:
+        raise BadUsage('--distance needs --speed, m/s')
+    standstill = 30.0 if args.standstill is None else args.standstill
+    return profile.from_figures(args.speed, args.distance, standstill, args.turns or 0,
+                                args.acceleration), {}
+
+
+def _sigmas(args, config, figures):
+    """Return the error figures: those of the bag, replaced by what is asked."""
+    from odocal_ros.calib.predict import Sigmas
+    from odocal_ros.offline.what_helps import RTK
+    if args.rtk and args.fix_sigma is not None:
+        raise BadUsage('--rtk and --fix-sigma both give the error of a fix; give one')
+    fix = RTK if args.rtk else args.fix_sigma
+    if fix is not None:
+        figures = figures | {'fix': fix, 'fix_up': None}
+    if args.fix_rate is not None:
+        figures = figures | {'fix_rate': args.fix_rate}
+    return Sigmas(config=config, quantum=args.pulse, **figures)
+
+
+def as_json(before, sigmas, found) -> dict:
+    """Return the content of ``odocal plan --json``; sigmas of the scale are relative."""
+    method = before.method
+    return {
+        'drive': {'distance': before.distance, 'chord': before.chord,
+                  'duration': before.duration, 'standing': list(before.standing)},
+        'sigmas': {'imu_grade': sigmas.config.imu.grade,
+                   'heading_source': before.alignment.heading_source,
+                   'heading_sigma': before.alignment.heading_sigma, 'fix_sigma': sigmas.fix,
+                   'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time},
+        'verdict': before.verdict.value, 'reasons': [r.as_dict() for r in before.reasons],
+        'methods': {'two_point': {
+            'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
+                          for name, e in method.estimates.items() if name != 'scale_ratio'},
+            'budget': method.details.get('budget', {})}},
+        'methods_not_in_this_version': list(NOT_YET),
+        'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
+                    for c in found]}
+
+
+def screen(before, sigmas, found) -> str:
+    """Return the prediction as one screen of plain text."""
+    return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budget(before),
+                      *_helps(before, found), *_reasons(before)])
+
+
+def _head(before, sigmas):
+    from odocal_ros.output.figures import length, time_span
+    stands = [f'standing {time_span(s)}' if s else 'in motion' for s in before.standing]
+    tau, a = sigmas.correlation_time, before.alignment
+    noise = f'alike for {tau:g} s' if tau else 'white'
+    return [f'{length(before.distance)} in {time_span(before.duration)}, {stands[0]} at the start '
+            f'mark, {stands[1]} at the end mark, {length(before.chord)} apart',
+            f'Imu {sigmas.config.imu.grade}, heading by {a.heading_source} '
+            f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
+            f'{sigmas.fix_rate:.3g} Hz, {noise}']
+
+
+def _methods(before):
+    from odocal_ros.calib.budget import PARAMETERS
+    shown = [_shown(p, before.sigma(p)) for p in PARAMETERS]
+    return [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}',
+            f'  {"two_point":<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}',
+            f'  ({" and ".join(NOT_YET)}: not in this version)']
+
+
+def _shown(parameter, sigma):
+    if sigma is None:
+        return 'unknown'
+    if parameter == 'scale_factor':
+        return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
+    return f'{math.degrees(sigma):.3g} deg'
+
+
+def _budget(before):
+    """Return the sources that matter, with their shares of the variance."""
+    from odocal_ros.calib.budget import PARAMETERS
+    table = before.method.details.get('budget')
+    if not table:
+        return []
+    total = [sum(row[p]**2 for row in table.values()) for p in PARAMETERS]
+    lines = [f'  {"error budget":<20}{"scale, ppm":>14}{"yaw, deg":>16}{"pitch, deg":>16}']
+    small = []
+    for name, row in table.items():
+        shares = [row[p]**2 / whole if whole else 0.0
+                  for p, whole in zip(PARAMETERS, total, strict=True)]
+        if max(shares) < SHOWN:
+            small.append(name)
+            continue
+        cells = ['-' if share < SHOWN else
+                 f'{row[p] * (1e6 if p == PARAMETERS[0] else math.degrees(1.0)):.2g} {share:>4.0%}'
+                 for p, share in zip(PARAMETERS, shares, strict=True)]
+        lines.append(f'  {name.replace("_", " "):<20}{cells[0]:>14}{cells[1]:>16}{cells[2]:>16}'
+                     f'{"   shared by all legs" if row["shared"] else ""}')
+    return [*lines, *textwrap.wrap(f'under 0.1 %: {", ".join(small).replace("_", " ")}', 96,
+                                   initial_indent='  ', subsequent_indent='    '), '']
+
+
+def _helps(before, found):
+    from odocal_ros.offline.what_helps import ranked, SCALE, YAW
+    lines = []
+    for word, parameter in (('scale', SCALE), ('yaw', YAW)):
+        best = ranked(found, before, parameter)
+        lines.append(f'  what would help the {word} most' if best else
+                     f'  nothing tried would help the {word}')
+        lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
+                  f'{_shown(parameter, c.sigma(parameter))}' for c in best[:4]]
+    return lines
+
+
+def _reasons(before):
+    lines = []
+    for reason in before.reasons:
+        lines += textwrap.wrap(f'{reason.code.name}: {reason.text}. {reason.remedy}', 96,
+                               initial_indent='  ', subsequent_indent='     ')
+    return ['', *lines] if lines else []

@@ -1,0 +1,225 @@
+"""odocal plan: its answers against the prediction, its drives against their source, bad input."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.predict import predict, Sigmas
+from odocal_ros.config import Config, with_settings
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.offline import profile
+from odocal_ros.offline.cli import main
+from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
+
+PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']
+
+
+def asked(capsys, *argv):
+    """Return the JSON of a plan."""
+    assert main(['plan', *argv, '--json']) == 0
+    out, err = capsys.readouterr()
+    assert err == ''
+    return json.loads(out)
+
+
+def refused(capsys, *argv):
+    """Return the one line that refuses a plan."""
+    assert main(['plan', *argv]) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.count('\n') == 1
+    return err
+
+
+def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
+    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white')
+    assert answer['drive']['distance'] == pytest.approx(11_200, rel=1e-9)
+    assert answer['drive']['standing'] == pytest.approx([300.0, 30.0])
+    estimates = answer['methods']['two_point']['estimates']
+    # white fixes at 5 Hz over 300 s and 30 s
+    expected = 1.5 * math.sqrt(1 / 1500 + 1 / 150) / 11_200
+    assert estimates['scale_factor']['sigma'] == pytest.approx(expected, rel=2e-3)
+    budget = answer['methods']['two_point']['budget']
+    assert math.degrees(budget['initial_heading']['yaw_mounting_angle']) == pytest.approx(0.06)
+    assert math.degrees(budget['gyro_noise']['yaw_mounting_angle']) == pytest.approx(
+        2.4e-4, abs=0.05e-4)
+    for parameter in ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'):
+        whole = math.sqrt(sum(row[parameter]**2 for row in budget.values()))
+        assert estimates[parameter]['sigma'] == pytest.approx(whole, rel=1e-9)
+    assert answer['methods_not_in_this_version'] == ['wheels', 'smoother']
+
+
+def test_changes_are_computed_not_told(capsys):
+    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white')
+    before = answer['methods']['two_point']['estimates']
+    scale, yaw = (before[n]['sigma'] for n in ('scale_factor', 'yaw_mounting_angle'))
+    changes = {c['text']: c for c in answer['changes']}
+    longer = next(c for text, c in changes.items() if 'straight on' in text)
+    assert longer['scale_factor'] == pytest.approx(scale / 2, rel=0.01)    # twice the way
+    # white fixes alone make the scale: RTK is 75 times better, the rest is below 0.04 ppm
+    assert changes['RTK fixes (0.02 m)']['scale_factor'] == pytest.approx(scale / 75, rel=0.05)
+    other = changes['a second leg in the other direction']
+    # height is shared and small; the heading is shared and all
+    assert other['scale_factor'] == pytest.approx(scale / math.sqrt(2), rel=1e-3)
+    assert other['yaw_mounting_angle'] == pytest.approx(yaw, rel=1e-3)
+    better = next(c for text, c in changes.items() if text.startswith('a heading known'))
+    assert better['yaw_mounting_angle'] == pytest.approx(yaw / 2, rel=0.01)
+
+
+def test_a_gyrocompass_heading_averages_down_over_legs(capsys):
+    answer = asked(capsys, *PAPER[1:])
+    assert answer['sigmas']['heading_source'] == 'gyrocompass'
+    yaw = answer['methods']['two_point']['estimates']['yaw_mounting_angle']['sigma']
+    other = next(c for c in answer['changes'] if 'second leg' in c['text'])
+    assert other['yaw_mounting_angle'] == pytest.approx(yaw / math.sqrt(2), rel=1e-3)
+
+
+def test_the_screen_ranks_by_gain_and_fits(capsys):
+    assert main([*PAPER]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 40
+    assert max(map(len, lines)) < 120
+    begin = lines.index('  what would help the scale most')
+    end = lines.index('  what would help the yaw most')
+    after = [float(line.split('->')[1].split()[0]) for line in lines[begin + 1:end]]
+    assert len(after) > 2
+    assert after == sorted(after)
+    assert 'RTK' in lines[begin + 1]
+    assert 'heading' in lines[end + 1]
+
+
+def test_an_out_and_back_is_refused_with_what_would_help(capsys):
+    assert main(['plan', '--scenario', 'out_and_back', '--imu-grade', 'navigation']) == 0
+    out = capsys.readouterr().out
+    assert 'CHORD_TOO_SHORT' in out
+    answer = asked(capsys, '--scenario', 'out_and_back', '--imu-grade', 'navigation')
+    assert answer['methods']['two_point']['estimates']['scale_factor']['sigma'] is None
+    assert answer['verdict'] == 'rejected'
+    half = next(c for c in answer['changes'] if 'farthest off' in c['text'])
+    motion = motion_of(resolved(SimOptions(scenario='out_and_back')))
+    t = np.arange(0.0, motion.duration, 0.1)
+    moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
+    stop = t[moving[np.flatnonzero(np.diff(moving) > 100)[0]]]
+    there = profile.from_scenario('out_and_back', None).until(
+        stop - t[moving[0]] + 0.1, 30.0)
+    expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
+    # the stop is 30 s here and there, cut to a tenth of a second
+    assert half['scale_factor'] == pytest.approx(expected.sigma('scale_factor'), rel=0.01)
+
+
+def test_a_drive_of_figures_has_those_figures():
+    drive = profile.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
+    assert drive.distance == pytest.approx(3000.0, rel=1e-6)
+    assert drive.speed.max() == pytest.approx(15.0)
+    # 2 * 15 s of ramp, 225 m of way in them
+    assert drive.duration == pytest.approx(30 + (3000 - 225) / 15 + 20, abs=0.11)
+    assert drive.standstills(2.0)[0][1] == pytest.approx(0.0, abs=0.11)
+    assert np.ptp(drive.yaw) == pytest.approx(math.pi / 2, rel=0.02)
+    assert drive.yaw[-1] == pytest.approx(drive.yaw[0], abs=1e-6)     # left, then right
+    slow = profile.from_figures(15.0, 100.0, 20.0, 0, 1.0)
+    assert slow.speed.max() == pytest.approx(10.0)         # v^2 = a d: no more in 100 m
+    assert slow.distance == pytest.approx(100.0, rel=1e-6)
+
+
+def gpx(path, times=True, rest=30.0, count=200):
+    """Write a track: rest, east at 10 m/s with a point a second, north as far, rest."""
+    origin = Origin(math.radians(48.0), math.radians(11.0), 500.0)
+    t = np.concatenate([[0.0, rest / 2], rest + np.arange(2 * count + 1), [2 * count + 2 * rest]])
+    way = np.clip(t - rest, 0, 2 * count) * 10.0
+    east, north = np.minimum(way, count * 10.0), np.maximum(way - count * 10.0, 0.0)
+    geodetic = origin.to_geodetic(np.stack([east, north, np.zeros_like(way)], -1))
+    points = []
+    for (lat, lon, height), when in zip(geodetic, t, strict=True):
+        stamp = f'<time>2026-01-01T00:{int(when) // 60:02d}:{when % 60:04.1f}Z</time>'
+        points.append(f'<trkpt lat="{math.degrees(lat):.9f}" lon="{math.degrees(lon):.9f}">'
+                      f'<ele>{height:.2f}</ele>{stamp if times else ""}</trkpt>')
+    path.write_text('<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1">'
+                    f'<trk><trkseg>{"".join(points)}</trkseg></trk></gpx>')
+    return path
+
+
+def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
+    drive = profile.from_gpx(gpx(tmp_path / 'a.gpx'))
+    assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # the corner is cut by a point
+    assert np.median(drive.speed[drive.speed > 0]) == pytest.approx(10.0, rel=1e-3)
+    rest = drive.standstills(2.0)
+    assert [b - a for a, b in rest] == pytest.approx([30.0, 30.0], abs=1.1)   # a point a second
+    assert drive.yaw[0] == pytest.approx(0.0, abs=1e-3)            # east
+    assert drive.yaw[-1] == pytest.approx(math.pi / 2, abs=1e-3)   # north
+    assert math.degrees(drive.latitude) == pytest.approx(48.0)
+    answer = asked(capsys, '--gpx', str(tmp_path / 'a.gpx'))
+    assert answer['drive']['chord'] == pytest.approx(math.hypot(2000, 2000), rel=5e-3)
+
+
+def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
+    path = str(gpx(tmp_path / 'a.gpx', times=False))
+    assert 'no times; give --speed' in refused(capsys, '--gpx', path)
+    answer = asked(capsys, '--gpx', path, '--speed', '20')
+    assert answer['drive']['duration'] == pytest.approx(200.0, rel=0.01)
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    (b'no xml at all', 'is no GPX file'), (b'<gpx></gpx>', 'holds 0 track points'),
+    (b'\xff\xfe\x00', 'is no GPX file'), (b'', 'is no GPX file'),
+    (b'<gpx><trkpt lat="x" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'not readable'),
+    (b'<gpx><trkpt lat="91" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
+    (b'<gpx><trkpt lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
+    (b'<gpx><trkpt lat="1" lon="1"><time>now</time></trkpt><trkpt lat="1" lon="1"/></gpx>',
+     'not readable'),
+    (b'<gpx><trkpt lat="1" lon="1"><time>2026-01-01T00:00:00Z</time></trkpt>'
+     b'<trkpt lat="1" lon="1"><time>2026-01-01T00:01:00Z</time></trkpt></gpx>', 'never moves')])
+def test_a_gpx_that_cannot_be_used_is_refused(tmp_path, capsys, text, words):
+    path = tmp_path / 'a.gpx'
+    path.write_bytes(text)
+    message = refused(capsys, '--gpx', str(path))
+    assert words in message
+    assert str(path) in message
+
+
+def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
+    bag = tmp_path / 'drive'
+    assert main(['simulate', '--scenario', 'straight', '--out', str(bag), '--duration', '200',
+                 '--imu-rate', '50', '--fix-sigma', '0.5', '--fix-rate', '2', '--quiet']) == 0
+    capsys.readouterr()
+    answer = asked(capsys, '--bag', str(bag), '--imu-grade', 'industrial')
+    assert answer['sigmas']['fix_sigma'] == pytest.approx(0.5, rel=1e-6)
+    assert answer['sigmas']['fix_rate'] == pytest.approx(2.0, rel=1e-6)
+    motion = motion_of(resolved(SimOptions(scenario='straight', duration=200.0)))
+    assert answer['drive']['distance'] == pytest.approx(motion.distance, rel=0.01)
+    assert answer['drive']['standing'] == pytest.approx([60.0, 60.0], abs=1.5)
+    assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
+
+
+@pytest.mark.parametrize(('argv', 'words'), [
+    ([], 'give one drive'),
+    (['--scenario', 'paper', '--distance', '5'], 'not --scenario and --distance'),
+    (['--scenario', 'moon'], 'want one of paper'),
+    (['--scenario', 'paper', '--duration', '10'], 'too short'),
+    (['--distance', '500'], '--distance needs --speed'),
+    (['--distance', '500', '--speed', '0'], '--speed 0'),
+    (['--distance', '0', '--speed', '10'], '--distance 0'),
+    (['--distance', '-5', '--speed', '10'], '--distance -5'),
+    (['--distance', '1e9', '--speed', '10'], 'at most'),
+    (['--distance', '500', '--speed', '10', '--standstill', '-1'], '--standstill -1'),
+    (['--distance', '500', '--speed', '10', '--acceleration', '0'], '--acceleration 0'),
+    (['--distance', '500', '--speed', '10', '--turns', '99'], '--turns 99'),
+    (['--distance', '500', '--speed', '10', '--turns', '-1'], '--turns -1'),
+    (['--scenario', 'paper', '--turns', '2'], 'go with --distance'),
+    (['--gpx', 'a.gpx', '--duration', '2'], '--duration goes with --scenario'),
+    (['--scenario', 'paper', '--fix-sigma', '0'], 'fix sigma 0'),
+    (['--scenario', 'paper', '--fix-sigma', '-2'], 'fix sigma -2'),
+    (['--scenario', 'paper', '--fix-rate', '0'], 'fix rate 0'),
+    (['--scenario', 'paper', '--heading-sigma-deg', '0'], '--heading-sigma-deg 0'),
+    (['--scenario', 'paper', '--heading-sigma-deg', '-1'], '--heading-sigma-deg -1'),
+    (['--scenario', 'paper', '--imu-grade', 'best'], 'not one of consumer'),
+    (['--scenario', 'paper', '--heading-source', 'stars'], 'not one of auto'),
+    (['--scenario', 'paper', '--pulse', '-1'], 'size of a count -1'),
+    (['--scenario', 'paper', '--rtk', '--fix-sigma', '1'], 'give one'),
+    (['--scenario', 'paper', '--set', 'imu.gyro_nois=1'], 'imu.gyro_noise'),
+    (['--distance', '4', '--speed', '2', '--standstill', '0', '--fix-rate', '0.1'],
+     'less than one fix interval'),
+    (['--gpx', '/nowhere/a.gpx'], 'cannot be read')])
+def test_bad_input_is_one_clear_sentence(capsys, argv, words):
+    assert words in refused(capsys, *argv)
