@@ -1,0 +1,78 @@
+"""Simulated drives for tests: made once, changed by copies; settings that fit them."""
+
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+
+from odocal_ros.config import Config, with_settings
+from odocal_ros.pipeline import calibrate
+from odocal_ros.sim.scenarios import simulate, SimOptions
+
+LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
+
+
+@cache
+def drive(**options):
+    """Return a drive at low rates; equal options give the same one."""
+    return simulate(SimOptions(**(LOW_RATES | options)))
+
+
+def settings(made, heading_sigma=1e-3, **changes):
+    """Return the settings of a drive's vehicle with its true heading, and changes (group__name)."""
+    o = made.options
+    known = {
+        'odometer.nominal_scale': float(o.nominal_scale),
+        'odometer.lever_arm': tuple(map(float, o.odometer_lever_arm)),
+        'gnss.lever_arm': tuple(map(float, o.antenna_lever_arm)),
+        'imu.mounting_rpy': tuple(map(float, o.mounting_rpy)),
+        'imu.grade': 'navigation' if o.imu_grade == 'perfect' else o.imu_grade,
+        'verdict.max_yaw_sigma': 0.1, 'verdict.max_scale_sigma': 0.1}
+    if heading_sigma is not None:
+        known |= {'alignment.heading': float(made.truth.heading),
+                  'alignment.heading_sigma': heading_sigma}
+    return with_settings(Config(), known | {k.replace('__', '.'): v for k, v in changes.items()})
+
+
+def changed(samples, **columns):
+    """Return samples with columns changed by functions of a writable copy."""
+    arrays = {f.name: np.array(getattr(samples, f.name)) for f in fields(samples)}
+    for name, change in columns.items():
+        result = change(arrays[name])
+        arrays[name] = arrays[name] if result is None else result
+    return type(samples)(**arrays)
+
+
+def seconds(leg, samples):
+    """Return the times of rows, s since the start mark."""
+    return (samples.stamp_ns - leg.start_ns) * 1e-9
+
+
+def shifted(leg, **marks):
+    """Return a leg with its marks moved by seconds: start=, stop=."""
+    return replace(leg, **{f'{name}_ns': getattr(leg, f'{name}_ns') + round(s * 1e9)
+                           for name, s in marks.items()})
+
+
+def two_point(leg, config, **more):
+    """Return the two-point result of a leg."""
+    return calibrate(leg, config, **more).methods['two_point']
+
+
+def everything_said(result):
+    """Return all reasons of a leg, by code."""
+    said = [*result.reasons, *(r for m in result.methods.values() for r in m.reasons)]
+    return {r.code: r.text for r in said}
+
+
+def errors_in_sigmas(result, truth):
+    """Return (estimate - truth) / sigma of scale, yaw and pitch, those that are given."""
+    e = result.methods['two_point'].estimates
+    true = {'scale_factor': truth.scale, 'yaw_mounting_angle': truth.yaw,
+            'pitch_mounting_angle': truth.pitch}
+    return {k: (e[k].value - v) / e[k].sigma for k, v in true.items() if e[k].value is not None}
+
+
+def rejecting(result):
+    """Return the codes for which a leg is rejected."""
+    return {c for c in everything_said(result) if c.gravity.value == 'rejected'}
