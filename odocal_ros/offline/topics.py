@@ -42,7 +42,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     """
     chosen = {slot: _named(topics, slot, topic) for slot, topic in overrides.items()}
     troubles: list[str] = []
-    for slot in _wanted(config):
+    for slot in wanted(config):
         if slot in chosen:
             continue
         found = candidates(topics, slot, config, chosen)
@@ -57,7 +57,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     return chosen
 
 
-def _wanted(config: Config) -> tuple[str, ...]:
+def wanted(config: Config) -> tuple[str, ...]:
     """Return the slots to fill; odometers and heading first, for what they leave to others."""
     two = 'topic' in (config.odometer.left, config.odometer.right)
     surveyed = config.reference.start and config.reference.end
@@ -95,8 +95,8 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
 
 def _types(slot: str, config: Config) -> Iterable[str]:
     if slot in ('odometer', 'odometer_right'):
-        wanted = config.odometer.type
-        return ODOMETERS if wanted == 'auto' else (full_type(wanted),)
+        asked = config.odometer.type
+        return ODOMETERS if asked == 'auto' else (full_type(asked),)
     return VELOCITY if slot == 'fix_velocity' else (FIX,) if slot == 'fix' else (IMU,)
 
 

@@ -1,0 +1,180 @@
+"""Look through a bag once and gather all that ``odocal inspect`` tells, as plain values."""
+
+from datetime import datetime, UTC
+import math
+
+from odocal_ros.bagio import cdr
+from odocal_ros.bagio.read import Bag, TopicInfo
+from odocal_ros.config import Config
+from odocal_ros.errors import OdocalError
+from odocal_ros.leg import LegRecorder
+from odocal_ros.messages import FIX, IMU, make_reader, Reader
+from odocal_ros.odometer_types import TYPES as ODOMETERS
+from odocal_ros.offline import survey
+from odocal_ros.offline.inspection_drive import closed, look
+from odocal_ros.offline.suggest import command, left_open, likely_mapping
+from odocal_ros.reasons import Code, Reason
+
+
+class _Tap:
+    """Keeps what one reader reads, for itself; what cannot be read is kept as ``trouble``."""
+
+    unreadable = 0      # so that one bad topic does not end the reading of the others
+
+    def __init__(self, reader: Reader) -> None:
+        self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
+
+    def rows(self, raws, received_ns, deserialize) -> list:
+        """Read and keep a block."""
+        try:
+            for slot, block in self.reader.rows(raws, received_ns, deserialize):
+                self.recorder.feed(slot, block)
+        except OdocalError as error:
+            self.trouble = str(error)
+        return []
+
+
+def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> dict:
+    """
+    Return what a bag holds, as for ``odocal inspect --json``.
+
+    Times are seconds from the bag's first message, angles rad, the rest SI.
+    """
+    taps, refused = _taps(bag, config, overrides)
+    bag.read(taps, print)       # a tap gives nothing on
+    mapping, config = likely_mapping(bag.topics, config, overrides)
+    topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
+              for name, info in bag.topics.items()]
+    found: dict = {
+        'bag': bag.name, 'path': path, 'files': [str(f) for f in bag.files],
+        'start': bag.start_ns * 1e-9, 'duration': (bag.end_ns - bag.start_ns) * 1e-9,
+        'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
+        'messages': sum(info.count for info in bag.topics.values()),
+        'notes': [note for note in bag.notes if isinstance(note, str)],
+        'topics': topics, 'mapping': mapping, 'mounting': None, 'drive': None,
+        'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
+    findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
+    extra: list[str] = []
+    if {'imu', 'odometer'} <= mapping.keys():
+        extra = look(bag, _together(taps, mapping), config, found, findings)
+    findings += _lacking(found, mapping, config)
+    found['findings'] = [reason.as_dict() for reason in dict.fromkeys(findings)]
+    found['open'] = left_open(bag.topics, config, overrides)
+    found['command'] = command(path, bag.topics, config, overrides, mapping, extra)
+    return _plain(found)
+
+
+def _plain(value):
+    """Return a value as JSON has it: what is no finite number is null."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _taps(bag: Bag, config: Config, overrides: dict[str, str]):
+    """Return topic -> tap for every topic that could be an input, and why others could not."""
+    asked = {topic: slot for slot, topic in overrides.items()}
+    taps: dict[str, _Tap] = {}
+    refused: dict[str, str] = {}
+    for name, info in bag.topics.items():
+        slot = asked.get(name) or {IMU: 'imu', FIX: 'fix'}.get(info.msgtype) or (
+            'odometer' if info.msgtype in (*ODOMETERS, config.odometer.type) else '')
+        if not slot or not info.count:
+            continue
+        slot = 'odometer' if slot == 'odometer_right' else slot
+        try:
+            taps[name] = _Tap(make_reader(slot, info.msgtype, config))
+        except OdocalError as error:
+            refused[name] = str(error)
+    return taps, refused
+
+
+def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict:
+    """Return what is known of one topic."""
+    seconds = (bag.end_ns - bag.start_ns) * 1e-9
+    facts: dict = {'name': info.name, 'type': info.msgtype, 'count': info.count,
+                   'rate_hz': info.count / seconds if seconds > 0 else None}
+    if tap is None:
+        return facts | ({'trouble': trouble} if trouble else {})
+    slot = tap.reader.slot
+    rows = tap.recorder.rows(slot)
+    trouble = tap.trouble or (f'{tap.reader.unreadable} messages cannot be read: '
+                              f'{tap.reader.trouble}' if tap.reader.unreadable else '')
+    if trouble:
+        facts['trouble'] = trouble
+    if not len(rows.stamp_ns):
+        return facts
+    schema = cdr.SCHEMAS.get(info.msgtype)
+    headerless = 'string header.frame_id' not in schema if schema else bool(
+        (rows.stamp_ns == rows.received_ns).all())
+    facts['timing'] = survey.timing(rows, bag.start_ns, headerless)
+    facts['rate_hz'] = facts['timing'].pop('rate_hz') or facts['rate_hz']
+    if slot == 'odometer':
+        assert tap.reader.form is not None      # an odometer's reader
+        facts['odometer'] = survey.odometer(rows, tap.reader.form)
+    elif slot in ('imu', 'fix'):
+        facts[slot] = (survey.imu if slot == 'imu' else survey.fixes)(rows)
+    return facts
+
+
+def _together(taps, mapping) -> LegRecorder:
+    """Return one recorder with the inputs of a mapping."""
+    recorder = LegRecorder()
+    for slot, topic in mapping.items():
+        if topic not in taps:
+            continue
+        rows = taps[topic].recorder
+        if slot == 'odometer':
+            recorder.form = taps[topic].reader.form
+            recorder.feed('odometer_right', rows.rows('odometer_right'))
+        own = 'odometer' if slot == 'odometer_right' else taps[topic].reader.slot
+        if own == slot or slot == 'odometer_right':
+            recorder.feed(slot, rows.rows(own))
+    return recorder
+
+
+def _lacking(found, mapping, config) -> list[Reason]:
+    """Say what a calibration would miss."""
+    lacking = [Reason(code, f'no topic for the {word}') for slot, code, word in (
+        ('imu', Code.NO_IMU, 'Imu'), ('odometer', Code.NO_ODOMETER, 'odometer'),
+        ('fix', Code.NO_FIX, 'fixes')) if slot not in mapping]
+    drive = found['drive']
+    if not drive:
+        return lacking
+    legs = found['legs']
+    if not found['standstills']:
+        slowest = f': its slowest second is {drive["slowest"]:.2f} m/s' * (drive['slowest'] > 0)
+        lacking.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
+    elif legs and not any(abs(leg['start'] - stop) < 1.0
+                          for leg in legs for _, stop in found['standstills']):
+        lacking.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
+                              f'at {found["standstills"][0][0]:.1f} s'))
+    for leg in legs:
+        name = f'the leg {leg["start"]:.1f}:{leg["stop"]:.1f} s'
+        if leg['way'] < config.leg.min_distance:
+            lacking.append(Reason(Code.LEG_TOO_SHORT, f'{name} is {leg["way"]:.0f} m long'))
+        elif closed(leg):
+            lacking.append(Reason(Code.CHORD_TOO_SHORT, f'{name} is a loop: {leg["way"]:.0f} m of '
+                                  f'way, {leg["chord"]:.0f} m from start to end'))
+    if 0 < drive['fastest'] < config.leg.min_speed:
+        lacking.append(Reason(Code.SPEED_TOO_LOW, f'never faster than {drive["fastest"]:.1f} m/s'))
+    return lacking + _heading(found, mapping, config)
+
+
+def _heading(found, mapping, config) -> list[Reason]:
+    """Say where a heading could come from, if from nowhere good."""
+    if 'heading' in mapping or math.isfinite(config.alignment.heading):
+        return []
+    facts = next(t for t in found['topics'] if t['name'] == mapping['imu'])['imu']
+    if not facts['orientation']:
+        why = 'no heading topic, and the Imu sends no orientation'
+    elif facts['yaw_sigma'] is None:
+        why = 'no heading topic, and the orientation of the Imu comes without a covariance'
+    elif facts['yaw_sigma'] > config.verdict.max_yaw_sigma:
+        why = (f'the only heading is the orientation of the Imu with a sigma of '
+               f'{math.degrees(facts["yaw_sigma"]):.1f} deg')
+    else:
+        return []
+    return [Reason(Code.YAW_NOT_SEPARABLE, why)]

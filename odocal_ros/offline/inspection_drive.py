@@ -1,0 +1,151 @@
+"""What a bag's inputs show together: units, axes, standstills, legs."""
+
+import math
+
+import numpy as np
+
+from odocal_ros.bagio.read import Bag
+from odocal_ros.calib.sanity import imu_sanity, MAX_RATE
+from odocal_ros.config import Config
+from odocal_ros.errors import BadUsage
+from odocal_ros.leg import LegRecorder
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.offline.legs import EACH_STOP, find_legs, LegSpan, marked_legs
+from odocal_ros.offline.mounting import mounting
+from odocal_ros.offline.stretches import (
+    straight_stretches,
+    survey_drive,
+    turn_ratio,
+    way_and_chord,
+)
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screen import screen
+
+CLOSED = 0.2            # chord over way: below, a leg ends where it began
+RAD_PER_DEG = math.pi / 180
+
+
+def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
+         findings: list[Reason]) -> list[str]:
+    """
+    Look at the inputs together.
+
+    Fills mounting, drive, standstills and legs of ``found``, adds to ``findings``, and returns
+    options for the replay: settings, and --leg.
+    """
+    if not all(len(recorder.rows(slot).stamp_ns) for slot in ('imu', 'odometer')):
+        return []
+    try:
+        (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)
+    except BadUsage:
+        first, last = 0, -1
+    leg = recorder.close(first, last, preroll=0.0)
+    inputs, reasons = screen(leg, config)
+    findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
+    if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
+        findings.append(Reason(Code.CLOCKS_DIFFER, 'Imu, odometer and fixes share no time: their '
+                               'stamps do not overlap'))
+        return []
+    base = (first - bag.start_ns) * 1e-9
+    options, w_i, f_i = _units(inputs, config, findings)
+    drive = survey_drive(inputs, config.odometer.nominal_scale, config.leg.standstill)
+    way, chord = way_and_chord(drive, -math.inf, math.inf)
+    driven = _driven(inputs, drive)
+    found['drive'] = {
+        'way': way, 'chord': chord, 'fix_sigma': drive.sigma,
+        'rough_scale': way / driven if way > 50 and driven else drive.scale,
+        'scale_unit': inputs.scale_unit, 'slowest': drive.slowest, 'fastest': drive.fastest,
+        'usable_fixes': len(drive.t_fix), 'travel': driven}
+    found['standstills'] = [[base + a, base + b] for a, b in drive.stops.tolist()]
+    options += _axes(inputs, w_i, f_i, drive, config, found, findings)
+    options += _legs(bag, recorder, inputs, drive, first, config, found)
+    return options
+
+
+def _driven(inputs, drive) -> float:
+    """Return the travel, to and fro, between the first and the last fix (else all), in units."""
+    t, s = inputs.travel.t, inputs.travel.s
+    if len(drive.t_fix) > 1:
+        inside = (t > drive.t_fix[0]) & (t < drive.t_fix[-1])
+        ends = drive.t_fix[[0, -1]]
+        s = np.concatenate([inputs.travel.at(ends[:1]), s[inside], inputs.travel.at(ends[1:])])
+    return float(np.abs(np.diff(s)).sum())
+
+
+def _units(inputs, config, findings):
+    """Judge the Imu's units; return options for replay and rates and forces mended, frame i."""
+    findings += imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)[0]
+    w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
+    options = []
+    if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:
+        options.append('imu.accel_scale=9.80665')
+        f_i = f_i * 9.80665
+    spread = np.linalg.norm(w_i - np.median(w_i, axis=0), axis=1)
+    if np.percentile(spread, 99.9) > MAX_RATE:
+        options.append(f'imu.gyro_scale={RAD_PER_DEG!r}')
+        w_i = w_i * RAD_PER_DEG
+    return options, w_i, f_i
+
+
+def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
+    """Tell how the Imu sits and whether its gyro turns with the course."""
+    m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
+    set_already = bool(np.any(config.imu.mounting_rpy))
+    agrees = m.C_bi is not None and np.allclose(
+        m.C_bi, matrix_from_rpy(config.imu.mounting_rpy), atol=0.1)
+    found['mounting'] = {
+        'rpy': m.rpy, 'assumed_forward': m.assumed, 'off': m.off,
+        'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
+        'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
+        'needed': m.rpy is not None and not agrees and not set_already}
+    up_i = np.median(f_i, axis=0) / np.linalg.norm(np.median(f_i, axis=0))
+    ratio = turn_ratio(inputs, drive, w_i @ up_i)
+    found['drive']['gyro_over_course'] = ratio
+    if ratio is not None and ratio < -0.5:
+        findings.append(Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right '
+                               f'(ratio {ratio:.2f} instead of 1)'))
+    elif ratio is not None and not 0.7 < ratio < 1.4:
+        what = ', as deg/s would' if 40 < ratio < 80 else ''
+        findings.append(Reason(Code.IMU_UNITS, f'the gyro turns {ratio:.2f} times as far as the '
+                               f'course of the fixes{what}'))
+    if m.rpy is None or not found['mounting']['needed']:
+        return []
+    return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
+
+
+def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
+    """Tell the legs that replay would take, and better ones if those will not do."""
+    if not len(drive.t_fix):
+        return []
+    base = (first - bag.start_ns) * 1e-9
+
+    def described(start_ns, stop_ns, **more):
+        start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
+        way, chord = way_and_chord(drive, start, stop)
+        return {'start': base + start, 'stop': base + stop, 'way': way, 'chord': chord} | more
+
+    marks = marked_legs(bag)
+    found['legs'] = [described(a, b, marked=bool(marks))
+                     for a, b in find_legs(recorder, bag, [], marks, config)]
+    stops = find_legs(recorder, bag, [EACH_STOP], [], config) if len(drive.stops) > 2 else []
+    found['each_stop'] = [described(a, b) for a, b in stops]
+    found['straight'] = [
+        described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
+            _from_rest(drive.stops, *ends)
+            for ends in straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
+    if marks or not all(closed(leg) for leg in found['legs']):
+        return []
+    open_legs = [leg for leg in found['each_stop']
+                 if leg['way'] >= config.leg.min_distance and not closed(leg)]
+    if len(open_legs) > 1 and len(open_legs) == len(found['each_stop']):
+        return ['--leg each-stop']
+    return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['straight']]
+
+
+def closed(leg) -> bool:
+    return leg['chord'] < CLOSED * leg['way']
+
+
+def _from_rest(stops, start, stop):
+    """Move ends that lie in a standstill to its end: there the marks of a leg belong."""
+    return tuple(next((b for a, b in stops.tolist() if a <= t <= b), t) for t in (start, stop))

@@ -1,0 +1,203 @@
+"""What ``odocal inspect`` found, as a person reads it."""
+
+import math
+import textwrap
+
+WIDTH = 98
+QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
+STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
+
+
+def text(found: dict) -> str:
+    """Return one screen of text (more where there is more to say)."""
+    roles = {topic: slot for slot, topic in found['mapping'].items()}
+    blocks = [_head(found), _topics(found, roles)]
+    blocks += [_details(topic, roles) for topic in found['topics'] if 'timing' in topic]
+    blocks += [_drive(found), _findings(found), _way_on(found)]
+    return '\n\n'.join('\n'.join(block) for block in blocks if block)
+
+
+def _head(found) -> list[str]:
+    files = len(found['files'])
+    lines = [found['path'], f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
+             f'{found["messages"]} messages in {files} file{"s" * (files > 1)}']
+    return lines + [line for note in found['notes'] for line in _wrapped(f'note: {note}', 2)]
+
+
+def _topics(found, roles) -> list[str]:
+    wide = max((len(topic['name']) for topic in found['topics']), default=0)
+    kinds = max((len(_short(topic['type'])) for topic in found['topics']), default=0)
+    lines = []
+    for topic in found['topics']:
+        rate = f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] and topic['count'] > 1 else ''
+        role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
+        lines.append(f'  {topic["name"]:{wide}}  {_short(topic["type"]):{kinds}} '
+                     f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())
+    return ['topics', *lines]
+
+
+def _short(msgtype: str) -> str:
+    return msgtype.replace('/msg/', '/')
+
+
+def _details(topic, roles) -> list[str]:
+    """Return what one input shows, one thought a line."""
+    points = [*_of_imu(topic), *_of_odometer(topic), *_of_fix(topic), *_of_timing(topic)]
+    if topic.get('trouble'):
+        points.append(topic['trouble'])
+    if topic['name'] not in roles and not any('odd:' in p for p in points):
+        points = points[:2]      # of topics not used, a look is enough
+    return [topic['name'], *(line for point in points for line in _wrapped(point, 2))]
+
+
+def _of_imu(topic):
+    imu = topic.get('imu')
+    if not imu:
+        return
+    unit = imu['force_unit']
+    if not imu['gravity']:
+        yield 'no specific force: orientation only'
+        yield from _orientation(imu)
+        return
+    way = {'+z': 'z-up', '-z': 'looks z-down'}.get(
+        imu['gravity_axis'], 'mounted on its side')
+    yield (f'gravity {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} on '
+           f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): {way}')
+    if unit != 'm/s^2':
+        yield 'odd: specific force is not in m/s^2' + (' but in g' if unit == 'g' else '')
+    if imu['not_finite']:
+        yield f'odd: {imu["not_finite"]} messages hold NaN or Inf'
+    yield from _orientation(imu)
+
+
+def _orientation(imu):
+    if not imu['orientation']:
+        yield 'no orientation' + (
+            ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (never set)')
+    elif imu['yaw_sigma'] is None:
+        yield 'orientation filled, its covariance unknown'
+    else:
+        yield f'orientation filled, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
+
+
+def _of_odometer(topic):
+    odometer = topic.get('odometer')
+    if not odometer:
+        return
+    what = {'cumulative': 'counts on', 'increment': 'counts since the message before',
+            'rate': 'speed'}[odometer['quantity']]
+    unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
+    unit += '/s' * (odometer['quantity'] == 'rate')
+    if odometer['least'] is None:
+        yield 'odd: no value is a number'
+        return
+    yield f'{what}: {odometer["least"]:.6g} to {odometer["most"]:.6g} {unit}'
+    if odometer['not_finite']:
+        yield f'odd: {odometer["not_finite"]} messages hold NaN or Inf'
+
+
+def _of_fix(topic):
+    fix = topic.get('fix')
+    if not fix:
+        return
+    status = ', '.join(f'{count} {STATUS.get(value, "status " + value)}'
+                       for value, count in fix['status'].items())
+    if fix['sigma']:
+        sigma = (f'sigma {fix["sigma"]["median"]:.2f} m '
+                 f'({fix["sigma"]["least"]:.2f} to {fix["sigma"]["most"]:.2f})')
+    else:
+        sigma = 'no covariance'
+    partly = f', covariance in {fix["covariance_known"]} of {topic["count"]}' \
+        if fix['sigma'] and fix['covariance_known'] < topic['count'] else ''
+    yield f'{status}; {sigma}{partly}'
+    if fix['positions'] < topic['count']:
+        yield f'odd: {topic["count"] - fix["positions"]} of them without a position'
+    if fix['position_step'] and fix['position_step'] > 0.05:
+        yield f'positions come in steps of {fix["position_step"]:.2f} m'
+
+
+def _of_timing(topic):
+    timing = topic['timing']
+    if timing['headerless']:
+        yield 'no header: stamped by its arrival (bag time)'
+    elif abs(timing['header_to_bag']) > 0.5e-3:
+        where = 'after' if timing['header_to_bag'] > 0 else 'before'
+        yield (f'recorded {abs(timing["header_to_bag"]):.3f} s {where} its header stamp '
+               f'(spread {timing["header_to_bag_spread"]:.3f} s)')
+    odd = [f'{timing[key]} {what}' for key, what in (
+        ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the stamp before them'),
+        ('backward_steps', 'with an earlier stamp than the one before')) if timing[key]]
+    if odd:
+        yield f'odd: {", ".join(odd)} of {topic["count"]} messages'
+    if timing['gap_count']:
+        longest = max(timing['gaps'], key=lambda gap: gap['length'])
+        yield (f'odd: {timing["gap_count"]} gap{"s" * (timing["gap_count"] > 1)}, the longest '
+               f'{longest["length"]:.2f} s at {longest["at"]:.2f} s')
+
+
+def _drive(found) -> list[str]:
+    drive = found['drive']
+    if not drive:
+        return []
+    lines = ['drive (seconds from the first message)']
+    if drive['usable_fixes']:
+        lines.append(f'  {drive["way"]:.0f} m by the fixes, {drive["chord"]:.0f} m from the first '
+                     f'to the last; {drive["slowest"]:.1f} to {drive["fastest"]:.1f} m/s')
+    if drive['rough_scale'] and drive['scale_unit'] != '1':
+        lines.append(f'  about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
+    stops = found['standstills']
+    shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
+    lines += _wrapped(f'standstills: {shown} s' if stops else 'standstills: none, never at rest',
+                      2)
+    for leg in found['legs']:
+        lines.append(f'  leg {"marked by the node" if leg["marked"] else "that replay takes"}: '
+                     + _leg(leg))
+    if len(found['each_stop']) > 1:
+        lines.append(f'  --leg each-stop: {len(found["each_stop"])} legs, '
+                     + ', '.join(f'{leg["way"]:.0f} m' for leg in found['each_stop'][:8]))
+    lines += [f'  straight: {_leg(leg)}' for leg in found['straight'][:3]]
+    return lines + _mounting(found['mounting'])
+
+
+def _leg(leg) -> str:
+    return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, way {leg["way"]:.0f} m, '
+            f'start to end {leg["chord"]:.0f} m')
+
+
+def _mounting(mounting) -> list[str]:
+    if mounting['rpy'] is None:
+        told = 'gravity and driving do not tell how the Imu sits; set imu.mounting_rpy yourself'
+        return _wrapped(f'axes: {told}', 2)
+    rpy = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
+    if mounting['assumed_forward']:
+        how = 'level from gravity; forward is taken as x, the drive does not show it'
+    else:
+        sure = math.degrees(mounting['forward_sigma'])
+        how = (f'forward seen to {sure:.0f} deg (1 sigma) in how the vehicle speeds up and turns, '
+               f'{math.degrees(mounting["off"]):.1f} deg off in all')
+    told = 'imu.mounting_rpy is to be' if mounting['needed'] else 'imu.mounting_rpy is right:'
+    return _wrapped(f'axes: {told} [{rpy}] deg ({how})', 2)
+
+
+def _findings(found) -> list[str]:
+    if not found['findings']:
+        return ['nothing is lacking for a calibration']
+    lines = ['to know before calibrating']
+    for reason in found['findings']:
+        lines += _wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}', 2)
+    return lines
+
+
+def _way_on(found) -> list[str]:
+    lines = []
+    if found['open']:
+        lines += _wrapped(f'replay needs help: {found["open"]}', 0)
+    if found['command']:
+        lines += ['try', f'  {found["command"]}']
+    return lines
+
+
+def _wrapped(line: str, indent: int) -> list[str]:
+    return textwrap.wrap(line, WIDTH, initial_indent=' ' * indent,
+                         subsequent_indent=' ' * (indent + 2), break_long_words=False,
+                         break_on_hyphens=False)

@@ -1,0 +1,127 @@
+"""How an Imu sits in the vehicle: up from gravity, forward from what driving does to it."""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import rpy_from_matrix
+
+BIN = 1.0                      # s, accelerations are compared as means over it
+SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
+NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it
+LEAST = 20                     # bins
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """
+    The nominal rotation that a drive suggests.
+
+    C_bi : (3, 3) takes the Imu frame i to b (forward, left, up), quarter turns only; None where
+        it cannot be told.
+    forward_i : (3,) forward as measured, None if the drive does not show it.
+    forward_sigma : rad.    assumed : forward was not measured but taken as x.
+    off : rad, between what was measured and the quarter turns.
+    """
+
+    C_bi: NDArray[np.float64] | None
+    forward_i: NDArray[np.float64] | None
+    forward_sigma: float
+    assumed: bool
+    off: float
+
+    @property
+    def rpy(self) -> list[float] | None:
+        """Return imu.mounting_rpy, rad."""
+        if self.C_bi is None:
+            return None
+        return [float(x) for x in np.round(rpy_from_matrix(self.C_bi), 12) + 0.0]
+
+
+def mounting(t, w_i, f_i, travel: Travel, metres_per_unit: float) -> Mounting:
+    """
+    Tell how an Imu sits.
+
+    Parameters
+    ----------
+    t, w_i, f_i : (n,), (n, 3), (n, 3) arrays
+        Times, s, turn rate, rad/s, and specific force, m/s^2 or g, in the sensor's frame.
+    travel : Travel
+        Odometer; positive is taken as forward.
+    metres_per_unit : float
+        Its rough scale.
+
+    """
+    mean = np.median(f_i, axis=0)
+    size = float(np.linalg.norm(mean))
+    if size < 1e-3:
+        return Mounting(None, None, np.pi, True, 0.0)
+    up_i = mean / size
+    forward_i, sigma = _forward(t, w_i, f_i, up_i, travel, metres_per_unit)
+    if forward_i is not None:
+        C = np.stack([forward_i, np.cross(up_i, forward_i), up_i])
+        nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
+        off = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
+        return Mounting(nearest if off < NEAR + sigma else None, forward_i, sigma, False, off)
+    if abs(up_i[2]) > np.cos(NEAR):        # upright or upside down: x is forward, most likely
+        C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
+        return Mounting(C_bi, None, sigma, True, float(np.arccos(abs(up_i[2]))))
+    return Mounting(None, None, sigma, True, 0.0)
+
+
+def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
+    """
+    Return the forward axis (level, unit) and its sigma, rad; None where it is not seen.
+
+    In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: speeding up
+    pushes forward, turning pushes to the inside. One least-squares angle fits both.
+    """
+    t0, t1 = max(t[0], travel.t[0]) + BIN, min(t[-1], travel.t[-1]) - BIN
+    if t1 - t0 < LEAST * BIN:
+        return None, np.pi
+    edges = np.arange(t0, t1, BIN)
+    cell = np.searchsorted(edges, t) - 1
+    inside = (cell >= 0) & (cell < len(edges) - 1)
+    count = np.bincount(cell[inside], minlength=len(edges) - 1)
+    use = count > 0
+    mean_of = [np.bincount(cell[inside], column[inside], len(edges) - 1) / np.maximum(count, 1)
+               for column in (*f_i.T, w_i @ up_i)]
+    f, w_up = np.stack(mean_of[:3], -1), mean_of[3]
+    wide = np.array([-BIN / 2, BIN / 2])
+    speed_at = [(travel.at(edges + x + BIN / 2) - travel.at(edges + x - BIN / 2))
+                * metres_per_unit / BIN for x in wide]
+    speed = np.mean(speed_at, axis=0)
+    middle = (edges[:-1] + edges[1:]) / 2
+    v = (speed[:-1] + speed[1:]) / 2
+    dv = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
+        * metres_per_unit / BIN**2
+    e1 = np.cross(up_i, np.eye(3)[int(np.argmin(np.abs(up_i)))])
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(up_i, e1)
+    A = (dv + 1j * v * w_up)[use]
+    F = (f @ e1 + 1j * (f @ e2))[use]
+    A, F = A - A.mean(), F - F.mean()
+    power = float(np.vdot(A, A).real)
+    if len(A) < LEAST or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
+        return None, np.pi
+    gain = np.vdot(A, F) / power
+    rest = F - gain * A
+    # half the residual lies across the axis; neighbours share noise, so count every third bin
+    sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
+    if sigma > SURE:
+        return None, sigma
+    theta = np.angle(gain)
+    return np.cos(theta) * e1 + np.sin(theta) * e2, sigma
+
+
+def _quarter_turns():
+    """Yield the 24 rotations that take axes to axes."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            C = np.zeros((3, 3))
+            C[range(3), order] = signs
+            if np.linalg.det(C) > 0:
+                yield C

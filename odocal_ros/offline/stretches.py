@@ -1,0 +1,142 @@
+"""How a recording was driven: way, stops, straight stretches, and whether the gyro agrees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.screen import Inputs
+
+STRAIGHT = 0.97      # chord over way: a stretch at least this straight suits the two-point method
+POINTS = 600         # fixes looked at for straight stretches, evenly taken
+TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
+AT_SPEED = 1.0       # s, over which a speed is taken
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """
+    A recording seen as a drive.
+
+    scale : m per unit of travel, rough; None where fixes do not tell.
+    stops : (k, 2) s, begin and end of standstills.
+    sigma : m, of a fix, horizontally, as sent.    white : m, what differs from fix to fix.
+    t_fix, fixes_n : (n,), (n, 3) s and m, usable fixes, east-north-up about the first.
+    slowest, fastest : m/s.
+    """
+
+    scale: float | None
+    sigma: float
+    white: float
+    stops: NDArray[np.float64]
+    t_fix: NDArray[np.float64]
+    fixes_n: NDArray[np.float64]
+    slowest: float
+    fastest: float
+
+
+def survey_drive(inputs: Inputs, nominal_scale: float, shortest: float) -> Drive:
+    """Return the drive that screened inputs show; ``shortest``: least standstill, s."""
+    fixes_n, sigma = np.empty((0, 3)), 2.5
+    if len(inputs.t_fix):
+        geodetic = np.nan_to_num(inputs.geodetic)
+        fixes_n = Origin(*(float(x) for x in geodetic[0])).to_n(geodetic)
+        sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) or nominal_scale or None
+    if inputs.scale_unit == '1':
+        scale = scale or 1.0
+    stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0
+    if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
+        stops = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale or 1.0, shortest)
+        t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - AT_SPEED, AT_SPEED / 2)
+        if scale and len(t):
+            speed = np.abs(inputs.travel.at(t + AT_SPEED) - inputs.travel.at(t)) * scale / AT_SPEED
+            slowest, fastest = float(speed.min()), float(speed.max())
+    return Drive(scale, sigma, _white(fixes_n), stops, inputs.t_fix, fixes_n, slowest, fastest)
+
+
+def _white(fixes_n) -> float:
+    """Return the white noise of fixes, m, by the median of their second differences."""
+    if len(fixes_n) < 5:
+        return 2.5
+    bend = np.diff(fixes_n[:, :2], n=2, axis=0)
+    return float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6)))
+
+
+def way_and_chord(drive: Drive, start: float, stop: float) -> tuple[float, float]:
+    """
+    Return the way driven and the distance between the ends, m, by the fixes from start to stop.
+
+    The way goes from fix to fix at least ten times their white noise apart: nearer ones would
+    add it up.
+    """
+    p = drive.fixes_n[(drive.t_fix >= start) & (drive.t_fix <= stop), :2]
+    if len(p) < 2:
+        return 0.0, 0.0
+    knots = [*_knots(p, max(2.0, 10 * drive.white)), len(p) - 1]
+    way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
+    return way, float(np.hypot(*(p[-1] - p[0])))
+
+
+def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tuple[float, float]]:
+    """Return (start, stop) of stretches at least ``shortest`` m long, the longest first; s."""
+    if drive.scale is None or len(drive.t_fix) < 3:
+        return []
+    pick = np.unique(np.linspace(0, len(drive.t_fix) - 1, POINTS).astype(int))
+    t, p = drive.t_fix[pick], drive.fixes_n[pick, :2]
+    travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
+    chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
+    far = chord >= shortest
+    # the rough scale cuts corners; the straightest stretches tell it best
+    ratio = chord[far] / np.maximum(travel[far], 1e-12)
+    best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
+    way = travel * max(drive.scale, min(best, 1.2 * drive.scale))
+    # fixes are off by sigma at both ends: what that hides is given, not demanded
+    fit = np.triu((chord >= STRAIGHT * way - drive.sigma) & (way >= shortest)
+                  & (chord <= way / STRAIGHT + 4 * drive.sigma))
+    found: list[tuple[float, float]] = []
+    while fit.any():
+        i, j = np.unravel_index(np.argmax(np.where(fit, way, 0)), fit.shape)
+        found.append((float(t[i]), float(t[j])))
+        fit[:j + 1, i:] = False            # whatever overlaps it
+    return found
+
+
+def turn_ratio(inputs: Inputs, drive: Drive, w_up) -> float | None:
+    """
+    Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
+
+    w_up : (n,) turn rate about the upward axis, rad/s. None where the drive hardly turns or the
+    two have little to do with each other.
+    """
+    knots = _knots(drive.fixes_n, max(5.0, 10 * drive.sigma))
+    if len(knots) < 5:
+        return None
+    step = np.diff(drive.fixes_n[knots, :2], axis=0)
+    t = (drive.t_fix[knots][:-1] + drive.t_fix[knots][1:]) / 2
+    course = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    angle = np.concatenate([[0.0], np.cumsum((w_up[:-1] + w_up[1:]) / 2 * np.diff(inputs.t_imu))])
+    # the mean angle over each chord; what a bias adds goes with the time
+    way_of = np.concatenate([[0.0], np.cumsum((angle[:-1] + angle[1:]) / 2
+                                              * np.diff(inputs.t_imu))])
+    ends = drive.t_fix[knots]
+    gyro = np.diff(np.interp(ends, inputs.t_imu, way_of)) / np.diff(ends)
+    drift = np.stack([np.ones_like(t), t], -1)
+    course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
+    power = float(gyro @ gyro)
+    if course @ course < TURNED**2 or power == 0:
+        return None
+    slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
+    alike = abs(slope) * np.sqrt(power / (course @ course))
+    return 1 / slope if alike > 0.9 else None
+
+
+def _knots(fixes_n, least) -> list[int]:
+    """Return fixes at least so far apart, m."""
+    knots = [0] if len(fixes_n) else []
+    for k, point in enumerate(fixes_n[:, :2]):
+        if np.hypot(*(point - fixes_n[knots[-1], :2])) >= least:
+            knots.append(k)
+    return knots

@@ -1,0 +1,65 @@
+"""Which topics a bag's inputs most likely are, and the replay command that says so."""
+
+import shlex
+
+from odocal_ros.bagio.read import TopicInfo
+from odocal_ros.config import Config, with_settings
+from odocal_ros.errors import BadUsage
+from odocal_ros.offline.topics import candidates, choose_topics, OPTION, wanted
+
+COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
+
+
+def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]):
+    """Return slot -> topic, the likeliest where several could be meant; and settings it needs."""
+    chosen = {slot: topic if topic in topics else f'/{topic}'
+              for slot, topic in overrides.items()}
+    for slot, topic in chosen.items():
+        if topic not in topics:      # the sentence that replay says
+            choose_topics(topics, config, {slot: topic})
+    free = candidates(topics, 'odometer', config, chosen)
+    sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
+    if not config.odometer.left and 'odometer' not in chosen and all(sides) and len(free) == 2:
+        config = with_settings(config, {'odometer.left': 'topic', 'odometer.right': 'topic'})
+    for slot in wanted(config):
+        found = [] if slot in chosen else candidates(topics, slot, config, chosen)
+        if found:
+            chosen[slot] = min(found, key=lambda name: _rank(slot, topics[name]))
+    return chosen, config
+
+
+def _rank(slot: str, info: TopicInfo):
+    """Sort the likelier topic first: the usual name, counters before speeds, more messages."""
+    usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
+    kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
+    worded = any(word in info.name.lower() for word in COUNTER_WORDS)
+    return (kinds[0] if 'odometer' in slot else 0, not info.name.endswith(usual),
+            not worded if 'odometer' in slot else 0, -info.count, info.name)
+
+
+def left_open(topics, config, overrides) -> str:
+    """Return what replay would say without options: which topics it cannot choose; '' if none."""
+    try:
+        choose_topics(topics, config, overrides)
+    except BadUsage as error:
+        return str(error)
+    return ''
+
+
+def command(path, topics, config, overrides, mapping, extra) -> str:
+    """Return the replay that the findings suggest; '' where an input is missing."""
+    if not {'imu', 'odometer', 'fix'} <= mapping.keys():
+        return ''
+    words = ['odocal', 'replay', shlex.quote(path)]
+    for slot, topic in mapping.items():
+        others = {s: t for s, t in mapping.items() if s != slot}
+        found = candidates(topics, slot, config, others) + [topic] * (topic not in candidates(
+            topics, slot, config, others))
+        if slot in overrides or len(found) > 1:
+            words += [OPTION[slot], shlex.quote(topic)]
+    if 'odometer_right' in mapping and 'odometer_right' not in overrides:
+        extra = ['odometer.left=topic', 'odometer.right=topic', *extra]
+    for option in extra:
+        words += option.split(' ', 1) if option.startswith('--') else [
+            '--set', shlex.quote(option)]
+    return ' '.join(words)

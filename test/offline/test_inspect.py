@@ -1,0 +1,328 @@
+"""odocal inspect: it tells the truth about real drives and about made ones with known faults."""
+
+import json
+import math
+import shlex
+
+import numpy as np
+import pytest
+import ros_bags
+from ros_bags import T0
+import ros_messages as make
+
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.offline.cli import main
+from odocal_ros.offline.mounting import mounting
+
+K = 0.02                   # m per pulse
+RATE = 25                  # Hz, Imu
+G = 9.81
+
+
+def planar(seconds=150):
+    """Return t, speed, turn rate and acceleration of a drive: rest, go, left turn, go, rest."""
+    t = np.arange(0, seconds, 1 / RATE)
+    a = np.where((t > 12) & (t < 22), 1.0, 0) - np.where((t > 130) & (t < 140), 1.0, 0) \
+        + np.where((t > 40) & (t < 120), 0.3 * np.sin(math.pi / 4 * t), 0)
+    w = np.where((t > 70) & (t < 80), math.pi / 20, 0.0)
+    v = np.cumsum(a) / RATE
+    return t, np.where(np.abs(v) < 1e-6, 0, v), w, a
+
+
+def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=False, known=2):
+    """
+    Return rows of a planar drive.
+
+    C_ib takes b to the Imu frame; gyro, accel: factors on what is sent; lag: s, added to the
+    fixes' stamps; loop: half way round a circle and back to the start.
+    """
+    t, v, w, a = planar(seconds)
+    if loop:
+        w = np.where(v > 0.1, 2 * math.pi * v / (v.sum() / RATE), 0.0)
+    C_ib = np.eye(3) if C_ib is None else C_ib
+    yaw = np.cumsum(w) / RATE
+    east, north = np.cumsum(v * np.cos(yaw)) / RATE, np.cumsum(v * np.sin(yaw)) / RATE
+    counts = np.floor(np.cumsum(v) / RATE / K).astype(int)
+    rng = np.random.default_rng(5)
+    rows = []
+    for i, s in enumerate(t):
+        ns = T0 + round(s * 1e9)
+        f = C_ib @ (a[i], v[i] * w[i], G) * accel + rng.normal(0, 0.02, 3)
+        rate = C_ib @ (0, 0, w[i]) * gyro + rng.normal(0, 0.001, 3)
+        rows.append(('/imu/data', ns, make.imu(ns, w=rate, f=f)))
+        rows.append(('/odometer', ns + 1, make.whole(int(counts[i]))))
+        if i % 5 == 0:
+            x, y = east[i] + rng.normal(0, 0.3), north[i] + rng.normal(0, 0.3)
+            rows.append(('/fix', ns + 2, make.fix(
+                ns + round(lag * 1e9), 48 + np.rad2deg(y / 6.38e6),
+                11 + np.rad2deg(x / 6.38e6 / math.cos(math.radians(48))), 500, sigma=0.3,
+                status=status, known=known)))
+    return rows
+
+
+def inspect(path, capsys, *options):
+    """Return what the command tells, as JSON and as text."""
+    assert main(['inspect', str(path), '--json', *options]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert main(['inspect', str(path), *options]) == 0
+    out = capsys.readouterr()
+    assert out.err == ''
+    assert max(len(line) for line in out.out.splitlines() if str(path) not in line) < 100
+    return told, out.out
+
+
+def codes(told):
+    return {finding['code'] for finding in told['findings']}
+
+
+def topic(told, name):
+    return next(t for t in told['topics'] if t['name'] == name)
+
+
+# ---- real drives ---------------------------------------------------------------------------
+
+def test_comma(data_dir, capsys):
+    path = data_dir / 'comma2k19_rav4' / 'bag'
+    told, text = inspect(path, capsys)
+    assert told['mapping'] == {'odometer': '/odometer/pulses_derived', 'imu': '/imu/data',
+                               'fix': '/fix'}
+    assert codes(told) == {'COVARIANCE_UNKNOWN', 'IMU_LOOKS_Z_DOWN', 'NO_STANDSTILL',
+                           'YAW_NOT_SEPARABLE'}
+    assert told['standstills'] == []
+    assert told['drive']['slowest'] > 7.9          # README: 8 to 20 m/s, never at rest
+    assert told['drive']['way'] == pytest.approx(1004, rel=0.01)
+    assert told['drive']['rough_scale'] == pytest.approx(0.010084, rel=0.005)
+    # README: forward-right-down, pitch 3.75 deg on top
+    assert told['mounting']['rpy'] == pytest.approx([math.pi, 0, 0], abs=1e-9)
+    assert told['mounting']['needed']
+    assert not told['mounting']['assumed_forward']
+    imu = topic(told, '/imu/data')
+    assert imu['rate_hz'] == pytest.approx(104.3, abs=0.1)
+    assert (imu['imu']['gravity_axis'], imu['imu']['orientation']) == ('-z', False)
+    assert topic(told, '/imu/data_flu')['imu']['gravity_axis'] == '+z'
+    fix = topic(told, '/fix')
+    assert fix['fix']['sigma'] is None
+    assert fix['timing']['header_to_bag'] == pytest.approx(0.20, abs=0.01)
+    pulses = topic(told, '/odometer/pulses_derived')
+    assert pulses['timing']['headerless']
+    assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
+        'cumulative', pytest.approx(82.9, abs=0.1))
+    for line in ('looks z-down', 'no header: stamped by its arrival', 'never at rest',
+                 'no covariance', '3 topics could be the odometer', '[180, 0, 0] deg'):
+        assert line in text
+
+
+def test_husky(data_dir, capsys):
+    path = data_dir / 'husky_parking_lot' / 'bag'
+    told, text = inspect(path, capsys)
+    assert told['mounting']['rpy'] == pytest.approx([math.pi / 2, 0, -math.pi / 2], abs=1e-9)
+    assert not told['mounting']['assumed_forward']
+    imu = topic(told, '/imu/data')['imu']
+    assert (imu['gravity_axis'], imu['orientation']) == ('+y', True)
+    assert topic(told, '/fix')['rate_hz'] == pytest.approx(2.5, abs=0.01)
+    (start, stop), = told['standstills']           # README: one stop of 11 s
+    assert stop - start == pytest.approx(11, abs=1)
+    leg, = told['legs']
+    assert leg['chord'] < 0.1 * leg['way']         # a closed loop
+    assert leg['way'] == pytest.approx(0.98 * 359, rel=0.02)
+    assert {'CHORD_TOO_SHORT', 'SPEED_TOO_LOW', 'IMU_AXES', 'YAW_NOT_SEPARABLE'} <= codes(told)
+    assert told['drive']['gyro_over_course'] == pytest.approx(1, abs=0.2)
+    assert len(told['straight']) == 2              # the long sides of 145 x 70 m
+    assert all(leg['chord'] > 0.9 * leg['way'] for leg in told['straight'])
+    assert '--leg' in told['command']
+    assert 'mounted on its side' in text
+
+
+def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
+    for name in ('comma2k19_rav4', 'husky_parking_lot'):
+        told, _ = inspect(data_dir / name / 'bag', capsys)
+        words = shlex.split(told['command'])[1:]
+        code = main([*words, '--output', str(tmp_path / name), '--quiet', '--json'])
+        result = json.loads(capsys.readouterr().out)
+        assert code in (0, 1)
+        assert result['result']['scale_factor']['value'] is not None
+
+
+@pytest.mark.parametrize('name', ['talker_mcap', 'cdr_test_mcap', 'service_events_mcap',
+                                  'split3_sqlite3_no_metadata', 'split5_mcap'])
+def test_bags_without_any_input(data_dir, capsys, name):
+    told, text = inspect(data_dir / 'reader_bags' / name, capsys)
+    assert codes(told) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
+    assert told['command'] == ''
+    assert 'replay needs help: no odometer' in text
+    assert ('metadata.yaml is missing' in text) == ('no_metadata' in name)
+
+
+def test_bag_that_cannot_be_read(tmp_path, capsys):
+    assert main(['inspect', str(tmp_path / 'nothing')]) == 2
+    assert 'no such file or folder' in capsys.readouterr().err
+
+
+# ---- made drives ---------------------------------------------------------------------------
+
+def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
+    told, text = inspect(ros_bags.write(tmp_path / 'bag', drive()), capsys)
+    assert codes(told) == {'YAW_NOT_SEPARABLE'}
+    (a, b), (c, d) = told['standstills']
+    assert (a, b, c, d) == pytest.approx((0, 12, 140, 150), abs=1.2)
+    leg, = told['legs']
+    t, v, w, _ = planar()
+    assert leg['way'] == pytest.approx(v.sum() / RATE, rel=0.02)
+    assert leg['start'] == pytest.approx(12, abs=1.2)
+    assert told['drive']['rough_scale'] == pytest.approx(K, rel=0.02)
+    assert told['drive']['gyro_over_course'] == pytest.approx(1, abs=0.05)
+    assert told['mounting'] == told['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
+    assert told['command'] == f'odocal replay {tmp_path / "bag"}'
+    assert told['open'] == ''
+    assert 'imu.mounting_rpy is right: [0, 0, 0] deg' in text
+
+
+@pytest.mark.parametrize('rpy', [
+    (math.pi, 0, 0), (math.pi / 2, 0, -math.pi / 2), (0, math.pi / 2, 0), (0, 0, math.pi / 2),
+    (0, 0, math.pi), (math.pi, 0, math.pi / 2)])
+def test_axes_are_told(tmp_path, capsys, rpy):
+    C_bi = matrix_from_rpy(rpy)
+    small = matrix_from_rpy((0.0, 0.05, 0.08))    # what calibration is for must not confuse it
+    rows = drive(C_ib=C_bi.T @ small.T)
+    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert matrix_from_rpy(told['mounting']['rpy']) == pytest.approx(C_bi, abs=1e-9)
+    assert told['mounting']['needed']
+    assert told['mounting']['off'] == pytest.approx(math.hypot(0.05, 0.08), abs=0.03)
+    setting = shlex.split(told['command'])[-1]
+    assert setting.startswith('imu.mounting_rpy=[')
+    # set as told, nothing is left to say about the axes
+    told, _ = inspect(tmp_path / 'bag', capsys, '--set', setting)
+    assert codes(told) == {'YAW_NOT_SEPARABLE'}
+    assert not told['mounting']['needed']
+
+
+def test_a_forward_axis_that_nothing_shows_is_assumed_or_left_open():
+    t = np.arange(0, 100, 0.02)
+    travel = Travel(t, 10.0 * t, 0.0)               # steady: no push anywhere
+    rng = np.random.default_rng(1)
+    w_i = rng.normal(0, 1e-3, (len(t), 3))
+    for up, rpy in (((0, 0, G), [0, 0, 0]), ((0, 0, -G), [math.pi, 0, 0]), ((0, G, 0), None)):
+        m = mounting(t, w_i, np.array(up) + rng.normal(0, 0.05, (len(t), 3)), travel, 1.0)
+        assert m.assumed
+        assert m.rpy == (rpy and pytest.approx(rpy))
+
+
+def test_units(tmp_path, capsys):
+    told, text = inspect(ros_bags.write(tmp_path / 'g', drive(accel=1 / 9.80665)), capsys)
+    assert 'IMU_UNITS' in codes(told)
+    assert 'specific force is not in m/s^2 but in g' in text
+    assert '--set imu.accel_scale=9.80665' in told['command']
+    told, _ = inspect(ros_bags.write(tmp_path / 'deg', drive(gyro=180 / math.pi)), capsys)
+    assert 'IMU_UNITS' in codes(told)
+    assert f'--set imu.gyro_scale={math.pi / 180!r}' in told['command']
+    told, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
+    assert 'GYRO_SIGN' in codes(told)
+
+
+def test_clocks_and_stamps(tmp_path, capsys):
+    told, _ = inspect(ros_bags.write(tmp_path / 'lag', drive(lag=-3.0)), capsys)
+    assert 'CLOCKS_DIFFER' in codes(told)
+    assert topic(told, '/fix')['timing']['header_to_bag'] == pytest.approx(3.0, abs=1e-3)
+    rows = drive()
+    imu = [i for i, row in enumerate(rows) if row[0] == '/imu/data']
+    rows[imu[100]][2].header.stamp.sec = 0          # zero
+    rows[imu[100]][2].header.stamp.nanosec = 0
+    rows[imu[200]][2].header.stamp.sec -= 5         # backward, once
+    rows[imu[301]] = (*rows[imu[301]][:2], rows[imu[300]][2])    # a row sent twice
+    gone = set(imu[2000:2600])                      # 12 s of Imu
+    rows = [row for i, row in enumerate(rows) if i not in gone]
+    told, text = inspect(ros_bags.write(tmp_path / 'odd', rows), capsys)
+    timing = topic(told, '/imu/data')['timing']
+    assert [timing[k] for k in ('zero_stamps', 'backward_steps', 'repeated_stamps')] == [1, 1, 1]
+    longest = max(timing['gaps'], key=lambda gap: gap['length'])
+    assert longest['length'] == pytest.approx(600 / RATE, abs=0.05)
+    assert longest['at'] == pytest.approx(2000 / RATE, abs=0.05)
+    assert topic(told, '/imu/data')['rate_hz'] == pytest.approx(RATE, rel=0.01)
+    assert f'the longest {longest["length"]:.2f} s at {longest["at"]:.2f} s' in text
+    assert {'BAD_ROWS_DROPPED', 'STAMPS_NOT_RISING'} <= codes(told)
+
+
+def test_fixes_that_are_none(tmp_path, capsys):
+    told, text = inspect(ros_bags.write(tmp_path / 'bag', drive(status=-1)), capsys)
+    assert 'FIXES_UNUSABLE' in codes(told)
+    assert topic(told, '/fix')['fix']['status'] == {'-1': 750}
+    assert '750 no fix' in text
+    told, _ = inspect(ros_bags.write(tmp_path / 'unknown', drive(known=0)), capsys)
+    assert topic(told, '/fix')['fix']['sigma'] is None
+    assert 'COVARIANCE_UNKNOWN' in codes(told)
+    rows = [row for row in drive() if row[0] != '/fix']
+    told, _ = inspect(ros_bags.write(tmp_path / 'without', rows), capsys)
+    assert {'NO_FIX'} <= codes(told)
+    assert [f['text'] for f in told['findings'] if f['code'] == 'NO_FIX'] == [
+        'no topic for the fixes']
+    assert len(told['standstills']) == 2            # seen without fixes too
+
+
+def test_orientation_as_heading(tmp_path, capsys):
+    def with_orientation(q, variance):
+        covariance = np.zeros(9)
+        covariance[8] = variance
+        return [(name, ns, m if name != '/imu/data' else make.imu(
+            ns, w=_xyz(m.angular_velocity), f=_xyz(m.linear_acceleration), q=q,
+            covariance=covariance)) for name, ns, m in drive()]
+
+    for q, variance, says in (((0, 0, 0.6, 0.8), 1e-6, None),
+                              ((0, 0, 0.6, 0.8), 0.01, 'sigma of 5.7 deg'),
+                              ((0, 0, 0.6, 0.8), 0.0, 'without a covariance'),
+                              ((0, 0, 0, 1), 0.0, 'sends no orientation')):   # a default
+        path = ros_bags.write(tmp_path / f'{variance}{q[2]}', with_orientation(q, variance))
+        told, _ = inspect(path, capsys)
+        texts = [f['text'] for f in told['findings'] if f['code'] == 'YAW_NOT_SEPARABLE']
+        assert bool(texts) == bool(says)
+        assert says is None or says in texts[0]
+
+
+def _xyz(vector):
+    return vector.x, vector.y, vector.z
+
+
+def test_a_loop_is_told_with_its_ends(tmp_path, capsys):
+    told, _ = inspect(ros_bags.write(tmp_path / 'bag', drive(loop=True)), capsys)
+    assert 'CHORD_TOO_SHORT' in codes(told)
+    assert told['legs'][0]['chord'] < 5
+
+
+def test_short_slow_and_odd_values(tmp_path, capsys):
+    rows = drive(30)
+    at = next(i for i, row in enumerate(rows) if i > 5 and row[0] == '/imu/data')
+    rows[at] = ('/imu/data', rows[at][1], make.imu(rows[at][1], w=(math.nan, 0, 0)))
+    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert 'LEG_TOO_SHORT' not in codes(told) or told['legs'][0]['way'] < 100
+    assert topic(told, '/imu/data')['imu']['not_finite'] == 1
+    nan = [('/speed', T0 + i, make.real(math.nan)) for i in range(5)]
+    told, text = inspect(ros_bags.write(tmp_path / 'nan', nan), capsys)
+    assert 'no value is a number' in text
+    single = [row for row in drive(1) if row[1] < T0 + 3]
+    told, _ = inspect(ros_bags.write(tmp_path / 'single', single), capsys)
+    assert told['messages'] == 3
+
+
+def test_two_wheels_on_two_topics_are_seen(tmp_path, capsys):
+    rows = [row for name, ns, m in drive() for row in (
+        [('/ticks/left', ns, m), ('/ticks/right', ns, m)] if name == '/odometer'
+        else [(name, ns, m)])]
+    told, _ = inspect(ros_bags.write(tmp_path / 'bag', rows), capsys)
+    assert told['mapping']['odometer_right'] == '/ticks/right'
+    assert told['command'].endswith('--set odometer.left=topic --set odometer.right=topic')
+
+
+def test_topic_named_by_the_user(tmp_path, capsys):
+    rows = drive(20) + [('/speed', T0 + i * 10**8, make.twist_stamped(T0 + i * 10**8, 1.0))
+                        for i in range(200)]
+    rows.sort(key=lambda row: row[1])
+    path = ros_bags.write(tmp_path / 'bag', rows)
+    told, _ = inspect(path, capsys)
+    assert told['mapping']['odometer'] == '/odometer'     # a counter before a speed
+    assert '2 topics could be the odometer' in told['open']
+    assert '--odometer-topic /odometer' in told['command']
+    told, _ = inspect(path, capsys, '--odometer-topic', 'speed')
+    assert told['mapping']['odometer'] == '/speed'
+    assert '--odometer-topic /speed' in told['command']
+    assert main(['inspect', str(path), '--fix-topic', '/gps']) == 2
+    assert 'no such topic' in capsys.readouterr().err
