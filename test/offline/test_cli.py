@@ -1,0 +1,68 @@
+"""The odocal command as a person meets it: exit codes, one line, no traceback."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+from odocal_ros.errors import BadBag
+from odocal_ros.offline import cli
+
+
+def test_help_of_everything_is_there(capsys):
+    for argv in (['--help'], *([c, '--help'] for c in cli.COMMANDS)):
+        with pytest.raises(SystemExit) as end:
+            cli.main(argv)
+        assert end.value.code == 0
+        assert 'usage: odocal' in capsys.readouterr().out
+
+
+def test_no_command_shows_help_and_fails(capsys):
+    assert cli.main([]) == 2
+    assert 'replay' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('argv', [
+    ['fly'], ['replay'], ['replay', 'x', '--nonsense'], ['replay', 'x', '--method', 'magic']])
+def test_wrong_use_is_one_line_and_exit_2(argv, capsys):
+    assert cli.main(argv) == 2
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert '--help' in err
+
+
+def fake_command(monkeypatch, error):
+    """Make every command end in an error."""
+    def run(args):
+        raise error
+    for module, _ in cli.COMMANDS.values():
+        monkeypatch.setattr(importlib.import_module(module), 'run', run)
+
+
+@pytest.mark.parametrize(('error', 'code'), [
+    (BadBag('x.db3: empty'), 2), (KeyboardInterrupt(), 130), (ZeroDivisionError('oops'), 3)])
+def test_errors_are_one_line_with_their_exit_code(error, code, monkeypatch, capsys):
+    fake_command(monkeypatch, error)
+    assert cli.main(['replay', 'x']) == code
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert 'Traceback' not in err
+
+
+def test_an_internal_error_leaves_a_trace_file(monkeypatch, capsys):
+    fake_command(monkeypatch, ZeroDivisionError('oops'))
+    cli.main(['replay', 'x'])
+    path = capsys.readouterr().err.split()[-1]
+    with open(path) as f:
+        assert 'ZeroDivisionError: oops' in f.read()
+
+
+def test_help_imports_nothing_heavy():
+    probe = ('import sys; from odocal_ros.offline.cli import main\n'
+             'try: main(["--help"])\nexcept SystemExit: pass\n'
+             'print([m for m in ("numpy", "scipy", "rosbags", "pyproj", "yaml", "rclpy") '
+             'if m in sys.modules], file=sys.stderr)')
+    done = subprocess.run([sys.executable, '-c', probe], capture_output=True, text=True,
+                          check=True)
+    assert done.stderr.strip() == '[]'
