@@ -13,6 +13,8 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
+EDGE = 0.3     # s cut off each end of a standstill: a slow start leans the specific force
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
@@ -103,12 +105,15 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
 
     Returns
     -------
-    Level at the end of the standstill; an accelerometer bias tilts it by bias / g. The bias walks
+    Level near the end of the standstill; an accelerometer bias tilts it by bias / g. The bias walks
     while its mean is taken: by a third of its variance over the standstill from the last value.
 
     """
-    inside = (t >= span[0]) & (t <= span[1])
-    length = max(span[1] - span[0], 1e-3)
+    cut = min(EDGE, (span[1] - span[0]) / 4)
+    inside = (t >= span[0] + cut) & (t <= span[1] - cut)
+    if not inside.any():        # rows at its very ends only
+        inside = (t >= span[0]) & (t <= span[1])
+    length = max(span[1] - span[0] - 2 * cut, 1e-3)
     up_b = f_b[inside].mean(axis=0)
     g = np.linalg.norm(up_b)
     sigma = np.hypot(grade.accel_bias, grade.accel_noise / np.sqrt(length)) / g
