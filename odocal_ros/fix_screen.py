@@ -2,9 +2,13 @@
 
 import numpy as np
 
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
 
 HEIGHT = 1e5         # m, beyond it a fix is at no real position
+ABOUT_START = 11     # fixes about the start mark that the origin is amid
+AWAY = 1e6           # m from where most fixes are, the same
 
 
 def usable_fixes(fix, sent, gnss):
@@ -30,6 +34,7 @@ def usable_fixes(fix, sent, gnss):
     # NaN compares false: what is not within is lost
     within = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi)
     lost = nowhere | ~within | (abs(fix.height) > HEIGHT)
+    lost = lost | _away(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
     poor = (sigma > gnss.max_sigma) & (gnss.max_sigma > 0) & ~unknown
@@ -49,6 +54,15 @@ def usable_fixes(fix, sent, gnss):
     return use, covariance, found
 
 
+def _away(fix, good):
+    """Tell which of the good fixes are on another part of the Earth than most: (n,) bool."""
+    away = np.zeros(len(good), bool)
+    if good.any():
+        r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
+        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > AWAY
+    return away
+
+
 def covariances(fix, default_sigma):
     """
     Return covariances with the unknown ones replaced, and which those are.
@@ -66,3 +80,12 @@ def covariances(fix, default_sigma):
     # satellites are above only: a height is about twice as bad
     covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
     return covariance, unknown
+
+
+def origin_amid(t_fix, geodetic) -> Origin:
+    """Return where n is fixed: the fix amid those about the start, so that no outlier is it."""
+    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:ABOUT_START])
+    r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
+    amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
+    latitude, longitude, height = geodetic[amid]
+    return Origin(float(latitude), float(longitude), float(np.nan_to_num(height)))

@@ -2,13 +2,18 @@
 
 import numpy as np
 
+from odocal_ros.reasons import Code, Reason
+
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
 BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15}
-TURN_STEP = 1.0      # rad/s, least jump of one or two rows that may be a glitch
+TURN_STEP = 0.8      # rad/s, least bound from row to row that may be a glitch
 FORCE_STEP = 50.0    # m/s^2, the same: potholes stay
 SPEED_STEP = 0.3     # of the top speed, the same
-CLEAR = 20.0         # times the usual wander about the neighbours
-CLOSE = 0.5          # s that five rows may span: over a longer time motion itself may jump
+CLEAR = 20.0         # times the usual step from row to row
+CLOSE = 0.4          # s within which a glitch is over: longer, and motion itself may do it
+HOME = 0.5           # of the bound: nearer to the row before it, the glitch is over
+RARE = 0.002         # of the rows: more of them are no glitches
+MOST = 2000          # bounds looked at
 
 
 def beyond(name, column):
@@ -24,7 +29,7 @@ def beyond(name, column):
 
 def alone(t, x, least):
     """
-    Tell which rows stand alone, two in a row at most, against the two each side.
+    Tell which rows leave their neighbours at a bound and come back at another.
 
     Parameters
     ----------
@@ -33,26 +38,28 @@ def alone(t, x, least):
     x : (n, k) array
         Values.
     least : float
-        Smallest jump that may be a glitch.
+        Smallest bound, from one row to the next, that may be a glitch.
 
     Returns
     -------
-    (n,) bool.
+    (n,) bool; all false where so many rows do so that it is the sensor's nature.
 
     """
-    none = np.zeros(len(x), bool)
-    if len(x) < 5 or not (np.abs(np.diff(x, axis=0)) > least).any():
-        return none
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, ((2, 2), (0, 0)), 'edge'), 5, 0)
-    off = np.abs(x - np.median(windows, axis=-1))
-    usual = 1.4826 * np.median(off, axis=0)
-    # rows beside a jump that lasts are near one half of their window, never far from its median
-    jump = (off > np.maximum(least, CLEAR * usual)).any(axis=1)
-    if not jump.any():
-        return none
-    span = t[np.minimum(np.arange(len(t)) + 2, len(t) - 1)] - t[np.maximum(np.arange(len(t)) - 2,
-                                                                           0)]
-    return jump & (span <= CLOSE)
+    found = np.zeros(len(x), bool)
+    bound = np.abs(np.diff(x, axis=0)).max(axis=1, initial=0.0)
+    if not (bound > least).any():
+        return found
+    least = max(least, CLEAR * float(np.median(bound)))
+    done = -1
+    for i in np.flatnonzero(bound > least)[:MOST]:
+        if i < done:
+            continue
+        within = np.searchsorted(t, t[i] + CLOSE, side='right')
+        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= HOME * bound[i]
+        if home.any():
+            done = i + 2 + int(np.argmax(home))
+            found[i + 1:done] = True
+    return found if found.mean() <= RARE else np.zeros(len(x), bool)
 
 
 def imu_glitches(t, w_i, f_i, imu):
@@ -67,3 +74,24 @@ def speed_glitches(t, speed):
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
     return alone(t, speed[:, None], max(SPEED_STEP * top, 1e-12))
+
+
+def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
+    """
+    Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
+
+    t, w : (n,), (n, 3) Imu rows.   travel : Travel.   limit : s, as long as a gap may be.
+    A gyro that reads zero is let pass: some drivers have a dead band.
+    """
+    if len(t) < 2 or len(travel.t) < 2:
+        return ()
+    same = (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    begin, end = t[edges[::2]], t[edges[1::2]]
+    rolled = np.abs(travel.at(end) - travel.at(begin)) > 3 * travel.quantum
+    held = np.flatnonzero((end - begin > limit) & rolled)
+    if not len(held):
+        return ()
+    worst = held[np.argmax((end - begin)[held])]
+    return (Reason(Code.IMU_GAP, f'the gyro repeats one value for {end[worst] - begin[worst]:.2f} '
+                   f's at t = {begin[worst]:.2f} s while the wheels roll: it hangs'),)

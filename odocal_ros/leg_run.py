@@ -7,15 +7,23 @@ import numpy as np
 from odocal_ros.align import align
 from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.check import (
-    against_travel, fix_noise_factor, gyro_against_course, mismatch, pieces, residuals,
-    track_check)
+    against_travel,
+    fix_noise_factor,
+    gyro_against_course,
+    mismatch,
+    pieces,
+    residuals,
+    slow_variance,
+    track_check,
+)
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.marks import fix_at, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
-from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, rough_scale
-from odocal_ros.nav.earth import earth_rate_n, ecef_from_geodetic
+from odocal_ros.fix_screen import origin_amid
+from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
+from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
@@ -27,7 +35,6 @@ MARK_WINDOW = 1.0       # s, least half-window of fixes about a mark in motion
 FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
-ABOUT_START = 11        # fixes about the start mark that the origin is amid
 TRACK_ROWS = 5000       # of a track kept in a result
 
 
@@ -49,7 +56,7 @@ class LegRun:
         self.leg, self.inputs, self.config, self.reasons = leg, inputs, config, reasons
         self.t_fit = inputs.t_stop
         self.holdout = holdout
-        self.origin = _origin(inputs)
+        self.origin = origin_amid(inputs.t_fix, inputs.geodetic)
         geodetic = inputs.geodetic.copy()
         lost = np.isnan(geodetic[:, 2])
         geodetic[lost, 2] = self.origin.height
@@ -130,7 +137,7 @@ class LegRun:
         if None in marks:
             return None
         chord = Chord(self.track, self.origin, *marks, lever_b, self._velocity_change(marks),
-                      self.alignment)
+                      self.alignment, (inputs.doubt_t, inputs.doubt_sigma))
         if not all(m.standing or m.surveyed for m in marks):     # the fit moves with the solution
             if refusal(chord, self.rough):
                 return chord
@@ -141,7 +148,7 @@ class LegRun:
         return chord
 
     def _surveyed(self, name, t):
-        """Return the reference point at a mark, empty where the chord cannot begin or end there."""
+        """Return the reference point at a mark, () where the chord does not begin or end there."""
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
         if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
@@ -191,10 +198,14 @@ class LegRun:
 
         more, factor = {}, np.ones(3)
         if between.sum() >= 3:
-            drift = self._drift(chord, f)
+            drift_n = self._drift(chord, f)
+            drift = float(np.linalg.norm(drift_n))
             residual = strays(f)
             residual[:, 2] = strays(solve(chord)[0])[:, 2]     # the pitch is no noise of heights
-            factor = self._noise_factor(residual, inputs.covariance_n[between], drift)
+            covariance = inputs.covariance_n[between]
+            factor = self._noise_factor(residual, covariance, drift)
+            chord = self._with_slow_errors(chord, f, fixes[0], residual, covariance, drift_n,
+                                           factor[0])
             f, _ = solve(chord, factor[2])
             more = {'before': track_check(strays(before), distance),
                     'after': track_check(strays(f), distance)}
@@ -246,13 +257,23 @@ class LegRun:
                 for name, g in (('before', before), ('after', f))}
 
     def _drift(self, chord, f):
-        """Return how far the gyros may bend a track that is pinned at both ends, 1 sigma, m."""
+        """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
         keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
         D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
         sources = drift_sources(self.track.t[keep], D, matrix_from_quat(self.track.q_nb[keep]),
                                 self.alignment)
         # the bow of a pinned track is a quarter of what its free end would stray
-        return float(np.sqrt(sum((e**2).sum() for e in sources.values()))) / 4
+        return np.concatenate(list(sources.values()), axis=1) / 4
+
+    def _with_slow_errors(self, chord, f, t, residual, covariance, drift_n, factor):
+        """Return the chord with marks no better than the slow part of the fix errors."""
+        along = (chord.M @ f)[:2] / np.hypot(*(chord.M @ f)[:2])
+        stated = np.einsum('nij,i,j->n', covariance[:, :2, :2], along, along)
+        slow = slow_variance(t, residual[:, :2] @ along, stated,
+                             np.linalg.norm(along @ drift_n[:2])) / factor**2
+        up_ratio = float(np.median(covariance[:, 2, 2] / stated))
+        return replace(chord, start=chord.start.at_least(slow, up_ratio),
+                       end=chord.end.at_least(slow, up_ratio))
 
     def _noise_factor(self, residual, covariance, drift):
         factor = fix_noise_factor(residual, covariance, drift)
@@ -272,12 +293,3 @@ class LegRun:
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
         found += against_travel(direction, course, self.config.odometer.signed)
         self.reasons += found or mismatch(check, self.fix_sigma, drift, distance)
-
-
-def _origin(inputs):
-    """Return where n is fixed: the fix amid those about the start, so that no outlier tilts n."""
-    near = np.sort(np.argsort(np.abs(inputs.t_fix), kind='stable')[:ABOUT_START])
-    r_e = ecef_from_geodetic(inputs.geodetic[near, 0], inputs.geodetic[near, 1], 0.0)
-    amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
-    latitude, longitude, height = inputs.geodetic[amid]
-    return Origin(float(latitude), float(longitude), float(np.nan_to_num(height)))

@@ -11,16 +11,17 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
 from odocal_ros.fix_screen import usable_fixes
-from odocal_ros.glitches import beyond, imu_glitches, speed_glitches
+from odocal_ros.glitches import beyond, frozen, imu_glitches, speed_glitches
 from odocal_ros.leg import Leg
-from odocal_ros.nav.odometer import mean_travel, Travel, travel
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.odometer_care import wheels
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import take
 
-CLOCK_LIMIT = 0.5        # s, between topics (design.md, Stamps)
 GAP_FACTOR = 5.0         # a gap in odometer or fixes, in median intervals
 NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
            'fix': Code.FIXES_UNUSABLE}
@@ -42,6 +43,8 @@ class Inputs:
     travel: Travel                     # mean of the wheels
     travel_left: Travel | None
     travel_right: Travel | None
+    doubt_t: NDArray[np.float64]       # (d,) s, where travel is in doubt (resets, gaps)
+    doubt_sigma: NDArray[np.float64]   # (d,) by how much, scale units
     t_fix: NDArray[np.float64]         # (k,)
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
@@ -66,8 +69,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
             found.append(Reason(code, f'no {LABEL[slot]} message between the marks'))
-    found += _clocks(leg, config)
     offset = _offsets(config)
+    found += judge_clocks(leg, offset, LABEL)
 
     def rows(slot):
         sent = getattr(leg, slot)
@@ -86,20 +89,23 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
-    whole, left, right = _travels(leg, config, rows, found)
+    travelled = wheels(leg, config, rows, found)
     fix, t_fix = rows('fix')
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
     t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
-    _gaps('odometer', whole.t, found)
+    _gaps('odometer', travelled.mean.t, found)
+    found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
     _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     return Inputs(
         t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=t_imu,
         w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
         f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
-        q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi, travel=whole, travel_left=left,
-        travel_right=right, t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
+        q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
+        travel=travelled.mean, travel_left=travelled.left, travel_right=travelled.right,
+        doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,
+        t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
         scale_unit=leg.form.scale_unit), tuple(found)
@@ -127,22 +133,6 @@ def _spikes(slot, samples, t, form, config):
     if slot in ('odometer', 'odometer_right') and form.quantity == 'rate':
         return speed_glitches(t, samples.value.astype(float))
     return np.zeros(len(t), bool)
-
-
-def _travels(leg, config, rows, found):
-    def one(slot):
-        samples, t = rows(slot)
-        result, reasons = travel(t, samples.value, leg.form, config.odometer.reversed)
-        found.extend(reasons)
-        return result
-
-    left = one('odometer')
-    if not len(leg.odometer_right.stamp_ns):
-        return left, None, None
-    right = one('odometer_right')
-    if not len(left.t) or not len(right.t):
-        return left, left, right
-    return mean_travel(left, right), left, right
 
 
 def _where(samples, index, leg) -> str:
@@ -216,41 +206,6 @@ def _longest_rising(stamp):
         keep.append(i)
         i = int(before[i])
     return np.array(keep[::-1])
-
-
-def _clocks(leg, config):
-    """Compare each topic's clock with the Imu's, at equal times of arrival."""
-    imu = leg.imu
-    if not (imu.stamp_ns > 0).all():
-        imu = take(imu, imu.stamp_ns > 0)
-    if len(imu.stamp_ns) < 2:
-        return []
-    base = imu.received_ns[0]
-    arrival = (imu.received_ns - base) * 1e-9
-    order = np.argsort(arrival, kind='stable')
-    lag = (imu.received_ns - imu.stamp_ns) * 1e-9
-    asked = _offsets(config)
-    found = []
-    for slot in ('odometer', 'odometer_right', 'fix', 'heading'):
-        samples = getattr(leg, slot)
-        ok = samples.stamp_ns > 0
-        if not ok.any():
-            continue
-        own = (samples.received_ns[ok] - samples.stamp_ns[ok]) * 1e-9
-        there = np.interp((samples.received_ns[ok] - base) * 1e-9, arrival[order], lag[order])
-        ahead = float(np.median(there - own)) + asked[slot]
-        if abs(ahead) > CLOCK_LIMIT:
-            found.append(Reason(Code.CLOCKS_DIFFER, f'the {LABEL[slot]} stamps are {ahead:+.3f} s '
-                                f'against the Imu stamps of the same moment{_cure(slot, ahead)}'))
-    return found
-
-
-def _cure(slot, ahead):
-    """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
-    group = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}.get(slot)
-    if group is None or abs(ahead) > 1.0:
-        return ''
-    return f': add {-ahead:+.3f} s to {group}.time_offset if they mean the same clock'
 
 
 def _gaps(slot, t, found):

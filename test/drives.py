@@ -7,7 +7,7 @@ import numpy as np
 
 from odocal_ros.config import Config, with_settings
 from odocal_ros.pipeline import calibrate
-from odocal_ros.sim.scenarios import simulate, SimOptions
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 
@@ -19,7 +19,7 @@ def drive(**options):
 
 
 def settings(made, heading_sigma=1e-3, **changes):
-    """Return the settings of a drive's vehicle with its true heading, and changes (group__name)."""
+    """Return the settings of a drive with its true heading, and changes as group__name."""
     o = made.options
     known = {
         'odometer.nominal_scale': float(o.nominal_scale),

@@ -10,6 +10,8 @@ DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compar
 CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
 SURE_TURN = 0.5           # rad between pieces: five sigmas of such directions
 LOOSE = 4.0               # sigmas of disagreement that name a mismatch
+CHI2_MEDIAN = 0.4549      # of one squared normal
+SLOW = 20.0               # s, window in which white errors average down
 SLOP = 0.002              # of the distance: slip, suspension, road
 
 
@@ -71,6 +73,38 @@ def fix_noise_factor(residual, covariance_n, drift):
     return np.where(factors > 1.25, factors, 1.0)
 
 
+def slow_variance(t, along, variance, drift):
+    """
+    Return the variance of fix errors that stay alike over SLOW seconds, m^2.
+
+    Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
+    the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
+    chord, since gyros bend a track across it.
+
+    Parameters
+    ----------
+    t, along : (n,) arrays
+        Times, s, and corrected track less fixes along the chord, m.
+    variance : (n,) array
+        As stated, m^2.
+    drift : float
+        What the gyros may have done along it, m: no error of the fixes.
+
+    """
+    window = ((t - t[0]) / SLOW).astype(int)
+    count = np.bincount(window)
+    full = count >= max(5, 0.5 * count.max())
+    if full.sum() < 5:
+        return 0.0
+    means = np.bincount(window, along)[full] / count[full]
+    jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
+    white = min(jump, np.median(variance)) / np.median(count[full])
+    seen = (means**2).mean() - drift**2
+    # within three sigmas of the mean square of so many windows, white errors alone may do it
+    clear = seen > white * (1 + 3 * np.sqrt(2 / full.sum()))
+    return float(seen - white) if clear else 0.0
+
+
 def mismatch(check: TrackCheck, fix_sigma, drift, distance) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
     allowed = LOOSE * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP * distance
@@ -87,6 +121,7 @@ def pieces(track_2d, fixes_2d, t, sigma):
     Returns
     -------
     middle : (k,) s.   track_direction, course : (k,) rad, from east, ccw.
+
     """
     need = max(DIRECTION_CHORD, CLEAR * sigma)
     a, cuts = 0, []

@@ -6,13 +6,13 @@ with them states the whole error; their scatter shows what part of it changes fr
 that part averages down, unless the data show that the slow part moved on within the window too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 OUTLIER = 5.0        # robust sigmas from the median
-ENOUGH = 10          # fixes below which nothing is judged about their correlation
+ENOUGH = 20          # fixes below which nothing is judged about their correlation
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,14 @@ class MarkFix:
     dropped: int
     height_known: bool = True
     surveyed: bool = False
+
+    def at_least(self, variance, up_ratio) -> 'MarkFix':
+        """Return the mark with no less than a level variance, m^2, and so many times it up."""
+        if self.surveyed:
+            return self
+        level = (self.covariance_n[0, 0] + self.covariance_n[1, 1]) / 2
+        more = max(0.0, variance - level) * np.diag([1.0, 1.0, up_ratio])
+        return replace(self, covariance_n=self.covariance_n + more)
 
 
 def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
@@ -55,11 +63,7 @@ def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
     mean : (3,) m.   covariance : (3, 3) of the mean, m^2.   used, dropped : int.
 
     """
-    middle = np.median(position_n, axis=0)
-    off = np.hypot(*(position_n - middle)[:, :2].T)
-    stated = np.sqrt(np.median(np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2) / 2))
-    spread = max(np.median(off) / 1.1774, 0.2 * stated)    # median of a Rayleigh law: 1.1774 sigma
-    keep = off <= OUTLIER * spread
+    keep = _near_middle(position_n, covariance_n)
     t, position_n, covariance_n = t[keep], position_n[keep], covariance_n[keep]
     weight = 1 / np.trace(covariance_n[:, :2, :2], axis1=1, axis2=2)
     weight = weight / weight.sum()
@@ -67,6 +71,17 @@ def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
     whole = np.einsum('n,nij->ij', weight, covariance_n)
     share = _share(t, position_n - mean, whole, weight, correlation_time)
     return mean, whole * share, int(keep.sum()), int((~keep).sum())
+
+
+def _near_middle(position_n, covariance_n):
+    """Tell which fixes are within five robust sigmas of the median, in the level and in height."""
+    off = np.abs(position_n - np.median(position_n, axis=0))
+    level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
+    stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
+    # medians: 1.1774 sigma of a Rayleigh law, 0.6745 of a normal one
+    spread = max(np.median(level) / 1.1774, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
+    spread_up = max(np.median(up) / 0.6745, 0.2 * np.sqrt(stated[2]))
+    return (level <= OUTLIER * spread) & (up <= OUTLIER * spread_up)
 
 
 def _share(t, residual, whole, weight, correlation_time):

@@ -13,9 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.budget import budget, budget_table, PARAMETERS, total_covariance
+from odocal_ros.calib.budget import (
+    budget,
+    budget_table,
+    parameter_gradient,
+    PARAMETERS,
+    total_covariance,
+)
 from odocal_ros.calib.marks import MarkFix
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
@@ -40,6 +46,8 @@ class Chord:
     lever_b: NDArray[np.float64]     # (3,) antenna from the odometer's point, m, in v
     velocity_change: NDArray[np.float64]  # (3, 3) end less start: times f gives m/s in n
     alignment: Alignment
+    # travel in doubt: where, s, and how much, scale units
+    doubt: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.empty(0), np.empty(0))
 
     @property
     def M(self) -> NDArray[np.float64]:
@@ -64,7 +72,8 @@ def solve(chord: Chord, up_scale=1.0):
     antenna = chord.end.position_n - chord.start.position_n
     sigma = np.sqrt(chord.start.covariance_n[2, 2] + chord.end.covariance_n[2, 2])
     vertical_known = bool(chord.start.height_known and chord.end.height_known
-                          and up_scale < np.inf and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
+                          and up_scale < np.inf
+                          and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
     f = np.array([1.0, 0.0, 0.0])
     for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
         yaw, pitch = mounting_from_forward(f / np.linalg.norm(f))
@@ -129,7 +138,8 @@ def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> 
 
     """
     f, vertical_known = solve(chord, fix_scale[2])
-    sources = _sources(chord, f, vertical_known, quantum, fix_scale, config)
+    sources = (*_sources(chord, f, vertical_known, quantum, fix_scale, config),
+               *_doubt(chord, f))
     covariance = total_covariance(sources)
     sigma = np.sqrt(np.diag(covariance))
     K = float(np.linalg.norm(f))
@@ -172,6 +182,17 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
                   velocity_change=chord.velocity_change @ f,
                   lever_arm_sigma=config.gnss.lever_arm_sigma,
                   odometer_time_sigma=config.odometer.time_sigma)
+
+
+def _doubt(chord, f):
+    """Return the source of travel lost in gaps and resets, empty where there are none."""
+    t, size = chord.doubt
+    inside = (t >= chord.start.t) & (t <= chord.end.t) & (size > 0)
+    if not inside.any():
+        return ()
+    along_n = chord.track.C_nb_at(t[inside]) @ f * size[inside, None]      # (k, 3) m
+    gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
+    return (Source('odometer_gaps', gradient @ along_n.T),)
 
 
 def _blind_height(mark, sigma=0.0):

@@ -1,0 +1,173 @@
+"""
+Odometer rows that do not say what they seem to: false rows, hung counters, lost increments.
+
+False rows are dropped where the counter goes on beside them as if nothing had been; what cannot
+be known of the travel (a reset, a gap of speeds or increments) becomes a doubt of the budget.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.glitches import speed_glitches
+from odocal_ros.nav.odometer import mean_travel, Travel, travel
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.samples import take
+
+ENOUGH = 20          # steps below which nothing is judged
+JUMP = 5.0           # times the 95th percentile of the moving rate: no motion
+EXCURSION = 30.0     # s after which a counter that comes back is no longer taken for the same
+MOST_JUMPS = 200     # beyond it the counter is not mended, but judged by the check
+GAP = 2.5            # median intervals: a message or more is missing
+BESIDE = 5           # steps beside a jump or a gap that tell the speed there
+LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
+
+
+@dataclass(frozen=True, eq=False)
+class Wheels:
+    """Travel of the wheels, and what of it is in doubt."""
+
+    mean: Travel
+    left: Travel | None
+    right: Travel | None
+    doubt_t: NDArray[np.float64]        # (k,) s, where
+    doubt_sigma: NDArray[np.float64]    # (k,) scale units, how much
+
+
+def wheels(leg, config, rows, found) -> Wheels:
+    """
+    Return the travel of the wheels of a leg.
+
+    rows : callable, a slot's usable rows and their times, s.   found : list that findings join.
+    """
+    def one(slot):
+        samples, t = rows(slot)
+        samples, t = _mended(samples, t, leg.form, found)
+        way, reasons = travel(t, samples.value, leg.form, config.odometer.reversed)
+        found.extend(reasons)
+        return _doubted(way, samples.value, leg.form)
+
+    left, t_left, sigma_left = one('odometer')
+    if not len(leg.odometer_right.stamp_ns):
+        return Wheels(left, None, None, t_left, sigma_left)
+    right, t_right, sigma_right = one('odometer_right')
+    mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
+    return Wheels(mean, left, right, np.append(t_left, t_right),
+                  np.append(sigma_left, sigma_right) / 2)
+
+
+def _mended(samples, t, form, found):
+    """Return rows without the false ones, increments with the false ones smoothed."""
+    if form.quantity == 'cumulative':
+        false = false_counts(t, samples.value, form.modulus)
+        if false.any():
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} odometer '
+                                'counts hang or jump away and come back, first at '
+                                f't = {t[np.argmax(false)]:.2f} s; dropped'))
+        return take(samples, ~false), t[~false]
+    if form.quantity == 'increment':
+        false = speed_glitches(t, samples.value.astype(float))
+        if false.any():
+            good = np.interp(t, t[~false], samples.value[~false].astype(float))
+            kept = np.where(false, good, samples.value).astype(samples.value.dtype)
+            samples = replace(samples, value=kept)
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} odometer '
+                                'increments stand alone far from their neighbours, first at '
+                                f't = {t[np.argmax(false)]:.2f} s; taken like those beside'))
+    return samples, t
+
+
+def counter_steps(value, modulus):
+    """Return the steps of a counter, rollover undone, as floats: (n,) to (n - 1,)."""
+    step = np.diff(value)
+    if np.issubdtype(value.dtype, np.integer) and 0 < modulus < 2**63:
+        half = modulus // 2
+        step = (step + half) % modulus - half
+    return step.astype(float)
+
+
+def false_counts(t, value, modulus):
+    """
+    Tell which rows of a counter are false: hung before a jump that catches up, or away and back.
+
+    t : (n,) s.   value : (n,) as sent.   Returns (n,) bool.
+    """
+    false = np.zeros(len(t), bool)
+    step = counter_steps(value, modulus)
+    if len(step) < ENOUGH or not step.any():
+        return false
+    dt = np.diff(t)
+    rate = step / np.maximum(dt, np.median(dt))
+    size = np.abs(rate)
+    top = float(np.percentile(size[size > 0], 95))
+    jumps = np.flatnonzero(size > max(JUMP * top, 3 / np.median(dt)))
+    if len(jumps) > MOST_JUMPS:
+        return false
+    done = -1
+    for j in jumps:
+        if j <= done:
+            continue
+        stall = _stall(step, j)
+        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= EXCURSION]
+        for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
+            net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
+            if _goes_on(t, net, rate, a, b) or a == j and _comes_back(t, net, step, a, b, top):
+                false[a + 1:b + 1] = True
+                done = b
+                break
+    return false
+
+
+def _goes_on(t, net, rate, a, b):
+    """Tell whether the counter after step b goes on from before step a at speeds as beside."""
+    length = t[b + 1] - t[a]
+    ways = [_usual(r) * length for r in (rate[max(0, a - BESIDE):a], rate[b + 1:b + 1 + BESIDE])]
+    slack = LOOSE * max(abs(w) for w in ways) + 3
+    return bool(min(ways) - slack <= net <= max(ways) + slack)
+
+
+def _comes_back(t, net, step, a, b, top):
+    """Tell whether a far jump at step a is taken back at step b, but for what may be motion."""
+    reach = 1.2 * top * (t[b + 1] - t[a]) + 3
+    return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
+
+
+def _doubted(way: Travel, value, form):
+    """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
+    none = np.empty(0)
+    if len(way.t) < ENOUGH:
+        return way, none, none
+    dt, step = np.diff(way.t), np.diff(way.s)
+    usual = np.median(dt)
+    rate = step / np.maximum(dt, usual)
+    if form.quantity == 'cumulative':
+        sent = counter_steps(value, form.modulus)
+        odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
+        # a reset: of the travel since the last count nothing is known but the speeds beside
+        stall = [_stall(step, k) for k in odd]
+        lost = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
+                * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
+        return way, way.t[odd], np.array(lost) / np.sqrt(3)
+    odd = np.flatnonzero(dt > max(GAP * usual, 0.2))
+    before = np.array([_usual(rate[max(0, k - BESIDE):k]) for k in odd])
+    after = np.array([_usual(rate[k + 1:k + 1 + BESIDE]) for k in odd])
+    missing = dt[odd] - (usual if form.quantity == 'increment' else 0.0)
+    if form.quantity == 'increment' and len(odd):
+        step = step.copy()
+        step[odd] += (before + after) / 2 * missing
+        way = Travel(way.t, np.concatenate([[0.0], np.cumsum(step)]), way.quantum)
+    # speeds within a gap: anything between those beside it, and more the longer it is
+    spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
+        np.abs(before), np.abs(after)) / np.sqrt(3)
+    return way, way.t[odd], spread * missing
+
+
+def _stall(step, j):
+    """Return the first of the steps of zero that end at step j, j where there are none."""
+    moves = np.flatnonzero(step[:j])
+    return int(moves[-1]) + 1 if len(moves) else 0
+
+
+def _usual(rate):
+    return float(np.median(rate)) if len(rate) else 0.0
