@@ -73,13 +73,12 @@ def _driven(inputs, drive) -> float:
 
 
 def _units(inputs, config, findings):
-    """Judge the Imu's units; return options for replay and rates and forces mended, frame i."""
+    """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)[0]
     w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
     options = []
     if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:
         options.append('imu.accel_scale=9.80665')
-        f_i = f_i * 9.80665
     spread = np.linalg.norm(w_i - np.median(w_i, axis=0), axis=1)
     if np.percentile(spread, 99.9) > MAX_RATE:
         options.append(f'imu.gyro_scale={RAD_PER_DEG!r}')

@@ -216,6 +216,9 @@ def test_units(tmp_path, capsys):
     told, _ = inspect(ros_bags.write(tmp_path / 'deg', drive(gyro=180 / math.pi)), capsys)
     assert 'IMU_UNITS' in codes(told)
     assert f'--set imu.gyro_scale={math.pi / 180!r}' in told['command']
+    told, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
+    assert told['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
+    assert 'IMU_UNITS: the gyro turns 2.' in text
     told, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
     assert 'GYRO_SIGN' in codes(told)
 
