@@ -18,7 +18,7 @@ import tempfile
 import time
 
 GOAL = {'sqlite3': 2.5, 'mcap': 2.0}
-ITERATE = '''
+ITERATE = """
 import sys, time
 from rosbags.rosbag2 import Reader
 began = time.perf_counter()
@@ -28,7 +28,7 @@ with Reader(sys.argv[1]) as reader:
     for connection, stamp, raw in reader.messages(connections=wanted):
         count += 1
 print(count, time.perf_counter() - began)
-'''
+"""
 
 
 def main() -> None:
@@ -52,7 +52,7 @@ def _bag(folder, storage, camera, hours):
     """Return a simulated bag, written unless it is there."""
     from odocal_ros.bagio.encode import camera as camera_topic
     from odocal_ros.bagio.write import drive_topics, write_bag
-    from odocal_ros.sim.scenarios import simulate, SimOptions
+    from odocal_ros.sim.scenarios import SimOptions, simulate
     path = folder / f'{hours:g}h_{storage}{"_camera" * camera}'
     if path.exists():
         return path

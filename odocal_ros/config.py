@@ -171,7 +171,7 @@ class VerdictConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputConfig:
-    directory: str = setting('', about="Where results go; empty: $ROS_HOME/odocal (~/.ros/odocal)"
+    directory: str = setting('', about='Where results go; empty: $ROS_HOME/odocal (~/.ros/odocal)'
                              '.')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')

@@ -9,8 +9,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from odocal_ros.samples import (
-    FixSamples, HeadingSamples, ImuSamples, join, no_fix, no_heading, no_imu, no_odometer,
-    no_velocity, OdometerForm, OdometerSamples, take, VelocitySamples)
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    join,
+    no_fix,
+    no_heading,
+    no_imu,
+    no_odometer,
+    no_velocity,
+    OdometerForm,
+    OdometerSamples,
+    take,
+    VelocitySamples,
+)
 
 EMPTY = {
     'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,

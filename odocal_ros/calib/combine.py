@@ -18,6 +18,8 @@ def combine_method(name, results, config) -> MethodResult:
         The method.
     results : list of MethodResult
         One a leg, at least one.
+    config : Config
+        Settings in force.
 
     Returns
     -------

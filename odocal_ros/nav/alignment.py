@@ -105,8 +105,9 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
 
     Returns
     -------
-    Level near the end of the standstill; an accelerometer bias tilts it by bias / g. The bias walks
-    while its mean is taken: by a third of its variance over the standstill from the last value.
+    Level near the end of the standstill; an accelerometer bias tilts it by bias / g. The bias
+    walks while its mean is taken: by a third of its variance over the standstill, from the last
+    value.
 
     """
     cut = min(EDGE, (span[1] - span[0]) / 4)

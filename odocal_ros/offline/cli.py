@@ -32,7 +32,7 @@ class _Usage(OdocalError):
 
 
 def _parser(names) -> argparse.ArgumentParser:
-    parser = _Parser(prog='odocal', description='Calibrate a vehicle\'s odometer against IMU '
+    parser = _Parser(prog='odocal', description="Calibrate a vehicle's odometer against IMU "
                      'and GNSS: scale factor and yaw mounting angle, with honest sigmas.')
     parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
@@ -48,6 +48,9 @@ def _parser(names) -> argparse.ArgumentParser:
 def main(argv=None) -> int:
     """Run a command line; return its exit code (design.md section 1)."""
     argv = sys.argv[1:] if argv is None else list(argv)
+    for stream in (sys.stdout, sys.stderr):      # a terminal without ± shows ? instead
+        if hasattr(stream, 'reconfigure'):
+            stream.reconfigure(errors='replace')
     try:
         parser = _parser({a for a in argv[:1] if a in COMMANDS})
         args = parser.parse_args(argv)

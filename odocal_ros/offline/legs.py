@@ -1,7 +1,7 @@
 """Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
 
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime, UTC
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -62,8 +62,8 @@ def _edge(text, whole):
     except ValueError:
         raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
                        'for seconds, A/B for dates') from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    since = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000, False
 
 
@@ -116,6 +116,8 @@ def find_legs(recorder, bag, asked, marks, config) -> list[tuple[int, int]]:
         Empty: marks if there are any, else one leg from standstill to standstill.
     marks : list of (start, stop)
         As the node marked them.
+    config : Config
+        What counts as a standstill, least distance.
 
     Raises
     ------

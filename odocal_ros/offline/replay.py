@@ -1,6 +1,6 @@
 """odocal replay: the node's pipeline over recorded bags."""
 
-from datetime import datetime, timezone
+from datetime import datetime, UTC
 import json
 from pathlib import Path
 import sys
@@ -45,12 +45,15 @@ def run(args) -> int:
     if (output / 'calibration.json').exists() and not args.force:
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
+    from odocal_ros.config import with_settings
     from odocal_ros.pipeline import combine
     legs, inputs = [], []
     for path in args.bags:
-        new, described = _legs_of(Path(path), args, asked, config)
+        new, described, frame = _legs_of(Path(path), args, asked, config)
         legs += new
         inputs.append(described)
+        if not config.frames.imu and frame:
+            config = with_settings(config, {'frames.imu': frame})
     calibration = combine(legs, config)
     return _report(calibration, config, inputs, output, args)
 
@@ -69,7 +72,7 @@ def _config(args):
 
 
 def _legs_of(path, args, asked, config):
-    """Return the results of a bag's legs and its entry for calibration.json."""
+    """Return the results of a bag's legs, its entry for calibration.json, the Imu's frame."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.leg import LegRecorder
     from odocal_ros.messages import make_reader
@@ -85,8 +88,7 @@ def _legs_of(path, args, asked, config):
         recorder = LegRecorder()
         with _progress(f'reading {bag.name}', args) as progress:
             bag.read(readers, recorder.feed, progress)
-        odometer = readers[topics['odometer']]
-        recorder.form = odometer.form
+        recorder.form = readers[topics['odometer']].form or recorder.form
         marks = [] if asked else marked_legs(bag)
         spans = find_legs(recorder, bag, asked, marks, config)
         notes = tuple(n for n in bag.notes if not isinstance(n, str))
@@ -95,7 +97,8 @@ def _legs_of(path, args, asked, config):
                 print(f'odocal: {note}', file=sys.stderr)
         results = _calibrated(recorder, spans, config, notes, bag.name, args)
         described = {'bag': bag.name, 'sha256': bag_sha256(bag), 'topics': topics}
-    return results, described
+        frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
+    return results, described, frame
 
 
 def _calibrated(recorder, spans, config, notes, name, args):
@@ -140,7 +143,7 @@ def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.output.files import as_json, write_results
     from odocal_ros.output.summary import screen
     from odocal_ros.reasons import Verdict
-    created = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    created = datetime.now(UTC).isoformat(timespec='seconds')
     written = write_results(calibration, config, output, inputs, created, force=args.force)
     if args.json:
         json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)

@@ -10,7 +10,7 @@ from odocal_ros.config import Config
 from odocal_ros.errors import BadUsage
 from odocal_ros.leg import LegRecorder
 from odocal_ros.offline.legs import find_legs, LegSpan, marked_legs, parse_leg
-from odocal_ros.sim.scenarios import simulate, SimOptions
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 S = 10**9
 
@@ -88,7 +88,7 @@ def recorded(drive):
 
 @pytest.fixture(scope='module')
 def out_and_back():
-    """A drive with a stop at the far end, an intermediate one."""
+    """Simulate a drive with a stop at the far end, an intermediate one."""
     return simulate(SimOptions(scenario='out_and_back', imu_rate=50.0, odometer_rate=20.0))
 
 
