@@ -19,7 +19,11 @@ MAY_USE = {'nav': {'nav'}, 'calib': {'nav', 'calib', 'leg', 'grades'}}
 NEVER = {'live': {'offline', 'sim'}, 'offline': {'live'}, 'sim': {'live', 'calib', 'pipeline'},
          'output': {'live', 'offline', 'bagio'}, 'bagio': {'live', 'offline', 'pipeline', 'calib'},
          'messages': {'live', 'offline', 'pipeline', 'nav', 'calib', 'sim', 'output'},
-         'pipeline': {'live', 'offline', 'bagio', 'output', 'messages', 'sim'}}
+         'pipeline': {'live', 'offline', 'bagio', 'output', 'messages', 'sim'},
+         'paper': {'live', 'offline', 'bagio', 'output', 'messages'},
+         'align': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'},
+         'leg_run': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper'},
+         'screen': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'}}
 
 
 def _modules():
