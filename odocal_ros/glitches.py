@@ -13,6 +13,7 @@ CLEAR = 20.0         # times the usual step from row to row
 CLOSE = 0.4          # s within which a glitch is over: longer, and motion itself may do it
 HOME = 0.5           # of the bound: nearer to the row before it, the glitch is over
 RARE = 0.002         # of the rows: more of them are no glitches
+ROLLS = 0.1          # of the top speed: slower on the mean, a vehicle may as well stand
 MOST = 2000          # bounds looked at
 
 
@@ -88,8 +89,9 @@ def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
     same = (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     begin, end = t[edges[::2]], t[edges[1::2]]
-    rolled = np.abs(travel.at(end) - travel.at(begin)) > 3 * travel.quantum
-    held = np.flatnonzero((end - begin > limit) & rolled)
+    speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
+    rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)
+    held = np.flatnonzero((end - begin > limit) & (rolled > ROLLS * np.percentile(speed, 95)))
     if not len(held):
         return ()
     worst = held[np.argmax((end - begin)[held])]

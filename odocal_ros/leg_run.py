@@ -267,9 +267,12 @@ class LegRun:
 
     def _with_slow_errors(self, chord, f, t, residual, covariance, drift_n, factor):
         """Return the chord with marks no better than the slow part of the fix errors."""
+        if not np.isnan(self.config.gnss.correlation_time):
+            return chord        # told, not judged
         along = (chord.M @ f)[:2] / np.hypot(*(chord.M @ f)[:2])
         stated = np.einsum('nij,i,j->n', covariance[:, :2, :2], along, along)
-        slow = slow_variance(t, residual[:, :2] @ along, stated,
+        way = (self.track.at(t) @ f)[:, :2] @ along
+        slow = slow_variance(t, residual[:, :2] @ along, way, stated,
                              np.linalg.norm(along @ drift_n[:2])) / factor**2
         up_ratio = float(np.median(covariance[:, 2, 2] / stated))
         return replace(chord, start=chord.start.at_least(slow, up_ratio),

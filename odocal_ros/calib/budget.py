@@ -139,7 +139,8 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
         'fix_start': fix_scale[:, None] * _root(start.covariance_n),
         'fix_end': fix_scale[:, None] * _root(end.covariance_n),
         'initial_heading': np.cross([0.0, 0.0, alignment.heading_sigma], D[-1])[:, None],
-        'initial_level': np.stack([np.cross(axis, D[-1]) for axis in np.eye(3)[:2]], -1)
+        # about b's own axes: an accelerometer bias tilts the level of every leg alike
+        'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_nb[0].T[:2]], -1)
         * alignment.level_sigma,
         **drift_sources(t, D, C_nb, alignment),
         'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
@@ -152,7 +153,7 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
         'projection': np.zeros((3, 1)),
     }
     gradient = parameter_gradient(f) @ np.linalg.inv(M)
-    shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height'} | (
+    shared = {'fix_latency', 'antenna_lever_arm', 'odometer_delay', 'height', 'initial_level'} | (
         {'initial_heading'} if alignment.heading_shared else set())
     sources = [Source(name, gradient @ e, name in shared) for name, e in chord.items()]
     height = start.covariance_n[2, 2] + end.covariance_n[2, 2]

@@ -73,18 +73,19 @@ def fix_noise_factor(residual, covariance_n, drift):
     return np.where(factors > 1.25, factors, 1.0)
 
 
-def slow_variance(t, along, variance, drift):
+def slow_variance(t, along, way, variance, drift):
     """
     Return the variance of fix errors that stay alike over SLOW seconds, m^2.
 
     Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
     the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
-    chord, since gyros bend a track across it.
+    chord, since gyros bend a track across it; less a straight line over the way, which is what
+    the errors of the two marks themselves make.
 
     Parameters
     ----------
-    t, along : (n,) arrays
-        Times, s, and corrected track less fixes along the chord, m.
+    t, along, way : (n,) arrays
+        Times, s, corrected track less fixes along the chord, m, and how far along it, m.
     variance : (n,) array
         As stated, m^2.
     drift : float
@@ -96,12 +97,15 @@ def slow_variance(t, along, variance, drift):
     full = count >= max(5, 0.5 * count.max())
     if full.sum() < 5:
         return 0.0
-    means = np.bincount(window, along)[full] / count[full]
+    means, places = (np.bincount(window, x)[full] / count[full] for x in (along, way))
+    means, places = means - means.mean(), places - places.mean()
+    means = means - places * (places @ means) / max(places @ places, 1e-9)
+    free = full.sum() - 2
     jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
     white = min(jump, np.median(variance)) / np.median(count[full])
-    seen = (means**2).mean() - drift**2
+    seen = (means**2).sum() / free - drift**2
     # within three sigmas of the mean square of so many windows, white errors alone may do it
-    clear = seen > white * (1 + 3 * np.sqrt(2 / full.sum()))
+    clear = seen > white * (1 + 3 * np.sqrt(2 / free))
     return float(seen - white) if clear else 0.0
 
 
