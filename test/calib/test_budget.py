@@ -1,0 +1,283 @@
+"""Every source of the budget against what the same error does to the real dead reckoning."""
+
+from dataclasses import replace
+
+from drives import changed, drive, settings, two_point
+import numpy as np
+import pytest
+
+from odocal_ros.calib.budget import budget, drift_sources, parameter_gradient, PARAMETERS
+from odocal_ros.calib.marks import MarkFix
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b, mounting_from_forward
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.rotations import exp_so3, matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from odocal_ros.nav.strapdown import attitude
+
+K, YAW, PITCH = 0.02, 0.05, -0.03
+F = K * forward_b(YAW, PITCH)
+EARTH = np.zeros(3)      # its turn is left out of the budget, which says so
+
+
+class Reckoner:
+    """A leg of 300 s with turns and a hill, dead reckoned by the real thing."""
+
+    def __init__(self):
+        self.t = np.arange(0.0, 300.0, 0.05)
+        speed = 12.0 * np.clip(self.t / 20, 0, 1) * np.clip((300 - self.t) / 20, 0, 1)
+        self.s = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.05)]) / K
+        w = np.zeros((len(self.t), 3))
+        for at, turn in ((80, 1.2), (150, -0.7), (220, 0.9)):
+            w[:, 2] += turn / 8 * ((self.t > at) & (self.t < at + 8))
+        w[:, 1] += 0.002 * np.sin(self.t / 30)
+        self.w = w
+        self.C0 = matrix_from_rpy([0.02, -0.01, 0.7])
+
+    def track(self, phi_n=(0, 0, 0), w_error=0.0, late=0.0):
+        """Return the track with an attitude error, gyro errors, an odometer that is late."""
+        q = quat_from_matrix(exp_so3(-np.asarray(phi_n, float)) @ self.C0)
+        t, q_nb = attitude(self.t, self.w + w_error, q, EARTH)
+        return dead_reckon(t, q_nb, Travel(self.t + late, self.s, 0.0))
+
+    def solve(self, chord_n, **errors):
+        """Return (ln K, yaw, pitch) that a chord and an erring track give."""
+        f = np.linalg.solve(self.track(**errors).P[-1], chord_n)
+        return np.array([np.log(np.linalg.norm(f)), *mounting_from_forward(f)])
+
+
+@pytest.fixture(scope='module')
+def leg():
+    return Reckoner()
+
+
+@pytest.fixture(scope='module')
+def truth(leg):
+    """Return track, true chord and the parameters it gives."""
+    track = leg.track()
+    chord = track.P[-1] @ F
+    return track, chord, leg.solve(chord)
+
+
+def alignment(**figures):
+    nothing = {'level_sigma': 0.0, 'heading_sigma': 0.0, 'gyro_bias_sigma': np.zeros(3),
+               'gyro_noise': 0.0, 'gyro_bias_walk': 0.0}
+    return Alignment(t=0.0, C_nb=np.eye(3), gyro_bias=np.zeros(3), heading_source='heading_topic',
+                     heading_shared=True, **(nothing | figures))
+
+
+def sources(track, *, standing=True, cov=0.0, fix_scale=(1.0, 1.0, 1.0), more=None, **figures):
+    options = {'quantum': 0.0, 'time_sigma': 0.0, 'velocity_change': np.zeros(3),
+               'lever_arm_sigma': 0.0, 'odometer_time_sigma': 0.0} | (more or {})
+    marks = [MarkFix(t, np.zeros(3), np.eye(3) * cov, standing, 9, 0)
+             for t in (track.t[0], track.t[-1])]
+    found = budget(F, track.P[-1], *marks, track.t, track.P @ F, matrix_from_quat(track.q_nb),
+                   alignment(**figures), fix_scale=np.array(fix_scale), **options)
+    return {s.name: s for s in found}
+
+
+def test_the_reckoning_gives_the_truth_back(truth):
+    np.testing.assert_allclose(truth[2], [np.log(K), YAW, PITCH], atol=1e-12)
+
+
+def test_the_gradient_is_the_derivative():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        f = K * forward_b(*rng.uniform(-1.0, 1.0, 2))
+        columns = [(parameters(f + d) - parameters(f - d)) / (2e-6 * K)
+                   for d in np.eye(3) * 1e-6 * K]
+        # central differences: error of second order, 1e-12 of the third derivative
+        np.testing.assert_allclose(parameter_gradient(f), np.array(columns).T, rtol=1e-6,
+                                   atol=1e-6 / K)
+
+
+def parameters(f):
+    return np.array([np.log(np.linalg.norm(f)), *mounting_from_forward(f)])
+
+
+SMALL = 1e-4         # errors small enough that what is of second order is below a part in 1e3
+
+
+def differ(leg, truth, plus, minus=None):
+    """Return half the difference of what an error and its opposite do."""
+    _, chord, _ = truth
+    return (leg.solve(chord, **plus) - leg.solve(chord, **minus)) / 2
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+def test_initial_level(leg, truth, axis):
+    column = sources(truth[0], level_sigma=SMALL)['initial_level'].effects[:, axis]
+    phi = leg.C0[:, axis] * SMALL
+    np.testing.assert_allclose(differ(leg, truth, {'phi_n': phi}, {'phi_n': -phi}), column,
+                               atol=1e-3 * SMALL)
+
+
+def test_initial_heading(leg, truth):
+    column = sources(truth[0], heading_sigma=SMALL)['initial_heading'].effects[:, 0]
+    phi = np.array([0.0, 0.0, SMALL])
+    np.testing.assert_allclose(differ(leg, truth, {'phi_n': phi}, {'phi_n': -phi}), column,
+                               atol=1e-3 * SMALL)
+    # a heading error is a yaw error, whatever the path; ln K has but what bends of the path leave
+    assert abs(column[0]) < 1e-3 * SMALL
+    assert abs(column[1]) == pytest.approx(SMALL, rel=0.01)
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_gyro_bias(leg, truth, axis):
+    bias = np.zeros(3)
+    bias[axis] = 1e-6
+    column = sources(truth[0], gyro_bias_sigma=bias)[f'gyro_bias_{"xyz"[axis]}'].effects[:, 0]
+    real = differ(leg, truth, {'w_error': bias}, {'w_error': -bias})
+    # the sign of a column is free: only products of columns enter; but all rows share it
+    real = real * np.sign(real @ column)
+    np.testing.assert_allclose(real, column, atol=2e-3 * np.abs(column).max())
+
+
+@pytest.mark.parametrize(('name', 'mark', 'sign'), [('fix_start', 0, -1), ('fix_end', 1, 1)])
+def test_fix_ends(leg, truth, name, mark, sign):
+    source = sources(truth[0], cov=0.04, fix_scale=(2.0, 2.0, 3.0))[name]
+    _, chord, _ = truth
+    real = np.stack([(leg.solve(chord + sign * e) - leg.solve(chord - sign * e)) / 2
+                     for e in np.diag([0.4, 0.4, 0.6])], -1)
+    # columns may be turned among themselves: compare covariances
+    np.testing.assert_allclose(source.effects @ source.effects.T, real @ real.T,
+                               atol=1e-3 * np.abs(real @ real.T).max())
+    assert not source.shared
+
+
+def test_fix_latency_acts_by_the_change_of_velocity(leg, truth):
+    change = np.array([3.0, -5.0, 0.2])
+    column = sources(truth[0], more={'time_sigma': 0.05, 'velocity_change': change})[
+        'fix_latency'].effects[:, 0]
+    _, chord, _ = truth
+    real = (leg.solve(chord + change * 0.05) - leg.solve(chord - change * 0.05)) / 2
+    np.testing.assert_allclose(column, real, atol=1e-6)
+
+
+def test_a_late_odometer(leg, truth):
+    column = sources(truth[0], more={'odometer_time_sigma': 0.1})['odometer_delay'].effects[:, 0]
+    real = differ(leg, truth, {'late': 0.1}, {'late': -0.1})
+    real = real * np.sign(real @ column)
+    assert np.abs(column).max() > 1e-5       # turns at speed make it matter
+    np.testing.assert_allclose(real, column, atol=0.02 * np.abs(column).max())
+
+
+def test_antenna_lever_arm(leg, truth):
+    source = sources(truth[0], more={'lever_arm_sigma': 0.1})['antenna_lever_arm']
+    track, chord, _ = truth
+    C = matrix_from_quat(track.q_nb)
+    real = []
+    for arm in np.eye(3) * 0.1:
+        e = (C[-1] - C[0]) @ arm
+        real.append((leg.solve(chord + e) - leg.solve(chord - e)) / 2)
+    real = np.array(real).T
+    np.testing.assert_allclose(source.effects @ source.effects.T, real @ real.T,
+                               atol=1e-3 * np.abs(real @ real.T).max())
+    assert source.shared
+
+
+def test_quantisation_is_that_of_two_roundings(truth):
+    track, chord, _ = truth
+    column = sources(track, more={'quantum': 0.02})['quantisation'].effects[:, 0]
+    rng = np.random.default_rng(2)
+    rounding = rng.uniform(-0.01, 0.01, (20000, 2))
+    sigma = (rounding[:, 0] - rounding[:, 1]).std() / np.linalg.norm(chord)
+    assert column[0] == pytest.approx(sigma, rel=0.03)       # 20000 draws: 0.5 %, and the bow
+
+
+def test_height_makes_the_earth_larger(truth):
+    track, _, _ = truth
+    found = sources(track, cov=100.0)['height']
+    assert found.effects[0, 0] == pytest.approx(10.0 / 6378137, rel=1e-3)
+    assert found.shared
+    assert sources(track)['projection'].effects.any() == np.False_
+
+
+@pytest.mark.parametrize('name', ['gyro_noise', 'gyro_bias_walk'])
+def test_gyro_noise_and_walk_against_monte_carlo(leg, truth, name):
+    """
+    200 runs: a variance within 5 * sqrt(2 / 200) = 50 %; sigmas within 0.71 to 1.22.
+
+    The walk is drawn in b and the budget turns it with n: alike in law for equal axes.
+    """
+    density = {'gyro_noise': 1e-4, 'gyro_bias_walk': 2e-6}[name]
+    source = sources(truth[0], **{name: density})[name]
+    rng, n, dt = np.random.default_rng(3), len(leg.t), 0.05
+    _, chord, true = truth
+    errors = []
+    for _ in range(200):
+        white = rng.standard_normal((n, 3))
+        w = white * density / np.sqrt(dt) if name == 'gyro_noise' else np.cumsum(
+            white * density * np.sqrt(dt), axis=0)
+        errors.append(leg.solve(chord, w_error=w) - true)
+    ratio = np.std(errors, axis=0) / np.sqrt((source.effects**2).sum(axis=1))
+    assert ((ratio[1:] > 0.71) & (ratio[1:] < 1.22)).all(), ratio
+    # ln K sees only what of it lies along the chord, and the turn of the walk in b shows there
+    assert 0.6 < ratio[0] < 1.35, ratio
+
+
+def test_gyros_err_from_the_alignment_on(leg, truth):
+    """A minute of standing before the leg adds its drift to all of the way."""
+    track, _, _ = truth
+    t = np.concatenate([np.arange(-60.0, 0.0, 0.05), track.t])
+    D = np.concatenate([np.zeros((1200, 3)), track.P @ F])
+    C = np.concatenate([np.tile(leg.C0, (1200, 1, 1)), matrix_from_quat(track.q_nb)])
+    figures = alignment(gyro_bias_sigma=np.full(3, 1e-6))
+    whole = drift_sources(t, D, C, figures)['gyro_bias_z']
+    part = drift_sources(t[1200:], D[1200:], C[1200:], figures)['gyro_bias_z']
+    turned = np.cross(leg.C0[:, 2] * 60.0 * 1e-6, D[-1])
+    np.testing.assert_allclose(whole[:, 0] - part[:, 0], turned, rtol=2e-3, atol=1e-6)
+
+
+class TestWhole:
+    """The budget of calibrate() against the same errors put into a whole simulated leg."""
+
+    @pytest.fixture
+    def made(self):
+        return drive(scenario='town', imu_grade='perfect', fix_sigma=0.0, duration=200.0, seed=3,
+                     odometer='angle', antenna_lever_arm=(1.0, 0.3, 1.5))
+
+    def solved(self, leg, config, **more):
+        e = two_point(leg, config, **more).estimates
+        return np.array([np.log(e[p].value) if p == 'scale_factor' else e[p].value
+                         for p in PARAMETERS])
+
+    def test_the_parts_are_all_named_and_make_the_sigma(self, made):
+        result = two_point(made.leg(), settings(made))
+        total = sum(s.effects @ s.effects.T for s in result.sources)
+        for i, p in enumerate(PARAMETERS):
+            e = result.estimates[p]
+            scale = e.value if p == 'scale_factor' else 1.0
+            assert e.sigma / scale == pytest.approx(np.sqrt(total[i, i]))
+            by_name = [row[p] for row in result.details['budget'].values()]
+            assert np.linalg.norm(by_name) == pytest.approx(e.sigma)
+        assert {s.name for s in result.sources if s.shared} == {
+            'initial_heading', 'initial_level', 'fix_latency', 'antenna_lever_arm',
+            'odometer_delay', 'height'}
+
+    def test_a_late_odometer_in_a_whole_leg(self, made):
+        config = settings(made, odometer__time_sigma=0.05)
+        source = next(s for s in two_point(made.leg(), config).sources
+                      if s.name == 'odometer_delay')
+        late = replace(made.leg(), odometer=changed(
+            made.odometer, stamp_ns=lambda a: a + 50_000_000))
+        early = replace(made.leg(), odometer=changed(
+            made.odometer, stamp_ns=lambda a: a - 50_000_000))
+        real = (self.solved(late, config) - self.solved(early, config)) / 2
+        column = source.effects[:, 0]
+        np.testing.assert_allclose(real * np.sign(real @ column), column,
+                                   atol=0.05 * np.abs(column).max())
+
+    @pytest.mark.parametrize('axis', [0, 1])
+    def test_a_wrong_antenna_in_a_whole_leg(self, made, axis):
+        config = settings(made, gnss__lever_arm_sigma=0.2)
+        source = next(s for s in two_point(made.leg(), config).sources
+                      if s.name == 'antenna_lever_arm')
+        arms = []
+        for sign in (1, -1):
+            arm = list(made.options.antenna_lever_arm)
+            arm[axis] += sign * 0.2
+            arms.append(self.solved(made.leg(), settings(made, gnss__lever_arm=tuple(arm))))
+        real, column = (arms[1] - arms[0]) / 2, source.effects[:, axis]
+        # the arm is given in v and the budget has it in b: a mounting of 1 deg between them
+        np.testing.assert_allclose(real * np.sign(real @ column), column,
+                                   atol=0.03 * np.abs(source.effects).max())
