@@ -1,0 +1,170 @@
+"""Several legs: own errors average down, shared ones do not, disagreement widens."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.combine import combine_method
+from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
+from odocal_ros.combination import combine
+from odocal_ros.config import Config, with_settings
+from odocal_ros.reasons import Code, Reason
+
+CONFIG = Config()
+SCALE, YAW, PITCH = PARAMETERS
+OWN, HEADING = 1e-4, 1e-3       # of ln K and yaw; of yaw alone
+
+
+def method(scale=0.02, yaw=0.01, own=OWN, heading=HEADING, refused=(), reasons=()):
+    sources = (Source('fix_start', np.diag([own, own, 2 * own])),
+               Source('initial_heading', np.array([[0.0], [heading], [0.0]]), shared=True),
+               Source('initial_level', np.array([[0.0], [0.0], [5e-4]]), shared=True))
+    sigma = [own, np.hypot(own, heading), np.hypot(2 * own, 5e-4)]
+    estimates = {SCALE: Estimate(scale, scale * sigma[0], 'm/pulse'),
+                 YAW: Estimate(yaw, sigma[1], 'rad'), PITCH: Estimate(0.007, sigma[2], 'rad'),
+                 'scale_ratio': Estimate(scale / 0.019, scale / 0.019 * sigma[0], '1')}
+    for name in refused:
+        estimates[name] = Estimate(None, None, estimates[name].unit)
+    return MethodResult('two_point', tuple(reasons), estimates, PARAMETERS, sources)
+
+
+def leg(result, *codes):
+    return LegResult(start_ns=1, stop_ns=2, distance=1e3, duration=100.0, imu_samples=1, pulses=1,
+                     fixes=1, rejected_fixes=0, reasons=tuple(Reason(c, c.name) for c in codes),
+                     methods={'two_point': result} if result else {}, C_bi=np.eye(3))
+
+
+def test_one_leg_is_itself():
+    one = method()
+    assert combine_method('two_point', [one], CONFIG) is one
+
+
+@pytest.mark.parametrize('n', [2, 5, 16])
+def test_own_errors_average_down_and_shared_ones_stay(n):
+    e = combine_method('two_point', [method()] * n, CONFIG).estimates
+    assert e[SCALE].value == pytest.approx(0.02)
+    assert e[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(n))
+    assert e[YAW].sigma == pytest.approx(np.hypot(OWN / np.sqrt(n), HEADING))
+    assert e[PITCH].sigma == pytest.approx(np.hypot(2 * OWN / np.sqrt(n), 5e-4))
+    assert e['scale_ratio'].value == pytest.approx(0.02 / 0.019)
+    assert e['scale_ratio'].sigma / e['scale_ratio'].value == pytest.approx(OWN / np.sqrt(n))
+
+
+def test_better_legs_weigh_more():
+    e = combine_method('two_point', [method(yaw=0.010), method(yaw=0.0102, own=OWN / 3)],
+                       CONFIG).estimates[YAW]
+    assert e.value == pytest.approx(0.0102 * 0.9 + 0.010 * 0.1)
+
+
+def test_a_shared_error_of_opposite_effect_cancels():
+    """An antenna that is off by as much on the way there and back leaves the mean alone."""
+    def with_antenna(sign):
+        one = method(heading=0.0)
+        arm = Source('antenna_lever_arm', np.array([[sign * 1e-2], [0.0], [0.0]]), shared=True)
+        return replace(one, sources=(*one.sources, arm))
+    there_and_back = combine_method('two_point', [with_antenna(1), with_antenna(-1)], CONFIG)
+    twice = combine_method('two_point', [with_antenna(1), with_antenna(1)], CONFIG)
+    assert there_and_back.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
+    assert twice.estimates[SCALE].sigma / 0.02 == pytest.approx(np.hypot(OWN / np.sqrt(2), 1e-2))
+
+
+def test_a_spread_beyond_the_sigmas_is_named_and_widens():
+    legs = [method(scale=0.02 * (1 + d)) for d in (-1e-3, 0.0, 1e-3)]
+    whole = combine_method('two_point', legs, CONFIG)
+    # chi-square 200 on two degrees: ten times the spread that the sigmas allow
+    assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(10 * OWN / np.sqrt(3), rel=1e-3)
+    assert [r.code for r in whole.reasons] == [Code.LEGS_DISAGREE]
+    assert whole.reasons[0].text == ('scale_factor differs between the 3 legs 10.0 times more '
+                                     'than their sigmas allow')
+
+
+def test_a_spread_that_the_shared_error_explains_is_no_disagreement():
+    """The heading may act differently in two legs: what differs of it is allowed for."""
+    def heading(value, yaw):
+        one = method(yaw=yaw)
+        return replace(one, sources=(one.sources[0], replace(
+            one.sources[1], effects=np.array([[0.0], [value], [0.0]])), one.sources[2]))
+    whole = combine_method('two_point', [heading(1e-3, 0.011), heading(-1e-3, 0.009)], CONFIG)
+    assert whole.reasons == ()
+    # and legs drawn by their own sigmas disagree in a twentieth of cases
+    rng, named = np.random.default_rng(5), 0
+    for _ in range(400):
+        legs = [method(scale=0.02 * np.exp(OWN * z)) for z in rng.standard_normal(4)]
+        named += any(r.text.startswith('scale') for r in
+                     combine_method('two_point', legs, CONFIG).reasons)
+    assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and the approximation's 1 %
+
+
+def test_the_combined_sigma_holds_for_drawn_legs():
+    """1000 draws of four legs with a common heading error: variance within 5 * sqrt(2/1000)."""
+    rng, z = np.random.default_rng(6), []
+    for _ in range(1000):
+        common = HEADING * rng.standard_normal()
+        legs = [method(yaw=0.01 + common + OWN * x) for x in rng.standard_normal(4)]
+        e = combine_method('two_point', legs, CONFIG).estimates[YAW]
+        z.append((e.value - 0.01) / e.sigma)
+    assert 0.88 < np.std(z) < 1.11
+
+
+def test_a_leg_without_a_yaw_still_gives_its_scale():
+    whole = combine_method('two_point', [method(refused=[YAW]), method()], CONFIG)
+    assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
+    assert whole.estimates[YAW].sigma == pytest.approx(np.hypot(OWN, HEADING))
+    nobody = combine_method('two_point', [method(refused=[YAW])] * 2, CONFIG)
+    assert nobody.estimates[YAW].value is None
+    assert nobody.estimates[SCALE].value is not None
+
+
+def test_the_combined_sources_make_the_combined_sigma():
+    whole = combine_method('two_point', [method(), method(own=2 * OWN)], CONFIG)
+    total = sum(s.effects @ s.effects.T for s in whole.sources)
+    for i, (name, scale) in enumerate(((SCALE, 0.02), (YAW, 1.0), (PITCH, 1.0))):
+        assert np.sqrt(total[i, i]) * scale == pytest.approx(whole.estimates[name].sigma)
+    assert {s.name for s in whole.sources if s.shared} == {'initial_heading', 'initial_level'}
+
+
+def test_a_rejected_leg_is_left_out_and_named():
+    bad = leg(method(scale=0.05), Code.IMU_GAP)
+    whole = combine([leg(method()), bad, leg(method())], CONFIG)
+    assert whole.estimates[SCALE].value == pytest.approx(0.02)
+    assert whole.verdict.value == 'caution'
+    assert [r.text for r in whole.reasons if r.code is Code.LEG_REJECTED] == [
+        'leg 2: rejected and not used: IMU_GAP']
+    assert len(whole.legs) == 3
+
+
+def test_when_all_are_rejected_the_values_are_kept_and_the_verdict_stands():
+    whole = combine([leg(method(), Code.IMU_GAP), leg(method(), Code.TRACK_MISMATCH)], CONFIG)
+    assert whole.verdict.value == 'rejected'
+    assert whole.estimates[SCALE].value == pytest.approx(0.02)
+    assert {Code.IMU_GAP, Code.TRACK_MISMATCH} <= {r.code for r in whole.reasons}
+
+
+def test_legs_without_any_method_are_rejected_with_a_reason():
+    whole = combine([leg(None)], CONFIG)
+    assert whole.verdict.value == 'rejected'
+    assert Code.NO_METHOD in {r.code for r in whole.reasons}
+    assert whole.estimates == {}
+    assert whole.imu_rotation_rpy is None
+
+
+def test_too_few_legs_are_a_caution():
+    config = with_settings(CONFIG, {'verdict.min_legs': 3})
+    whole = combine([leg(method())] * 2, config)
+    assert [r.text for r in whole.reasons] == ['2 good legs of 3']
+    assert whole.verdict.value == 'caution'
+    assert combine([leg(method())] * 3, config).reasons == ()
+
+
+def test_the_limits_are_asked_of_the_whole_not_of_each_leg():
+    wide = method(own=1.5e-3, heading=0.0, reasons=[Reason(Code.SCALE_SIGMA_TOO_LARGE, 'leg')])
+    assert combine([leg(wide)], CONFIG).verdict.value == 'caution'
+    assert combine([leg(wide)] * 4, CONFIG).reasons == ()
+
+
+def test_the_rotation_is_the_mounting_on_top_of_the_nominal_one():
+    turned = replace(leg(method()), C_bi=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
+    rpy = combine([turned], CONFIG).imu_rotation_rpy
+    assert rpy[2] == pytest.approx(np.pi / 2 + 0.01)

@@ -1,0 +1,181 @@
+"""What values against limits say, and what an Imu tells of its own units and axes."""
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.check import (
+    against_travel,
+    fix_noise_factor,
+    gyro_against_course,
+    mismatch,
+    pieces,
+    slow_variance,
+    track_check,
+)
+from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.sanity import imu_sanity
+from odocal_ros.config import Config, with_settings
+from odocal_ros.reasons import Code
+
+CONFIG = Config()
+
+
+def estimates(scale=0.02, relative=1e-4, yaw=0.01, yaw_sigma=1e-3):
+    return {'scale_factor': Estimate(scale, scale and scale * relative, 'm/pulse'),
+            'yaw_mounting_angle': Estimate(yaw, yaw_sigma, 'rad')}
+
+
+def codes(reasons):
+    return [r.code for r in reasons]
+
+
+def test_good_values_say_nothing():
+    assert judge(estimates(), 0.021, CONFIG) == ()
+    assert judge(estimates(), 0.0, CONFIG) == ()
+
+
+@pytest.mark.parametrize(('values', 'nominal', 'code', 'text'), [
+    (estimates(relative=2e-3), 0.0, Code.SCALE_SIGMA_TOO_LARGE, '2000 ppm, 1000 ppm asked'),
+    (estimates(yaw_sigma=0.02), 0.0, Code.YAW_SIGMA_TOO_LARGE, '1.146 deg, 0.498 deg asked'),
+    (estimates(scale=0.03), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '+50.0 % from the nominal 0.02'),
+    (estimates(scale=0.01), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '-50.0 %')])
+def test_each_limit_has_its_sentence(values, nominal, code, text):
+    reasons = judge(values, nominal, CONFIG)
+    assert codes(reasons) == [code]
+    assert text in reasons[0].text
+    assert code.gravity.value == 'caution'
+
+
+def test_what_is_not_determined_is_not_judged():
+    assert judge({'scale_factor': Estimate(None, None, 'm/pulse'),
+                  'yaw_mounting_angle': Estimate(None, None, 'rad')}, 0.02, CONFIG) == ()
+
+
+def test_the_nominal_scale_is_the_first_that_is_known():
+    wheel = with_settings(CONFIG, {'wheels.radius': 0.3, 'wheels.pulses_per_revolution': 100.0})
+    both = with_settings(wheel, {'odometer.nominal_scale': 0.5})
+    assert nominal_scale(both, 'm/pulse') == 0.5
+    assert nominal_scale(wheel, 'm/pulse') == pytest.approx(2 * np.pi * 0.3 / 100)
+    assert nominal_scale(wheel, 'm/rad') == 0.3
+    assert nominal_scale(CONFIG, '1') == 1.0
+    assert nominal_scale(CONFIG, 'm/pulse') == 0.0
+
+
+class TestImu:
+    """Gravity and turn rates tell units and axes."""
+
+    @staticmethod
+    def say(up, size=9.81, fast=0.1, C_bi=None):
+        rng = np.random.default_rng(1)
+        f = np.tile(np.asarray(up, float) * size, (2000, 1)) + 0.02 * rng.standard_normal(
+            (2000, 3)) * size / 9.81
+        w = 0.002 * rng.standard_normal((2000, 3))
+        w[500:520, 2] = fast
+        return imu_sanity(f, w, np.eye(3) if C_bi is None else C_bi)
+
+    def test_a_sound_imu_says_nothing(self):
+        assert self.say([0, 0, 1]) == ((), False)
+        assert self.say([np.sin(0.2), 0, np.cos(0.2)]) == ((), False)      # parked on a hill
+
+    def test_g_is_known_and_told_the_factor(self):
+        reasons, _ = self.say([0, 0, 1], size=1.0)
+        assert codes(reasons) == [Code.IMU_UNITS]
+        assert 'as g would: set imu.accel_scale to 9.80665' in reasons[0].text
+        reasons, _ = self.say([0, 0, 1], size=0.5)
+        assert 'a gravity of 0.5 m/s^2 instead of 9.8' in reasons[0].text
+
+    def test_deg_per_second_is_known_by_its_speed(self):
+        reasons, _ = self.say([0, 0, 1], fast=20.0)
+        assert codes(reasons) == [Code.IMU_UNITS]
+        assert '0.017453292519943295' in reasons[0].text
+
+    def test_z_down_is_turned_over(self):
+        reasons, turned = self.say([0, 0, -1])
+        assert codes(reasons) == [Code.IMU_LOOKS_Z_DOWN]
+        assert turned
+        # not where a rotation was configured: then the configuration is wrong
+        reasons, turned = self.say([0, 0, -1], C_bi=np.diag([1.0, -1.0, -1.0]))
+        assert codes(reasons) == [Code.IMU_AXES]
+        assert not turned
+
+    @pytest.mark.parametrize(('up', 'name'), [([1, 0, 0], '+x'), ([0, -1, 0], '-y')])
+    def test_a_sideways_imu_is_named(self, up, name):
+        reasons, turned = self.say(up)
+        assert codes(reasons) == [Code.IMU_AXES]
+        assert f'gravity shows on {name}' in reasons[0].text
+        assert not turned
+
+    def test_an_imu_that_shows_nothing_is_no_crash(self):
+        reasons, turned = imu_sanity(np.zeros((50, 3)), np.zeros((50, 3)), np.eye(3))
+        assert codes(reasons) == [Code.IMU_UNITS]
+        assert not turned
+
+
+class TestCheck:
+    """The corrected track against the fixes."""
+
+    def test_criteria(self):
+        check = track_check(np.array([[3.0, 4.0, 9.0], [0.0, 0.0, 9.0], [0.0, -1.0, 9.0]]), 50.0)
+        assert (check.max, check.end, check.mean) == (5.0, 1.0, 2.0)
+        assert check.rms == pytest.approx(np.sqrt(26 / 3))
+        assert check.percent_of_distance == 2.0
+
+    @pytest.mark.parametrize('true', [0.5, 1.0, 3.0])
+    def test_the_noise_factor_is_what_residuals_show(self, true):
+        rng = np.random.default_rng(2)
+        residual = true * rng.standard_normal((3000, 3)) * [1.0, 1.0, 2.0]
+        stated = np.tile(np.diag([1.0, 1.0, 4.0]), (3000, 1, 1))
+        factor = fix_noise_factor(residual, stated, 0.0)
+        # medians of 3000: 2 to 3 %; below 1.25 the stated sigmas stand
+        np.testing.assert_allclose(factor, max(true, 1.0), rtol=0.1)
+        assert fix_noise_factor(residual, stated, 10.0).max() == 1.0
+        residual[:, 2] = np.nan
+        assert np.isfinite(fix_noise_factor(residual, stated, 0.0)).all()
+
+    def test_slow_errors_are_seen_beside_white_ones(self):
+        rng = np.random.default_rng(3)
+        t = np.arange(0.0, 600.0, 0.2)
+        white, stated = rng.standard_normal(len(t)), np.ones(len(t))
+        assert slow_variance(t, white, 10 * t, stated, 0.0) == 0.0
+        slow = np.repeat(rng.standard_normal(20), 150) * 0.4
+        # 20 draws of a variance, of which a line takes two: within five sigmas of sqrt(2 / 18)
+        found = slow_variance(t, white + slow, 10 * t, stated, 0.0)
+        assert 0.16 / 4 < found < 0.16 * 2.7
+        assert slow_variance(t, white + slow, 10 * t, stated, 2.0) == 0.0     # gyros explain it
+        # what the marks' own errors make, a line over the way, is none
+        assert slow_variance(t, white + 3 + 0.001 * t, 10 * t, stated, 0.0) == 0.0
+        assert slow_variance(t[:300], white[:300], t[:300], stated[:300], 0.0) == 0.0
+
+    def test_mismatch_is_beyond_noise_drift_and_slip(self):
+        check = track_check(np.full((10, 3), 10.0), 1000.0)
+        assert codes(mismatch(check, 1.5, 0.0, 1000.0)) == [Code.TRACK_MISMATCH]
+        assert mismatch(check, 1.5, 5.0, 1000.0) == ()
+        assert mismatch(check, 1.5, 0.0, 5000.0) == ()
+
+    @pytest.mark.parametrize(('factor', 'code', 'text'), [
+        (1.0, None, ''), (-1.0, Code.GYRO_SIGN, 'wrong sign'),
+        (57.3, Code.IMU_UNITS, 'set imu.gyro_scale to 0.017453292519943295'),
+        (1 / 57.3, None, ''), (0.3, Code.IMU_UNITS, 'imu.gyro_scale wants 3.3')])
+    def test_turns_by_gyro_and_by_fixes(self, factor, code, text):
+        course = np.cumsum([0.0, 1.2, -0.9, 1.0, 0.7, -1.3])
+        reasons = gyro_against_course(factor * course, np.angle(np.exp(1j * course)))
+        if code is None and factor != 1.0:
+            code, text = Code.IMU_UNITS, 'imu.gyro_scale wants 57.3'
+        assert codes(reasons) == ([code] if code else [])
+        assert not code or text in reasons[0].text
+
+    def test_reversing_with_rising_counts_is_seen(self):
+        course = np.array([0.1, 0.0, 0.1, 0.0, 3.1, 3.2, 0.1, 0.0])
+        reasons = against_travel(np.full(8, 0.05), course, signed=True)
+        assert codes(reasons) == [Code.REVERSING_UNSIGNED]
+        assert 'on 2 of 8 pieces' in reasons[0].text
+        assert against_travel(course + 0.3, course, signed=True) == ()
+
+    def test_pieces_are_long_enough_for_a_direction(self):
+        t = np.arange(0.0, 100.0)
+        p = np.stack([2.0 * t, np.zeros(100)], -1)
+        middle, track, course = pieces(p, p, t, sigma=1.0)
+        assert len(middle) == 9                    # of 20 sigmas, 20 m
+        np.testing.assert_array_equal(track, course)
+        assert len(pieces(p * 0, p * 0, t, 1.0)[0]) == 0
