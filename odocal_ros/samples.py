@@ -126,7 +126,8 @@ def freeze(owner, **rows) -> None:
 
 def take(samples, index):
     """Return the rows that a numpy index picks, as the same type."""
-    return type(samples)(*(getattr(samples, f.name)[index] for f in fields(samples)))
+    return _owned(type(samples), {f.name: getattr(samples, f.name)[index]
+                                  for f in fields(samples)})
 
 
 def join(blocks):
@@ -135,7 +136,17 @@ def join(blocks):
     if len(blocks) == 1:
         return blocks[0]
     names = [f.name for f in fields(blocks[0])]
-    return type(blocks[0])(*(np.concatenate([getattr(b, n) for b in blocks]) for n in names))
+    return _owned(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
+                                    for n in names})
+
+
+def _owned(kind, columns):
+    """Return samples of arrays that were checked before and that nobody else holds: no copy."""
+    samples = object.__new__(kind)
+    for name, array in columns.items():
+        array.setflags(write=False)
+        object.__setattr__(samples, name, array)
+    return samples
 
 
 def no_imu() -> ImuSamples:

@@ -73,18 +73,22 @@ def _config(args):
 
 def _legs_of(path, args, asked, config):
     """Return the results of a bag's legs, its entry for calibration.json, the Imu's frame."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.leg import LegRecorder
     from odocal_ros.messages import make_reader
     from odocal_ros.offline.legs import find_legs, marked_legs
     from odocal_ros.offline.topics import choose_topics
-    with open_bag(path) as bag:
+    # the hash costs as long as reading the file: beside the decoding, which holds one core
+    with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
             'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
         overrides = {slot: topic for slot, topic in overrides.items() if topic}
         topics = choose_topics(bag.topics, config, overrides)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                    for slot, topic in topics.items()}
+        digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
         with _progress(f'reading {bag.name}', args) as progress:
             bag.read(readers, recorder.feed, progress)
@@ -96,7 +100,7 @@ def _legs_of(path, args, asked, config):
             if isinstance(note, str) and not args.quiet:
                 print(f'odocal: {note}', file=sys.stderr)
         results = _calibrated(recorder, spans, config, notes, bag.name, args)
-        described = {'bag': bag.name, 'sha256': bag_sha256(bag), 'topics': topics}
+        described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
     return results, described, frame
 
