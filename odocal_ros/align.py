@@ -24,6 +24,7 @@ COURSE_DISTANCE = 30.0    # m of track for a course
 COURSE_TIME = 300.0       # s within which it must be driven
 COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
 HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
+NOISY = 10.0              # times the noise of the grade at rest: another gyro, or another unit
 NEAR = 0.5                # s: a heading sample this near to a moving start is taken
 
 
@@ -87,8 +88,10 @@ def _from_place(inputs, span, fixes_n, origin):
 def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
     span = choose_standstill(spans)
     if span is not None:
-        noise = max(grade.gyro_noise, _measured_noise(inputs, span))
-        return level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, noise), noise, ()
+        seen = _measured_noise(inputs, span)
+        noise = max(grade.gyro_noise, seen)
+        level = level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, noise)
+        return level, noise, _against_grade(seen, grade)
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
     pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
@@ -105,6 +108,16 @@ def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
                    f'{t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
                    f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
     return level, grade.gyro_noise, (found,)
+
+
+def _against_grade(noise, grade: Grade):
+    """Return a caution where the gyro at rest is far noisier than its grade: walks will be too."""
+    times = noise / max(grade.gyro_noise, 1e-12)
+    if times <= NOISY:
+        return ()
+    unit = ', as one that sends deg/s would be' if 30 < times < 120 else ''
+    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'at rest the gyro is {times:.0f} times as noisy as '
+                   f'its grade{unit}'),)
 
 
 def _measured_noise(inputs, span):

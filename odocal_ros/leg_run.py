@@ -211,7 +211,7 @@ class LegRun:
                     'after': track_check(strays(f), distance)}
             if self.holdout:
                 more |= self._held_out(chord, before, f)
-            self._judge_track(chord, f, fixes, more['after'], factor[0], drift, distance)
+            self._judge_track(chord, f, fixes, residual, more['after'], drift, distance)
         method = fit(chord, self.nominal, inputs.scale_unit, inputs.travel.quantum, factor,
                      config)
         if not chord.alignment.heading_separable and chord.M[:2, 0] @ chord.M[:2, 0] > 0 \
@@ -286,11 +286,14 @@ class LegRun:
                       'covariance says')
         return factor
 
-    def _judge_track(self, chord, f, fixes, check, factor, drift, distance):
+    def _judge_track(self, chord, f, fixes, residual, check, drift, distance):
         """Compare the corrected track with the fixes: units, signs, reversing, sanity."""
         t, p = fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
-        middle, direction, course = pieces(track_2d, p[:, :2], t, self.fix_sigma * factor)
+        # what fixes stray from one to the next is their noise, whatever is wrong with the track
+        jump = np.median((np.diff(residual[:, :2], axis=0)**2).sum(axis=1)) / np.log(2) / 4
+        middle, direction, course = pieces(track_2d, p[:, :2], t,
+                                           max(self.fix_sigma, np.sqrt(jump)))
         C = matrix_from_quat(self.track.q_nb)
         yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)

@@ -50,6 +50,9 @@ class Code(Enum):
                                  'axes are forward-right-down.')
     IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; odocal '
                         'inspect suggests it.')
+    IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the like, to what '
+                                     'the Imu is; a gyro that sends deg/s looks so too: '
+                                     'imu.gyro_scale.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
     COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'

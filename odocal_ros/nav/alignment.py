@@ -13,6 +13,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
+RULED_OUT = 10.0   # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
 EDGE = 0.3     # s cut off each end of a standstill: a slow start leans the specific force
 
 
@@ -194,7 +195,8 @@ def _gyro_bias_n(level, C_nb, yaw_sigma, compass, latitude, grade):
     A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
     psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. A gyrocompass has
     used up the east part and knows nothing of it. Where that leaves less than the grade says
-    of the turn-on bias, or without a standstill, the bias is taken as zero.
+    of the turn-on bias, or without a standstill, the bias is taken as zero. A reading that the
+    grade rules out shows that the grade is wrong (or the unit): the reading is taken.
     """
     if level.standstill is None:
         return np.zeros(3), np.full(3, grade.gyro_bias)
@@ -205,5 +207,6 @@ def _gyro_bias_n(level, C_nb, yaw_sigma, compass, latitude, grade):
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
     measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)
-    known = sigma < grade.gyro_bias
+    known = (sigma < grade.gyro_bias) | (
+        np.abs(measured) > RULED_OUT * np.hypot(sigma, grade.gyro_bias))
     return np.where(known, measured, 0.0), np.where(known, sigma, grade.gyro_bias)

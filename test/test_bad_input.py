@@ -1,0 +1,435 @@
+"""
+Bad input through the whole pipeline: nothing raises, each fault has its sentence and its remedy.
+
+Every test ends in ``sound``: what is given holds within its sigma, what is rejected says why.
+"""
+
+from dataclasses import replace
+
+from drives import (
+    changed,
+    drive,
+    errors_in_sigmas,
+    everything_said,
+    rejecting,
+    seconds,
+    settings,
+    shifted,
+)
+import numpy as np
+import pytest
+
+from odocal_ros.nav.angles import yaw_from_heading
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.reasons import Code
+from odocal_ros.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
+from odocal_ros.sim import sensors
+from odocal_ros.sim.motion import Motion, Start
+from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.profile import chain, hold, ramp
+
+RAD_TO_DEG = 180 / np.pi
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+
+
+@pytest.fixture(scope='module')
+def town():
+    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+
+
+@pytest.fixture(scope='module')
+def leg(made):
+    return made.leg()
+
+
+def run(leg, config):
+    """Calibrate and combine; whatever comes must be sound."""
+    result = calibrate(leg, config)
+    whole = combine([result], config)
+    said = everything_said(result)
+    if whole.verdict.value == 'rejected':
+        assert rejecting(result), 'rejected without a reason'
+    for code, text in said.items():
+        assert len(text) > 10
+        assert code.remedy.endswith('.')
+        assert 'nan' not in text.lower().split()
+    for e in whole.estimates.values():
+        assert (e.value is None) == (e.sigma is None)
+        assert e.value is None or (np.isfinite(e.value) and e.sigma > 0)
+    return result, said
+
+
+def sound(result, truth, sigmas=5.0):
+    """Check that a result that is given holds."""
+    assert result.verdict.value != 'rejected', everything_said(result)
+    z = errors_in_sigmas(result, truth)
+    assert all(abs(x) < sigmas for x in z.values()), z
+
+
+@pytest.mark.parametrize(('slot', 'columns', 'code', 'text'), [
+    ('imu', ('w_i',), Code.NO_IMU, 'none of the 10001 Imu messages is usable'),
+    ('imu', ('f_i',), Code.NO_IMU, 'none of the 10001 Imu messages is usable'),
+    ('fix', ('latitude',), Code.FIXES_UNUSABLE, 'none of the 1000 fix messages is usable')])
+def test_a_topic_of_nothing_but_nan(made, leg, slot, columns, code, text):
+    bad = changed(getattr(leg, slot), **{c: lambda a: a * np.nan for c in columns})
+    result, said = run(replace(leg, **{slot: bad}), settings(made))
+    assert said[code] == text
+    assert code in rejecting(result)
+
+
+def test_a_speed_topic_of_nothing_but_nan():
+    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', odometer='speed')
+    bad = changed(made.odometer, value=lambda a: a * np.nan)
+    _, said = run(replace(made.leg(), odometer=bad), settings(made))
+    assert said[Code.NO_ODOMETER] == 'none of the 4000 odometer messages is usable'
+
+
+@pytest.mark.parametrize(('slot', 'empty', 'code'), [
+    ('imu', no_imu, Code.NO_IMU), ('odometer', no_odometer, Code.NO_ODOMETER),
+    ('fix', no_fix, Code.NO_FIX)])
+def test_no_message_at_all(made, leg, slot, empty, code):
+    result, _ = run(replace(leg, **{slot: empty()}), settings(made))
+    assert rejecting(result) == {code}
+
+
+@pytest.mark.parametrize('keep', [1, 2, 3])
+@pytest.mark.parametrize('slot', ['imu', 'odometer', 'fix'])
+def test_a_handful_of_rows(made, leg, slot, keep):
+    few = take(getattr(leg, slot), slice(5000, 5000 + keep) if slot == 'imu' else
+               slice(700, 700 + keep))
+    result, _ = run(replace(leg, **{slot: few}), settings(made))
+    assert rejecting(result)
+
+
+def test_all_fixes_status_none(made, leg):
+    result, said = run(replace(leg, fix=changed(leg.fix, status=lambda a: a * 0 - 1)),
+                       settings(made))
+    assert said[Code.FIXES_UNUSABLE] == 'of 1000 fixes are not used: 1000 with status below 0'
+    assert 'gnss.min_status' in Code.FIXES_UNUSABLE.remedy
+
+
+def test_ten_seconds_without_imu(made, leg):
+    t = seconds(leg, leg.imu)
+    result, said = run(replace(leg, imu=take(leg.imu, (t < 40) | (t > 50))), settings(made))
+    assert said[Code.IMU_GAP].endswith('for 10.04 s at t = 39.98 s (1 gap above 0.5 s)')
+    # straight on, nothing was lost: the values are kept and hold
+    assert max(map(abs, errors_in_sigmas(result, made.truth).values())) < 5
+    # a gap long before the leg is none of its business
+    result, said = run(replace(leg, imu=take(leg.imu, (t < -55) | (t > -50))), settings(made))
+    assert Code.IMU_GAP not in said
+    sound(result, made.truth)
+
+
+def test_an_imu_that_ends_early(made, leg):
+    t = seconds(leg, leg.imu)
+    result, said = run(replace(leg, imu=take(leg.imu, t < 50.0)), settings(made))
+    assert 'at t = 49.98 s' in said[Code.IMU_GAP]
+    result, said = run(replace(leg, imu=take(leg.imu, t < -10.0)), settings(made))
+    assert Code.IMU_GAP in rejecting(result)
+    result, said = run(replace(leg, imu=take(leg.imu, t > 20.0)), settings(made))
+    assert 'missing for 20.0' in said[Code.IMU_GAP]
+
+
+def test_an_odometer_that_starts_late_or_ends_early_shortens_the_leg(made, leg):
+    t = seconds(leg, leg.odometer)
+    for keep, text in ((t > 20, 'begins 20.0 s after the start mark'),
+                       (t < 50, 'ends 90.0 s before the stop mark')):
+        result, said = run(replace(leg, odometer=take(leg.odometer, keep)), settings(made))
+        assert text in said[Code.TOPIC_GAP]
+        sound(result, made.truth)
+
+
+def test_a_gap_in_the_odometer_lowers_the_weight_not_the_leg(made, leg):
+    t = seconds(leg, leg.odometer)
+    result, said = run(replace(leg, odometer=take(leg.odometer, (t < 35) | (t > 45))),
+                       settings(made))
+    assert Code.TOPIC_GAP in said
+    sound(result, made.truth)
+
+
+@pytest.mark.parametrize('kind', ['increment', 'rate'])
+def test_a_gap_of_increments_or_speeds_widens_the_sigma(made, leg, kind):
+    base = leg
+    if kind == 'increment':
+        step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
+        base = replace(leg, odometer=changed(leg.odometer, value=lambda a: step),
+                       form=OdometerForm('increment', 0, 'm/pulse'))
+        source = made
+    else:
+        source = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
+                       odometer='speed')
+        base = source.leg()
+    t = seconds(base, base.odometer)
+    whole, _ = run(base, settings(source))
+    result, said = run(replace(base, odometer=take(base.odometer, (t < 20) | (t > 30))),
+                       settings(source))       # across the end of speeding up
+    assert Code.TOPIC_GAP in said
+    sound(result, source.truth)
+    sigma = [r.methods['two_point'].estimates['scale_factor'].sigma for r in (whole, result)]
+    assert sigma[1] > 3 * sigma[0]
+
+
+def test_duplicate_rows_change_nothing(made, leg):
+    twice = {slot: take(getattr(leg, slot), np.repeat(np.arange(
+        len(getattr(leg, slot).stamp_ns)), 2)) for slot in ('imu', 'odometer', 'fix')}
+    config = settings(made)
+    result, said = run(replace(leg, **twice), config)
+    assert Code.STAMPS_NOT_RISING in said
+    clean, _ = run(leg, config)
+    for name, e in clean.methods['two_point'].estimates.items():
+        assert result.methods['two_point'].estimates[name] == e
+
+
+def test_zero_and_backward_stamps_cost_their_rows_only(made, leg):
+    bad = {slot: changed(getattr(leg, slot), stamp_ns=lambda a: (
+        a.__setitem__(slice(30, 33), 0), a.__setitem__(slice(60, 62), a[60:62] - 10**9))[0])
+        for slot in ('imu', 'odometer', 'fix')}
+    result, said = run(replace(leg, **bad), settings(made))
+    assert {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING} <= set(said)
+    sound(result, made.truth)
+    assert result.fixes + 10 > len(leg.fix.stamp_ns[seconds(leg, leg.fix) > -0.5])
+
+
+def test_a_counter_that_rolls_over(made, leg):
+    wrapped = changed(leg.odometer, value=lambda a: a % 9000)
+    result, said = run(replace(leg, odometer=wrapped, form=OdometerForm(
+        'cumulative', 9000, 'm/pulse')), settings(made))
+    assert '(modulus 9000)' in said[Code.COUNTER_ROLLOVER]
+    clean, _ = run(leg, settings(made))
+    assert result.methods['two_point'].estimates['scale_factor'] == \
+        clean.methods['two_point'].estimates['scale_factor']
+
+
+def test_a_counter_that_is_reset(made, leg):
+    at = int(np.searchsorted(seconds(leg, leg.odometer), 40.0))
+    reset = changed(leg.odometer, value=lambda a: a.__setitem__(slice(at, None), a[at:] - a[at]))
+    result, said = run(replace(leg, odometer=reset), settings(made))
+    assert 'a reset, not motion' in said[Code.COUNTER_RESET]
+    assert result.verdict.value == 'caution'
+    sound(result, made.truth)
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_a_counter_that_counts_down(made, leg, known):
+    down = replace(leg, odometer=changed(leg.odometer, value=lambda a: -a))
+    config = settings(made, heading_sigma=1e-3 if known else None)
+    result, said = run(down, config)
+    assert Code.ODOMETER_REVERSED in rejecting(result)
+    assert 'odometer.reversed' in Code.ODOMETER_REVERSED.remedy
+    scale = result.methods['two_point'].estimates['scale_factor']
+    assert scale.value == pytest.approx(made.truth.scale, rel=2e-3)      # always above zero
+    result, _ = run(down, settings(made, heading_sigma=1e-3 if known else None,
+                                   odometer__reversed=True))
+    sound(result, made.truth)
+
+
+class Reversing:
+    """720 m forward, then 160 m back, as a drive."""
+
+    def __init__(self):
+        self.options = resolved(SimOptions(scenario='straight', imu_grade='tactical', seed=2,
+                                           imu_rate=50.0, odometer_rate=20.0))
+        pieces = (hold(40) + ramp(20, 12, 1.0) + hold(40) + ramp(20, -12, 1.0) + hold(4)
+                  + ramp(5, -4, 1.0) + hold(35) + ramp(5, 4, 1.0) + hold(10))
+        acceleration = chain(pieces)
+        speed = acceleration.integral()
+        speed.powers[:, 0] = np.round(speed.powers[:, 0], 11)
+        self.motion = Motion(speed, chain(hold(speed.end)), Start(
+            0.7, 2.0, 50.0, float(yaw_from_heading(self.options.heading))))
+        start = self.options.start_ns
+        imu = sensors.imu(self.motion, self.options)
+        self.made = replace(drive(scenario='straight', duration=200.0, imu_grade='tactical'),
+                            options=self.options)
+        self.leg = replace(
+            self.made.leg(), start_ns=start + 40 * 10**9, stop_ns=int(imu.stamp_ns[-1]), imu=imu,
+            odometer=sensors.odometers(self.motion, self.options)[0],
+            fix=sensors.fixes(self.motion, self.options))
+
+
+@pytest.fixture(scope='module')
+def reversing():
+    return Reversing()
+
+
+def test_reversing_is_fine_for_a_counter_that_counts_back(reversing):
+    result, _ = run(reversing.leg, settings(reversing.made))
+    sound(result, reversing.made.truth)
+
+
+@pytest.mark.parametrize('signed', [True, False])
+def test_reversing_without_direction_rejects(reversing, signed):
+    def rising(value):
+        return value[0] + np.cumsum(np.abs(np.diff(value, prepend=value[:1])))
+    leg = replace(reversing.leg, odometer=changed(reversing.leg.odometer, value=rising))
+    result, said = run(leg, settings(reversing.made, odometer__signed=signed))
+    assert Code.REVERSING_UNSIGNED in rejecting(result)
+    assert 'the track runs against the fixes' in said[Code.REVERSING_UNSIGNED]
+
+
+def test_g_instead_of_metres_per_second_squared(made, leg):
+    in_g = replace(leg, imu=changed(leg.imu, f_i=lambda a: a / 9.80665))
+    result, said = run(in_g, settings(made))
+    assert Code.IMU_UNITS in rejecting(result)
+    assert 'set imu.accel_scale to 9.80665' in said[Code.IMU_UNITS]
+    result, _ = run(in_g, settings(made, imu__accel_scale=9.80665))
+    sound(result, made.truth)
+
+
+@pytest.mark.parametrize('scenario', ['town', 'straight'])
+def test_degrees_instead_of_radians(made, town, scenario):
+    it = town if scenario == 'town' else made
+    leg = replace(it.leg(), imu=changed(it.imu, w_i=lambda a: a * RAD_TO_DEG))
+    result, said = run(leg, settings(it))
+    if scenario == 'town':
+        assert Code.IMU_UNITS in rejecting(result)
+        assert 'set imu.gyro_scale to 0.017453292519943295' in said[Code.IMU_UNITS]
+    else:      # a straight road turns nothing to tell it by, but at rest the noise does
+        assert 'as one that sends deg/s would be' in said[Code.IMU_WORSE_THAN_GRADE]
+        assert 'imu.gyro_scale' in Code.IMU_WORSE_THAN_GRADE.remedy
+        assert result.verdict.value != 'accepted'
+    result, _ = run(leg, settings(it, imu__gyro_scale=1 / RAD_TO_DEG))
+    sound(result, it.truth)
+
+
+def test_a_z_down_imu_is_read_as_what_it_is(town):
+    leg = replace(town.leg(), imu=changed(town.imu, w_i=lambda a: a * [1.0, -1.0, -1.0],
+                                          f_i=lambda a: a * [1.0, -1.0, -1.0]))
+    result, said = run(leg, settings(town))
+    assert 'taken as forward-right-down' in said[Code.IMU_LOOKS_Z_DOWN]
+    assert result.verdict.value == 'caution'
+    sound(result, town.truth)
+    clean, _ = run(town.leg(), settings(town))
+    e, c = (r.methods['two_point'].estimates for r in (result, clean))
+    for name in e:
+        assert e[name].value == pytest.approx(c[name].value, rel=1e-9)
+    # the whole rotation, roll of half a turn and all, is what goes out
+    rpy = combine([result], settings(town)).imu_rotation_rpy
+    assert abs(rpy[0]) == pytest.approx(np.pi, abs=0.05)
+    assert rpy[2] == pytest.approx(town.truth.yaw, abs=0.01)
+
+
+def test_a_sideways_imu_is_refused_and_told_so(made, leg):
+    turned = changed(leg.imu, w_i=lambda a: a[:, [2, 1, 0]] * [1, 1, -1],
+                     f_i=lambda a: a[:, [2, 1, 0]] * [1, 1, -1])
+    result, said = run(replace(leg, imu=turned), settings(made))
+    assert rejecting(result) == {Code.IMU_AXES}
+    assert 'gravity shows on +x (up should be +z)' in said[Code.IMU_AXES]
+
+
+def test_a_gyro_with_the_wrong_sign_is_named(town):
+    leg = replace(town.leg(), imu=changed(town.imu, w_i=lambda a: a * [1.0, 1.0, -1.0]))
+    result, _ = run(leg, settings(town))
+    assert rejecting(result) & {Code.GYRO_SIGN, Code.TRACK_MISMATCH, Code.CHORD_TOO_SHORT}
+
+
+def test_a_leg_too_short(made, leg):
+    short = replace(leg, stop_ns=leg.start_ns + 14 * 10**9)
+    result, said = run(short, settings(made))
+    assert 'm between the marks, 100 m are the least' in said[Code.LEG_TOO_SHORT]
+
+
+def test_a_vehicle_that_never_moves(made, leg):
+    still = shifted(leg, start=-55.0)
+    still = replace(still, stop_ns=leg.start_ns - 5 * 10**9)
+    for nominal in (0.02, 0.0):
+        result, said = run(still, settings(made, odometer__nominal_scale=nominal))
+        assert said[Code.LEG_TOO_SHORT] == 'the vehicle did not move'
+        assert rejecting(result) == {Code.LEG_TOO_SHORT}
+
+
+@pytest.mark.parametrize('nominal', [0.02, 0.0])
+def test_an_odometer_that_does_not_count(made, leg, nominal):
+    result, said = run(replace(leg, odometer=changed(leg.odometer, value=lambda a: a * 0 + 7)),
+                       settings(made, odometer__nominal_scale=nominal))
+    assert said[Code.ODOMETER_STILL] == 'the fixes move, the odometer does not count'
+
+
+def test_fixes_that_do_not_move(made, leg):
+    stuck = changed(leg.fix, latitude=lambda a: a * 0 + a[0], longitude=lambda a: a * 0 + a[0])
+    result, said = run(replace(leg, fix=stuck), settings(made))
+    assert said[Code.LEG_TOO_SHORT] == 'the fixes stay in one place while the odometer counts'
+
+
+def test_no_standstill_before_the_start(made, leg):
+    t = seconds(leg, leg.imu)
+    moving = shifted(leg, start=30.0)
+    cut = {slot: take(getattr(leg, slot), seconds(leg, getattr(leg, slot)) > 30.0)
+           for slot in ('imu', 'odometer', 'fix')}
+    assert (t > 30.0).any()
+    result, said = run(replace(moving, **cut), settings(made))
+    assert 'no standstill before the start mark' in said[Code.NO_STANDSTILL]
+    assert result.verdict.value == 'caution'
+    sound(result, made.truth)
+
+
+def test_fixes_only_outside_the_drive(made, leg):
+    t = seconds(leg, leg.fix)
+    # standing at both ends: the middle is not needed, but nothing checks the drive then
+    result, _ = run(replace(leg, fix=take(leg.fix, (t < 0) | (t > 85))), settings(made))
+    sound(result, made.truth)
+    for keep in (t < 0, t > 85):
+        result, said = run(replace(leg, fix=take(leg.fix, keep)), settings(made))
+        assert rejecting(result) <= {Code.NO_FIX, Code.LEG_TOO_SHORT}, said
+        assert rejecting(result)
+
+
+def test_a_single_fix(made, leg):
+    result, said = run(replace(leg, fix=take(leg.fix, slice(500, 501))), settings(made))
+    assert said[Code.NO_FIX] == '1 usable fix between the marks'
+
+
+@pytest.mark.parametrize('shift', [-3600, 3600])
+def test_marks_outside_the_data(made, leg, shift):
+    result, _ = run(shifted(leg, start=float(shift), stop=float(shift)), settings(made))
+    assert rejecting(result)
+
+
+def test_a_stop_before_the_start(made, leg):
+    result, said = run(replace(leg, stop_ns=leg.start_ns - 1), settings(made))
+    assert said[Code.LEG_TOO_SHORT] == 'the stop mark is not after the start mark'
+    result, said = run(replace(leg, stop_ns=leg.start_ns), settings(made))
+    assert Code.LEG_TOO_SHORT in rejecting(result)
+
+
+def test_a_wheel_that_slips_strays_from_the_fixes(made, leg):
+    """40 s of spinning a tenth too far: 50 m that the fixes do not show, 40 times their sigma."""
+    t = seconds(leg, leg.odometer)
+    spun = 0.1 * 12.0 / made.options.scale * np.clip(t - 25, 0, 40)
+    slipped = changed(leg.odometer, value=lambda a: a + spun.astype(int))
+    result, said = run(replace(leg, odometer=slipped), settings(made))
+    assert rejecting(result) == {Code.TRACK_MISMATCH} or 'stray from the track' in said[
+        Code.FIXES_NOISIER_THAN_SAID]
+
+
+def test_one_wild_fix_costs_nothing(made, leg):
+    for at in (250, 300, 310, 500, 700):       # one at the very start mark, too
+        wild = changed(leg.fix, latitude=lambda a, at=at: a.__setitem__(at, a[at] + 0.05),
+                       height=lambda a, at=at: a.__setitem__(at, 9000.0))
+        result, _ = run(replace(leg, fix=wild), settings(made))
+        sound(result, made.truth)
+
+
+def test_a_nominal_scale_of_another_world_is_a_caution(made, leg):
+    result, said = run(leg, settings(made, odometer__nominal_scale=1.0))
+    assert '-97.9 % from the nominal 1' in said[Code.SCALE_FAR_FROM_NOMINAL]
+    assert result.verdict.value == 'caution'
+    sound(result, made.truth)
+
+
+def test_two_topics_of_other_clocks_refuse(made, leg):
+    late = replace(leg, odometer=changed(leg.odometer, stamp_ns=lambda a: a + 700_000_000))
+    result, said = run(late, settings(made))
+    assert Code.CLOCKS_DIFFER in rejecting(result)
+    result, _ = run(late, settings(made, odometer__time_offset=-0.7))
+    sound(result, made.truth)
+
+
+def test_everything_at_once_still_answers(made, leg):
+    rng = np.random.default_rng(1)
+    worst = {slot: join([take(getattr(leg, slot), rng.permutation(len(getattr(
+        leg, slot).stamp_ns))), getattr(leg, slot)]) for slot in ('imu', 'odometer', 'fix')}
+    run(replace(leg, **worst), settings(made))
