@@ -281,6 +281,14 @@ def test_in_motion_the_nearest_heading_that_says_something_is_taken(plain):
     assert yaw_of(a) == pytest.approx(1.0, abs=PLACE)
 
 
+def test_in_motion_a_heading_of_long_ago_is_none(plain):
+    case = asked(plain, alignment__heading_source='heading_topic')
+    a, reasons = case.align(spans=np.empty((0, 2)),
+                            **heading_rows(1.0, 1e-4, np.array([-0.6, 0.6])))
+    assert a.heading_source == 'course'
+    assert Code.HEADING_UNAVAILABLE in {r.code for r in reasons}
+
+
 @pytest.mark.parametrize('source', ['imu_orientation', 'heading_topic'])
 @pytest.mark.parametrize(('variance', 'says'), [(np.nan, 'covariance[0] = -1'), (10.0, '+-181')])
 def test_an_orientation_not_sent_or_worthless_is_refused(plain, source, variance, says):

@@ -181,29 +181,28 @@ def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro
     yaw is that of L's x axis where the level is taken, its sigma holds for that too.
     """
     C_nb = level.C_np @ C_nL(yaw) @ level.C_Lb
-    bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, source == 'gyrocompass', latitude,
-                                   grade)
+    bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade)
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
                      sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill)
 
 
-def _gyro_bias_n(level, C_nb, yaw_sigma, compass, latitude, grade):
+def _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade):
     """
     Return gyro bias and its sigma, ENU: the mean rate at rest less the Earth's.
 
     A wrong heading puts the Earth rate on wrong axes: a yaw error psi moves the east part by
-    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. A gyrocompass has
-    used up the east part and knows nothing of it. Where that leaves less than the grade says
-    of the turn-on bias, or without a standstill, the bias is taken as zero. A reading that the
-    grade rules out shows that the grade is wrong (or the unit): the reading is taken.
+    psi, the north part by psi^2 / 2 of its level part; a tilt moves all three. Where that says
+    less than the grade does of the turn-on bias, or without a standstill, the bias is taken as
+    zero: so the east part after a gyrocompass, which has used it up. A reading that the grade
+    rules out shows that the grade is wrong (or the unit): the reading is taken.
     """
     if level.standstill is None:
         return np.zeros(3), np.full(3, grade.gyro_bias)
     level_rate, up_rate = OMEGA * np.cos(latitude), abs(OMEGA * np.sin(latitude))
     # rms of psi^2 / 2 for a normal psi: sqrt(3) / 2 sigma^2; of an unknown one sqrt(3 / 2)
-    by_yaw = np.array([np.inf if compass else min(yaw_sigma, 1.0),
-                       min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0]) * level_rate
+    by_yaw = level_rate * np.array(
+        [min(yaw_sigma, 1.0), min(np.sqrt(3) / 2 * yaw_sigma**2, np.sqrt(1.5)), 0.0])
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
     measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)

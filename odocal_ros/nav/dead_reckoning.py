@@ -128,7 +128,7 @@ def rough_scale(travel: Travel, t_fix, fixes_n, sigma):
     while pieces and way[-1] > 0:
         k = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], pieces + 1)))
         chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
-        onward = run >= way[-1] / pieces / 2      # no flicker of counts at rest, no to and fro
+        onward = run > 0
         if onward.any() and np.median(chord[onward]) >= max(20.0, 8 * sigma):
             return float(np.median(chord[onward] / run[onward]))
         pieces //= 2

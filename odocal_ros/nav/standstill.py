@@ -21,7 +21,7 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
     travel : Travel
         Odometer travel.
     metres_per_unit : float
-        Rough scale of it.
+        Rough scale of it, above 0.
     shortest : float
         Least duration, s.
 
@@ -43,13 +43,13 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
     quiet = _still_wheels(middle, travel, metres_per_unit) & steady
     quiet &= _not_turning(rate, quiet, edges, shortest)
     spans = _spans(quiet, edges, shortest)
-    moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * abs(metres_per_unit)
+    moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
     return spans[moved <= CREEP * (spans[:, 1] - spans[:, 0]) + _allowed(travel, metres_per_unit)]
 
 
 def _allowed(travel, metres_per_unit):
     """Return the travel, m, of one that stands: MOVE, or a count or so of jitter."""
-    return max(MOVE, 1.5 * travel.quantum * abs(metres_per_unit))
+    return max(MOVE, 1.5 * travel.quantum * metres_per_unit)
 
 
 def _spans(quiet, edges, shortest):
@@ -64,7 +64,7 @@ def _still_wheels(middle, travel, metres_per_unit):
     # range of the travel in the window by a few probes, so that rocking to and fro is seen
     probes = [travel.at(middle + x) for x in np.linspace(-WINDOW, WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
-    return reach * abs(metres_per_unit) <= _allowed(travel, metres_per_unit)
+    return reach * metres_per_unit <= _allowed(travel, metres_per_unit)
 
 
 def _gyro(edges, t_imu, w_b):

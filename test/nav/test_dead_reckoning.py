@@ -180,16 +180,16 @@ def fixes(metres, rng, sigma):
 @pytest.mark.parametrize('metres_per_count', [0.0213, 0.3])
 def test_rough_scale_survives_noise_outliers_standing_and_flicker(seed, metres_per_count):
     rng = np.random.default_rng(seed)
-    t = np.arange(0, 300, 0.2)
-    metres = 12 * np.clip(t - 60, 0, 180)
+    t = np.arange(0, 900, 0.2)
+    metres = 12 * np.clip(t - 60, 0, 90)
     p = fixes(metres, rng, 1.5)
     p[rng.uniform(size=len(t)) < 0.05] += rng.normal(0, 40, 3)
-    flicker = rng.integers(0, 2, len(t)) * ((t < 60) | (t > 240))
+    flicker = rng.integers(0, 2, len(t)) * ((t < 60) | (t > 150))
     odometer = Travel(t, np.floor(metres / metres_per_count) + flicker, 1.0)
-    # a piece of 20 m carries sqrt(2) * 1.5 m of noise: 10 %, the median of 100 pieces 1.3 %;
+    # a piece of 20 m carries sqrt(2) * 1.5 m of noise: 10 %, the median of 50 pieces 1.8 %;
     # noise across the way adds (2.1 / 20)^2 / 2 = 0.6 %, outliers in a tenth move the median by
-    # 0.1 of a sigma
-    assert rough_scale(odometer, t, p, 1.5) == pytest.approx(metres_per_count, rel=0.05)
+    # 0.1 of a sigma; flicker of one count while it drives none
+    assert rough_scale(odometer, t, p, 1.5) == pytest.approx(metres_per_count, rel=0.07)
     backwards = Travel(t, -odometer.s, 1.0)
     assert rough_scale(backwards, t, p, 1.5) == rough_scale(odometer, t, p, 1.5)
 

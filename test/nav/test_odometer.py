@@ -119,6 +119,22 @@ def test_motion_after_an_hour_of_standing_is_no_reset():
     assert found.s[-1] == total[-1]
 
 
+def test_a_short_drive_after_long_creeping_is_no_reset():
+    value = np.cumsum(np.concatenate([np.ones(10_000, int), np.full(200, 40)]))
+    found, reasons = travel(np.arange(len(value)) * 0.02, value, counter(2**32))
+    assert reasons == ()
+    assert found.s[-1] == value[-1] - 1
+
+
+def test_two_counts_at_once_of_one_that_sends_at_every_count_are_no_reset():
+    """Standing it sends fast zeros, creeping one count a second."""
+    dt = np.concatenate([np.full(300, 0.01), np.ones(200), [0.01], np.full(300, 0.01)])
+    step = np.concatenate([np.zeros(300, int), np.ones(200, int), [2], np.zeros(300, int)])
+    found, reasons = travel(np.cumsum(dt), np.cumsum(step), counter(2**32))
+    assert reasons == ()
+    assert found.s[-1] == 202
+
+
 def test_bursts_of_stamps_are_no_resets():
     """A driver that sends ten rows at once: each row's own interval says nothing of speed."""
     t, total, _ = drive(400)

@@ -113,7 +113,8 @@ def test_rpy_round_trip(roll, pitch, yaw):
 @pytest.mark.parametrize('off', [0.0, *np.logspace(-16, -1, 31)])
 def test_matrix_survives_rpy_at_and_beside_gimbal_lock(up, off):
     """Roll and yaw are lost there, but together they must still give the same matrix."""
-    C = matrix_from_rpy([0.3, up * (np.pi / 2 - off), -1.1])
+    R = exp_so3([0.4, -1.3, 2.2])
+    C = matrix_from_rpy([0.3, up * (np.pi / 2 - off), -1.1]) @ R @ R.T     # with its round-off
     # within 1e-12 of the lock roll is taken as 0
     assert_allclose(matrix_from_rpy(rpy_from_matrix(C)), C, atol=2e-12)
     if not 1e-15 < off < 1e-11:
