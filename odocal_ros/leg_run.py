@@ -13,13 +13,13 @@ from odocal_ros.calib.check import (
     mismatch,
     pieces,
     residuals,
-    slow_variance,
     track_check,
 )
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.marks import fix_at, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
@@ -203,7 +203,7 @@ class LegRun:
             residual = strays(f)
             residual[:, 2] = strays(solve(chord)[0])[:, 2]     # the pitch is no noise of heights
             covariance = inputs.covariance_n[between]
-            factor = self._noise_factor(residual, covariance, drift)
+            factor = self._noise_factor(residual, covariance, drift, chord)
             chord = self._with_slow_errors(chord, f, fixes[0], residual, covariance, drift_n,
                                            factor[0])
             f, _ = solve(chord, factor[2])
@@ -269,17 +269,13 @@ class LegRun:
         """Return the chord with marks no better than the slow part of the fix errors."""
         if not np.isnan(self.config.gnss.correlation_time):
             return chord        # told, not judged
-        along = (chord.M @ f)[:2] / np.hypot(*(chord.M @ f)[:2])
-        stated = np.einsum('nij,i,j->n', covariance[:, :2, :2], along, along)
-        way = (self.track.at(t) @ f)[:, :2] @ along
-        slow = slow_variance(t, residual[:, :2] @ along, way, stated,
-                             np.linalg.norm(along @ drift_n[:2])) / factor**2
-        up_ratio = float(np.median(covariance[:, 2, 2] / stated))
-        return replace(chord, start=chord.start.at_least(slow, up_ratio),
-                       end=chord.end.at_least(slow, up_ratio))
+        start, end = marks_no_better(
+            (chord.start, chord.end), self.spans, t, self.track.at(t) @ f, chord.M @ f,
+            residual / factor, covariance, drift_n / factor)     # in sigmas as stated
+        return replace(chord, start=start, end=end)
 
-    def _noise_factor(self, residual, covariance, drift):
-        factor = fix_noise_factor(residual, covariance, drift)
+    def _noise_factor(self, residual, covariance, drift, chord):
+        factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
             self._say(Code.FIXES_NOISIER_THAN_SAID, 'the fixes stray from the track '
                       f'{factor[0]:.1f} times (in height {factor[2]:.1f} times) as far as their '

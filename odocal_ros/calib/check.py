@@ -10,8 +10,6 @@ DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compar
 CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
 SURE_TURN = 0.5           # rad between pieces: five sigmas of such directions
 LOOSE = 4.0               # sigmas of disagreement that name a mismatch
-CHI2_MEDIAN = 0.4549      # of one squared normal
-SLOW = 20.0               # s, window in which white errors average down
 SLOP = 0.002              # of the distance: slip, suspension, road
 
 
@@ -47,7 +45,7 @@ def track_check(residual, distance) -> TrackCheck:
                       float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
 
 
-def fix_noise_factor(residual, covariance_n, drift):
+def fix_noise_factor(residual, covariance_n, drift, marks=()):
     """
     Return the factors on stated fix sigmas that residuals ask for, east, north, up: (3,).
 
@@ -61,6 +59,9 @@ def fix_noise_factor(residual, covariance_n, drift):
         What the gyros may have bent the track by, m: taken out of the residuals. What is left may
         still hold errors of the track, so this errs on the wide side; below a factor of 1.25 the
         stated sigmas stand.
+    marks : sequence of MarkFix
+        The two that the track is pinned to: it has their errors, in proportion to the way a third
+        of the variance of each, and the factor is theirs too.
 
     """
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
@@ -68,45 +69,10 @@ def fix_noise_factor(residual, covariance_n, drift):
     rise = residual[:, 2] - np.median(residual[:, 2])
     up2 = (np.median(np.abs(rise)) / 0.6745)**2                          # median of a normal law
     seen = np.array([level2, level2, up2]) - drift**2
-    asked = np.array([stated[0] + stated[1], stated[0] + stated[1], stated[2]])
+    level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
+    asked = np.array([level, level, stated[2]])
     factors = np.sqrt(np.maximum(np.nan_to_num(seen), 0.0) / np.maximum(asked, 1e-12))
     return np.where(factors > 1.25, factors, 1.0)
-
-
-def slow_variance(t, along, way, variance, drift):
-    """
-    Return the variance of fix errors that stay alike over SLOW seconds, m^2.
-
-    Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
-    the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
-    chord, since gyros bend a track across it; less a straight line over the way, which is what
-    the errors of the two marks themselves make.
-
-    Parameters
-    ----------
-    t, along, way : (n,) arrays
-        Times, s, corrected track less fixes along the chord, m, and how far along it, m.
-    variance : (n,) array
-        As stated, m^2.
-    drift : float
-        What the gyros may have done along it, m: no error of the fixes.
-
-    """
-    window = ((t - t[0]) / SLOW).astype(int)
-    count = np.bincount(window)
-    full = count >= max(5, 0.5 * count.max())
-    if full.sum() < 5:
-        return 0.0
-    means, places = (np.bincount(window, x)[full] / count[full] for x in (along, way))
-    means, places = means - means.mean(), places - places.mean()
-    means = means - places * (places @ means) / max(places @ places, 1e-9)
-    free = full.sum() - 2
-    jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
-    white = min(jump, np.median(variance)) / np.median(count[full])
-    seen = (means**2).sum() / free - drift**2
-    # within three sigmas of the mean square of so many windows, white errors alone may do it
-    clear = seen > white * (1 + 3 * np.sqrt(2 / free))
-    return float(seen - white) if clear else 0.0
 
 
 def mismatch(check: TrackCheck, fix_sigma, drift, distance) -> tuple[Reason, ...]:

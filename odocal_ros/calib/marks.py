@@ -101,7 +101,7 @@ def _share(t, residual, whole, weight, correlation_time):
     # white fixes: scatter and half the squared steps are both 1, within 3 sigma of their own noise
     slack = 3 * np.sqrt(1 / n)
     if scatter > 1 - slack and step > scatter * (1 - slack):
-        return max(white, white * scatter)
+        return white * (scatter if scatter > 1 + slack else 1.0)
     fast = min(step, 1.0)
     slow = max(1.0, scatter) - fast
     return fast * white + slow * _left(t, weight, _correlation_time(t, z, fast, slow))

@@ -9,12 +9,12 @@ from odocal_ros.calib.check import (
     gyro_against_course,
     mismatch,
     pieces,
-    slow_variance,
     track_check,
 )
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.sanity import imu_sanity
+from odocal_ros.calib.slow_errors import slow_variance
 from odocal_ros.config import Config, with_settings
 from odocal_ros.reasons import Code
 
@@ -137,15 +137,15 @@ class TestCheck:
         rng = np.random.default_rng(3)
         t = np.arange(0.0, 600.0, 0.2)
         white, stated = rng.standard_normal(len(t)), np.ones(len(t))
-        assert slow_variance(t, white, 10 * t, stated, 0.0) == 0.0
+        assert slow_variance(t, white, 10 * t, stated, 0.0)[0] == 0.0
         slow = np.repeat(rng.standard_normal(20), 150) * 0.4
         # 20 draws of a variance, of which a line takes two: within five sigmas of sqrt(2 / 18)
-        found = slow_variance(t, white + slow, 10 * t, stated, 0.0)
+        found, _ = slow_variance(t, white + slow, 10 * t, stated, 0.0)
         assert 0.16 / 4 < found < 0.16 * 2.7
-        assert slow_variance(t, white + slow, 10 * t, stated, 2.0) == 0.0     # gyros explain it
+        assert slow_variance(t, white + slow, 10 * t, stated, 2.0)[0] == 0.0  # gyros explain it
         # what the marks' own errors make, a line over the way, is none
-        assert slow_variance(t, white + 3 + 0.001 * t, 10 * t, stated, 0.0) == 0.0
-        assert slow_variance(t[:300], white[:300], t[:300], stated[:300], 0.0) == 0.0
+        assert slow_variance(t, white + 3 + 0.001 * t, 10 * t, stated, 0.0)[0] == 0.0
+        assert slow_variance(t[:300], white[:300], t[:300], stated[:300], 0.0)[0] == 0.0
 
     def test_mismatch_is_beyond_noise_drift_and_slip(self):
         check = track_check(np.full((10, 3), 10.0), 1000.0)

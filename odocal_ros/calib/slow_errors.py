@@ -1,0 +1,117 @@
+"""Fix errors that stay alike over a mark: seen along the leg, where a mark cannot see them."""
+
+import numpy as np
+
+from odocal_ros.calib.marks import MarkFix, standing_at
+
+CHI2_MEDIAN = 0.4549      # of one squared normal
+UNCLEAR = 2.0             # of a variance: nearer, neither of two estimates is the better
+TIMES = np.geomspace(2.0, 2000.0, 100)    # s, time constants that SLOW can tell
+SLOW = 20.0               # s, window in which white errors average down
+
+
+def slow_variance(t, along, way, variance, drift):
+    """
+    Return the variance of fix errors averaged over SLOW seconds, m^2, and how long they last, s.
+
+    Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
+    the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
+    chord, since gyros bend a track across it; less a straight line over the way, which is what
+    the errors of the two marks themselves make.
+
+    Parameters
+    ----------
+    t, along, way : (n,) arrays
+        Times, s, corrected track less fixes along the chord, m, and how far along it, m.
+    variance : (n,) array
+        As stated, m^2.
+    drift : float
+        What the gyros may have done along it, m: no error of the fixes.
+
+    """
+    window = ((t - t[0]) / SLOW).astype(int)
+    count = np.bincount(window)
+    full = count >= max(5, 0.5 * count.max())
+    if full.sum() < 5:
+        return 0.0, np.inf
+    means, places = (np.bincount(window, x)[full] / count[full] for x in (along, way))
+    means, places = means - means.mean(), places - places.mean()
+    means = means - places * (places @ means) / max(places @ places, 1e-9)
+    free = full.sum() - 2
+    jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
+    white = min(jump, np.median(variance)) / np.median(count[full])
+    seen = (means**2).sum() / free - drift**2
+    # within three sigmas of the mean square of so many windows, white errors alone may do it
+    if seen <= white * (1 + 3 * np.sqrt(2 / free)):
+        return 0.0, np.inf
+    next_to = (means[1:] * means[:-1])[np.diff(np.flatnonzero(full)) == 1]
+    alike = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
+    return float(seen - white), _lasting(alike)
+
+
+def _lasting(alike):
+    """Return the time constant, s, that makes neighbouring means over SLOW s so much alike."""
+    x = SLOW / TIMES
+    return float(np.interp(alike, (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x))), TIMES))
+
+
+def slow_share(seconds, tau):
+    """Return the variance of a mean of slow errors over a time, against that over SLOW s."""
+    share = [2 * (x - 1 + np.exp(-x)) / x**2 if x > 1e-4 else 1.0
+             for x in (seconds / tau, SLOW / tau)]       # of a Gauss-Markov process
+    return float(share[0] / share[1])
+
+
+def no_better(mark: MarkFix, slow, tau, span, stated, up_ratio) -> MarkFix:
+    """
+    Return a mark no better than the slow part of the fix errors allows.
+
+    A mark that has seen slow errors itself knows them as well as the leg does: it is widened only
+    where it took them for white, or where the leg clearly says more.
+
+    Parameters
+    ----------
+    mark : MarkFix
+        With the variance of its own fixes.
+    slow, tau : float
+        As slow_variance returns them.
+    span : (begin, end) or None
+        The standstill at the mark, s; None in motion.
+    stated : float
+        Variance of one fix, m^2.
+    up_ratio : float
+        Variance up against that in the level.
+
+    """
+    begin, end = span or (mark.t, mark.t)
+    floor = slow * slow_share(end - begin, tau)
+    own = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
+    took_for_white = own * mark.used < UNCLEAR * stated
+    return mark.at_least(floor, up_ratio) if took_for_white or floor > UNCLEAR * own else mark
+
+
+def marks_no_better(marks, spans, t, way_n, chord_n, residual, covariance_n, drift_n):
+    """
+    Return both marks of a leg no better than the slow part of its fix errors allows.
+
+    Parameters
+    ----------
+    marks : (MarkFix, MarkFix)
+        With the variance of their own fixes.
+    spans : (k, 2) array
+        Standstills, s.
+    t, way_n, residual, covariance_n : (n,), (n, 3), (n, 3), (n, 3, 3) arrays
+        Times of the fixes, s, corrected track there, track less fix, m, and stated, m^2.
+    chord_n : (3,) array
+        From mark to mark, m.
+    drift_n : (3, k) array
+        What the gyros may have bent the track by, m.
+
+    """
+    along = chord_n[:2] / np.hypot(*chord_n[:2])
+    stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)
+    slow, tau = slow_variance(t, residual[:, :2] @ along, way_n[:, :2] @ along, stated,
+                              np.linalg.norm(along @ drift_n[:2]))
+    up_ratio = np.median(covariance_n[:, 2, 2] / stated)
+    return tuple(no_better(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
+                           up_ratio) for mark in marks)
