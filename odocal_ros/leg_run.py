@@ -13,6 +13,7 @@ from odocal_ros.calib.check import (
     mismatch,
     pieces,
     residuals,
+    steady,
     track_check,
 )
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
@@ -286,10 +287,8 @@ class LegRun:
         """Compare the corrected track with the fixes: units, signs, reversing, sanity."""
         t, p = fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
-        # what fixes stray from one to the next is their noise, whatever is wrong with the track
-        jump = np.median((np.diff(residual[:, :2], axis=0)**2).sum(axis=1)) / np.log(2) / 4
-        middle, direction, course = pieces(track_2d, p[:, :2], t,
-                                           max(self.fix_sigma, np.sqrt(jump)))
+        keep, sigma = steady(residual, self.fix_sigma)
+        middle, direction, course = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
         C = matrix_from_quat(self.track.q_nb)
         yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)

@@ -106,6 +106,26 @@ def pieces(track_2d, fixes_2d, t, sigma):
     return (t[a] + t[b]) / 2, np.arctan2(*track.T[::-1]), np.arctan2(*fix.T[::-1])
 
 
+def steady(residual, fix_sigma):
+    """
+    Tell which fixes are no outliers beside their neighbours, and how noisy they are.
+
+    residual : (n, 2 or more) corrected track less fixes, m, whatever is wrong with the track.
+
+    Returns
+    -------
+    (n,) bool, and the sigma of a fix against the next, m, no less than fix_sigma.
+
+    """
+    level = residual[:, :2]
+    jump = np.median((np.diff(level, axis=0)**2).sum(axis=1)) / np.log(2) / 4
+    sigma = max(fix_sigma, float(np.sqrt(jump)))
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(level, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
+    off = np.hypot(*(level - np.median(windows, axis=-1)).T)
+    return off <= 5 * sigma, sigma
+
+
 def gyro_against_course(yaw, course) -> tuple[Reason, ...]:
     """
     Compare turns by gyro and by fixes; name a wrong sign or unit of the gyro.

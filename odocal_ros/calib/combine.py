@@ -5,6 +5,7 @@ import numpy as np
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.reasons import Code, Reason
 
+DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
 Z95 = 1.6449       # one-sided 95 % point of the normal law
 
 
@@ -66,7 +67,8 @@ def _combine(parameter, i, have):
     shared = {n: weight @ g for n, g in by_leg.items()}
     variance = 1 / (1 / own).sum()
     # what legs may differ by: their own errors, and shared ones that act differently
-    apart = own + sum(((g - shared[n])**2).sum(axis=1) for n, g in by_leg.items())
+    apart = own + sum(((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
+                      for n, g in by_leg.items())
     freedom = len(y) - 1
     chi2 = float(((y - mean)**2 / apart).sum()) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()

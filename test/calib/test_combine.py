@@ -97,6 +97,17 @@ def test_a_spread_that_the_shared_error_explains_is_no_disagreement():
     assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and the approximation's 1 %
 
 
+def test_a_level_that_was_drawn_anew_is_no_disagreement():
+    """Legs of two power-ups have two accelerometer biases: allowed for, yet not averaged down."""
+    def pitched(value):
+        one = method()
+        return replace(one, estimates=one.estimates | {PITCH: Estimate(value, 5e-4, 'rad')})
+    whole = combine_method('two_point', [pitched(0.0065), pitched(0.0075)], CONFIG)
+    assert whole.reasons == ()
+    assert whole.estimates[PITCH].sigma > 5e-4
+    assert combine_method('two_point', [pitched(0.0), pitched(0.005)], CONFIG).reasons != ()
+
+
 def test_the_combined_sigma_holds_for_drawn_legs():
     """1000 draws of four legs with a common heading error: variance within 5 * sqrt(2/1000)."""
     rng, z = np.random.default_rng(6), []

@@ -9,6 +9,7 @@ from odocal_ros.calib.check import (
     gyro_against_course,
     mismatch,
     pieces,
+    steady,
     track_check,
 )
 from odocal_ros.calib.judge import judge, nominal_scale
@@ -171,6 +172,16 @@ class TestCheck:
         assert codes(reasons) == [Code.REVERSING_UNSIGNED]
         assert 'on 2 of 8 pieces' in reasons[0].text
         assert against_travel(course + 0.3, course, signed=True) == ()
+
+    def test_outliers_have_no_direction(self):
+        rng = np.random.default_rng(4)
+        residual = rng.standard_normal((500, 3)) + np.linspace(0, 300, 500)[:, None]
+        residual[[100, 101, 300], 0] += 30.0
+        keep, sigma = steady(residual, 0.5)
+        assert np.flatnonzero(~keep).tolist() == [100, 101, 300]
+        # of 500 white errors of 1 m on a track that goes astray by 0.6 m a fix
+        assert sigma == pytest.approx(1.05, abs=0.15)
+        assert steady(residual, 9.0)[1] == 9.0
 
     def test_pieces_are_long_enough_for_a_direction(self):
         t = np.arange(0.0, 100.0)
