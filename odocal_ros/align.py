@@ -10,7 +10,16 @@ import numpy as np
 
 from odocal_ros.config import Config
 from odocal_ros.grades import Grade, grade_of
-from odocal_ros.nav.alignment import complete, gyrocompass, Level, level_at_rest, level_in_motion
+from odocal_ros.nav.alignment import (
+    COMPASS_LIMIT,
+    complete,
+    COURSE_DISTANCE,
+    gyrocompass,
+    Level,
+    level_at_rest,
+    level_in_motion,
+    MOTION_LEVEL,
+)
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.earth import C_en, earth_rate_n
@@ -19,10 +28,7 @@ from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import Inputs
 
-MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
-COURSE_DISTANCE = 30.0    # m of track for a course
-COURSE_TIME = 300.0       # s within which it must be driven
-COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
+COURSE_TIME = 300.0       # s within which the way for a course must be driven
 HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
 NOISY = 10.0              # times the noise of the grade at rest: another gyro, or another unit
 NEAR = 0.5                # s: a heading sample this near to a moving start is taken

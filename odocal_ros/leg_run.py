@@ -18,7 +18,7 @@ from odocal_ros.calib.check import (
 )
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import judge, nominal_scale
-from odocal_ros.calib.marks import fix_at, MarkFix, standing_at
+from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
@@ -32,11 +32,11 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
 
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
-MARK_WINDOW = 1.0       # s, least half-window of fixes about a mark in motion
 FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 TRACK_ROWS = 5000       # of a track kept in a result
+WORTH = 0.01            # relative sigma up to which a scale gives the distance
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -100,7 +100,7 @@ class LegRun:
             return leg_result(self.leg, self.inputs, self.reasons, distance=distance)
         method, more = self._two_point(chord, distance)
         return leg_result(self.leg, self.inputs, self.reasons, {'two_point': method},
-                       distance=distance, **more)
+                          **{'distance': distance} | more)
 
     def _say(self, code, text):
         self.reasons.append(Reason(code, text))
@@ -223,6 +223,9 @@ class LegRun:
             method.estimates, self.nominal, config))
         step = max(1, len(self.track.t) // TRACK_ROWS)
         P = self.track.P[::step] - self.track.at(chord.start.t)
+        scale = method.estimates['scale_factor']
+        if scale.sigma < WORTH * scale.value:        # truer than the rough scale
+            more['distance'] = distance * scale.value / self.rough
         more |= {'track_n': chord.start.position_n + P @ f,
                  'track_before_n': chord.start.position_n + P @ before,
                  'reference_n': fixes[1],

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+MARK_WINDOW = 1.0    # s, least half-window of fixes about a mark in motion
 OUTLIER = 5.0        # robust sigmas from the median
 ENOUGH = 20          # fixes below which nothing is judged about their correlation
 

@@ -5,15 +5,20 @@ import numpy as np
 from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.config import Config
 from odocal_ros.grades import grade_of
-from odocal_ros.nav.alignment import complete, gyrocompass, Level, level_at_rest, level_in_motion
+from odocal_ros.nav.alignment import (
+    COMPASS_LIMIT,
+    complete,
+    COURSE_DISTANCE,
+    gyrocompass,
+    Level,
+    level_at_rest,
+    level_in_motion,
+    MOTION_LEVEL,
+)
 from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
 from odocal_ros.reasons import Code, Reason
 
-# as align.py takes them for a recorded leg
-MOTION_LEVEL = 30.0         # s of driving that a level without standstill is taken from
-COMPASS_LIMIT = 0.05        # rad: a gyrocompass worse than this is no heading
-COURSE_DISTANCE = 30.0      # m of track for a course
 OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
 

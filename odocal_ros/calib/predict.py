@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import judge_drive
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.marks import MarkFix, mean_fix, standing_at
+from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
 from odocal_ros.calib.planned_alignment import plan_alignment
 from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.calib.result import MethodResult
@@ -25,7 +25,6 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.reasons import Reason, Verdict
 
-MARK_WINDOW = 1.0           # s each side of a mark in motion, as leg_run.py
 CORRELATION_TIME = 60.0     # s over which fixes of one receiver stay alike where nothing is said
 FORWARD = np.array([1.0, 0.0, 0.0])
 

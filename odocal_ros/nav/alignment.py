@@ -14,6 +14,10 @@ from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
 RULED_OUT = 10.0   # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
+# what a leg is aligned by, recorded or planned
+MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
+COURSE_DISTANCE = 30.0    # m of track for a course
+COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
 EDGE = 0.3     # s cut off each end of a standstill: a slow start leans the specific force
 
 
