@@ -33,7 +33,7 @@ def combine(legs, config: Config) -> Calibration:
     used = good or legs
     reasons = _leg_reasons(legs, good)
     names = dict.fromkeys(n for leg in used for n in leg.methods)
-    methods = {n: combine_method(n, [leg.methods[n] for leg in used if n in leg.methods], config)
+    methods = {n: combine_method(n, [leg.methods[n] for leg in used if n in leg.methods])
                for n in names}
     chosen = next(iter(methods.values()), None)
     estimates = {} if chosen is None else {

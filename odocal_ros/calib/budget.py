@@ -25,7 +25,7 @@ def parameter_gradient(f):
     """Return the (3, 3) derivative of (ln K, yaw, pitch) by f = K forward_b."""
     K = np.linalg.norm(f)
     x, y, z = f
-    level = np.hypot(x, z)
+    level = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # as mounting_from_forward has it
     return np.array([f / K**2,
                      [x * y / level / K**2, -level / K**2, z * y / level / K**2],
                      [-z / level**2, 0.0, x / level**2]])
@@ -201,3 +201,11 @@ def budget_table(sources, parameters, scale):
     """
     return {s.name: {p: float(np.linalg.norm(s.effects[i]) * scale[i])
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
+
+
+def correlations(covariance, names):
+    """Return the correlation of each pair of parameters, for calibration.json."""
+    sigma = np.sqrt(np.diag(covariance))
+    rho = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
+    return {f'{names[i]},{names[j]}': float(rho[i, j])
+            for i in range(len(names)) for j in range(i + 1, len(names))}

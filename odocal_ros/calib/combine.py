@@ -1,7 +1,10 @@
 """Several legs of one vehicle to one result: own errors average down, shared ones do not."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from odocal_ros.calib.budget import budget_table, correlations, total_covariance
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.reasons import Code, Reason
 
@@ -9,7 +12,7 @@ DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not o
 Z95 = 1.6449       # one-sided 95 % point of the normal law
 
 
-def combine_method(name, results, config) -> MethodResult:
+def combine_method(name, results) -> MethodResult:
     """
     Combine what one method says of several legs.
 
@@ -19,8 +22,6 @@ def combine_method(name, results, config) -> MethodResult:
         The method.
     results : list of MethodResult
         One a leg, at least one.
-    config : Config
-        Settings in force.
 
     Returns
     -------
@@ -47,9 +48,30 @@ def combine_method(name, results, config) -> MethodResult:
         estimates[parameter] = Estimate(value, sigma, unit)
         for source, effect in (shared | {'legs': np.array([np.sqrt(own)])}).items():
             sources.setdefault(source, []).append((i, effect))
-    estimates |= _ratio(results, estimates)
-    return MethodResult(name, reasons, estimates, parameters, _stacked(sources, len(parameters)),
-                        {'legs_used': len(results)})
+    estimates |= _ratio(results, estimates) | _newest(results, estimates)
+    stacked = _stacked(sources, len(parameters))
+    return MethodResult(name, reasons, estimates, parameters, stacked,
+                        {'legs_used': len(results)} | _details(stacked, parameters, estimates))
+
+
+def _newest(results, estimates):
+    """Return what belongs to a leg alone (gyro bias) from the last leg that knows it."""
+    names = [n for n in results[0].estimates if n not in estimates and n != 'scale_ratio']
+    return {n: next((r.estimates[n] for r in reversed(results)
+                     if r.estimates[n].value is not None), results[0].estimates[n])
+            for n in names}
+
+
+def _details(sources, parameters, estimates):
+    """Return budget and correlation of a combination, as a leg's result has them."""
+    known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
+    if not known:
+        return {}
+    names = [parameters[i] for i in known]
+    rows = [replace(s, effects=s.effects[known]) for s in sources]
+    scale = [estimates[p].value if p.startswith('scale_factor') else 1.0 for p in names]
+    return {'budget': budget_table(rows, names, scale),
+            'correlation': correlations(total_covariance(rows), names)}
 
 
 def _combine(parameter, i, have):

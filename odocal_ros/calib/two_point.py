@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.budget import (
     budget,
     budget_table,
+    correlations,
     parameter_gradient,
     PARAMETERS,
     total_covariance,
@@ -111,7 +112,7 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
 def unsolved(reasons, scale_unit) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad'}
+             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
     return MethodResult('two_point', tuple(reasons),
                         {name: Estimate(None, None, unit) for name, unit in units.items()},
                         PARAMETERS)
@@ -153,15 +154,25 @@ def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> 
         'yaw_mounting_angle': Estimate(yaw, float(sigma[1]), 'rad') if separable
         else Estimate(None, None, 'rad'),
         'pitch_mounting_angle': Estimate(pitch, float(sigma[2]), 'rad') if vertical_known
-        else Estimate(None, None, 'rad')}
+        else Estimate(None, None, 'rad'),
+        **_gyro_bias(chord.alignment)}
     details = {'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
-               'correlation': _correlations(covariance),
+               'correlation': correlations(covariance, PARAMETERS),
                'cross_check': _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0
                                           else K, config),
                'heading_source': chord.alignment.heading_source}
     reasons += _planes_agree(details['cross_check'], K, sigma[0])
     return MethodResult('two_point', reasons, estimates, PARAMETERS, sources,
                         details | {'f': f})
+
+
+def _gyro_bias(alignment):
+    """Return the gyro bias in b as estimates, not determined without a standstill."""
+    known = alignment.standstill is not None
+    return {f'gyro_bias_{axis}': Estimate(float(bias), float(sigma), 'rad/s') if known
+            else Estimate(None, None, 'rad/s')
+            for axis, bias, sigma in zip('xyz', alignment.gyro_bias, alignment.gyro_bias_sigma,
+                                         strict=True)}
 
 
 def _sources(chord, f, vertical_known, quantum, fix_scale, config):
@@ -230,13 +241,6 @@ def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
     return reasons
 
 
-def _correlations(covariance):
-    sigma = np.sqrt(np.diag(covariance))
-    rho = covariance / np.outer(sigma, sigma)
-    return {f'{PARAMETERS[i]},{PARAMETERS[j]}': float(rho[i, j])
-            for i in range(3) for j in range(i + 1, 3)}
-
-
 def _cross_check(chord, f, nominal_scale, config):
     """
     Return K and yaw by eq. (6)-(10) in the plane and by the geodesic, S1 / S2 and bearings.
@@ -251,7 +255,7 @@ def _cross_check(chord, f, nominal_scale, config):
     end_n = chord.end.position_n - turn @ _C_bv(yaw, pitch) @ chord.lever_b
     reckoned_n = start_n + nominal_scale * chord.M @ forward_b(0.0, pitch)
     o, b, b_dr = (chord.origin.to_geodetic(p) for p in (start_n, end_n, reckoned_n))
-    plane = plane_for(config.projection, (o[1] + b[1]) / 2)
+    plane = plane_for(config.projection, o[1] + wrap(b[1] - o[1]) / 2)
     results = {}
     for name, length in (('plane', lambda p, q: plane_chord(plane, p, q)),
                          ('geodesic', geodesic_chord)):

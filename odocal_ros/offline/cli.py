@@ -77,7 +77,8 @@ def _internal(error) -> int:
                                      delete=False) as f:
         f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n')
         traceback.print_exception(error, file=f)
-    print(f'odocal: internal error ({type(error).__name__}: {str(error).splitlines()[0:1]}); '
+    first = (str(error).splitlines() or [''])[0]
+    print(f'odocal: internal error ({type(error).__name__}: {first}); '
           f'please report it with {f.name}', file=sys.stderr)
     return INTERNAL
 

@@ -97,8 +97,7 @@ def _second_leg(drive, sigmas, before):
     if before.sigma(SCALE) is None:
         return []
     other = predict(drive.turned_around(), sigmas)
-    both = combine_method('two_point', [_whole(before.method), _whole(other.method)],
-                          sigmas.config)
+    both = combine_method('two_point', [_whole(before.method), _whole(other.method)])
     yaw = both.estimates[YAW].sigma if before.sigma(YAW) is not None else None
     return [Change('a second leg in the other direction', both.estimates[SCALE].sigma, yaw)]
 

@@ -7,6 +7,8 @@ route whose kinks lie on them is then exact, a cubic one nearly so. White noise 
 sample rate, so that sums over time have the stated density.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.nav.earth import radii
@@ -26,7 +28,7 @@ from odocal_ros.sim.motion import (
     point,
 )
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
-from odocal_ros.sim.options import SIM_GRADES, SimOptions
+from odocal_ros.sim.options import ORIGIN, SIM_GRADES, SimOptions
 
 # seconds from the first Imu sample, so that no two topics sample together
 ODOMETER_PHASE, FIX_PHASE, HEADING_PHASE = 0.002, 0.003, 0.004
@@ -88,11 +90,11 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
-    """Return an outside heading of the Imu's x axis, as a dual-antenna receiver sends it."""
+    """Return an outside heading of b's x axis, as a dual-antenna receiver sends it."""
     ns, t = stamps(motion.duration, options.heading_rate, HEADING_PHASE)
-    q_ni = _orientation(motion.at(t), options, sigma, 'heading')
+    q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ORIGIN), sigma, 'heading')
     stamp = options.start_ns + ns
-    return HeadingSamples(stamp, stamp + round(HEADING_TRANSPORT * 1e9), q_ni,
+    return HeadingSamples(stamp, stamp + round(HEADING_TRANSPORT * 1e9), q_nb,
                           np.full(len(t), sigma**2))
 
 

@@ -38,12 +38,12 @@ def leg(result, *codes):
 
 def test_one_leg_is_itself():
     one = method()
-    assert combine_method('two_point', [one], CONFIG) is one
+    assert combine_method('two_point', [one]) is one
 
 
 @pytest.mark.parametrize('n', [2, 5, 16])
 def test_own_errors_average_down_and_shared_ones_stay(n):
-    e = combine_method('two_point', [method()] * n, CONFIG).estimates
+    e = combine_method('two_point', [method()] * n).estimates
     assert e[SCALE].value == pytest.approx(0.02)
     assert e[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(n))
     assert e[YAW].sigma == pytest.approx(np.hypot(OWN / np.sqrt(n), HEADING))
@@ -53,8 +53,8 @@ def test_own_errors_average_down_and_shared_ones_stay(n):
 
 
 def test_better_legs_weigh_more():
-    e = combine_method('two_point', [method(yaw=0.010), method(yaw=0.0102, own=OWN / 3)],
-                       CONFIG).estimates[YAW]
+    legs = [method(yaw=0.010), method(yaw=0.0102, own=OWN / 3)]
+    e = combine_method('two_point', legs).estimates[YAW]
     assert e.value == pytest.approx(0.0102 * 0.9 + 0.010 * 0.1)
 
 
@@ -64,15 +64,15 @@ def test_a_shared_error_of_opposite_effect_cancels():
         one = method(heading=0.0)
         arm = Source('antenna_lever_arm', np.array([[sign * 1e-2], [0.0], [0.0]]), shared=True)
         return replace(one, sources=(*one.sources, arm))
-    there_and_back = combine_method('two_point', [with_antenna(1), with_antenna(-1)], CONFIG)
-    twice = combine_method('two_point', [with_antenna(1), with_antenna(1)], CONFIG)
+    there_and_back = combine_method('two_point', [with_antenna(1), with_antenna(-1)])
+    twice = combine_method('two_point', [with_antenna(1), with_antenna(1)])
     assert there_and_back.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
     assert twice.estimates[SCALE].sigma / 0.02 == pytest.approx(np.hypot(OWN / np.sqrt(2), 1e-2))
 
 
 def test_a_spread_beyond_the_sigmas_is_named_and_widens():
     legs = [method(scale=0.02 * (1 + d)) for d in (-1e-3, 0.0, 1e-3)]
-    whole = combine_method('two_point', legs, CONFIG)
+    whole = combine_method('two_point', legs)
     # chi-square 200 on two degrees: ten times the spread that the sigmas allow
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(10 * OWN / np.sqrt(3), rel=1e-3)
     assert [r.code for r in whole.reasons] == [Code.LEGS_DISAGREE]
@@ -86,14 +86,14 @@ def test_a_spread_that_the_shared_error_explains_is_no_disagreement():
         one = method(yaw=yaw)
         return replace(one, sources=(one.sources[0], replace(
             one.sources[1], effects=np.array([[0.0], [value], [0.0]])), one.sources[2]))
-    whole = combine_method('two_point', [heading(1e-3, 0.011), heading(-1e-3, 0.009)], CONFIG)
+    whole = combine_method('two_point', [heading(1e-3, 0.011), heading(-1e-3, 0.009)])
     assert whole.reasons == ()
     # and legs drawn by their own sigmas disagree in a twentieth of cases
     rng, named = np.random.default_rng(5), 0
     for _ in range(400):
         legs = [method(scale=0.02 * np.exp(OWN * z)) for z in rng.standard_normal(4)]
         named += any(r.text.startswith('scale') for r in
-                     combine_method('two_point', legs, CONFIG).reasons)
+                     combine_method('two_point', legs).reasons)
     assert 0.02 < named / 400 < 0.09      # 5 % +- 3 * 1.1 %, and the approximation's 1 %
 
 
@@ -102,10 +102,10 @@ def test_a_level_that_was_drawn_anew_is_no_disagreement():
     def pitched(value):
         one = method()
         return replace(one, estimates=one.estimates | {PITCH: Estimate(value, 5e-4, 'rad')})
-    whole = combine_method('two_point', [pitched(0.0065), pitched(0.0075)], CONFIG)
+    whole = combine_method('two_point', [pitched(0.0065), pitched(0.0075)])
     assert whole.reasons == ()
     assert whole.estimates[PITCH].sigma > 5e-4
-    assert combine_method('two_point', [pitched(0.0), pitched(0.005)], CONFIG).reasons != ()
+    assert combine_method('two_point', [pitched(0.0), pitched(0.005)]).reasons != ()
 
 
 def test_the_combined_sigma_holds_for_drawn_legs():
@@ -114,22 +114,22 @@ def test_the_combined_sigma_holds_for_drawn_legs():
     for _ in range(1000):
         common = HEADING * rng.standard_normal()
         legs = [method(yaw=0.01 + common + OWN * x) for x in rng.standard_normal(4)]
-        e = combine_method('two_point', legs, CONFIG).estimates[YAW]
+        e = combine_method('two_point', legs).estimates[YAW]
         z.append((e.value - 0.01) / e.sigma)
     assert 0.88 < np.std(z) < 1.11
 
 
 def test_a_leg_without_a_yaw_still_gives_its_scale():
-    whole = combine_method('two_point', [method(refused=[YAW]), method()], CONFIG)
+    whole = combine_method('two_point', [method(refused=[YAW]), method()])
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
     assert whole.estimates[YAW].sigma == pytest.approx(np.hypot(OWN, HEADING))
-    nobody = combine_method('two_point', [method(refused=[YAW])] * 2, CONFIG)
+    nobody = combine_method('two_point', [method(refused=[YAW])] * 2)
     assert nobody.estimates[YAW].value is None
     assert nobody.estimates[SCALE].value is not None
 
 
 def test_the_combined_sources_make_the_combined_sigma():
-    whole = combine_method('two_point', [method(), method(own=2 * OWN)], CONFIG)
+    whole = combine_method('two_point', [method(), method(own=2 * OWN)])
     total = sum(s.effects @ s.effects.T for s in whole.sources)
     for i, (name, scale) in enumerate(((SCALE, 0.02), (YAW, 1.0), (PITCH, 1.0))):
         assert np.sqrt(total[i, i]) * scale == pytest.approx(whole.estimates[name].sigma)
@@ -179,3 +179,13 @@ def test_the_rotation_is_the_mounting_on_top_of_the_nominal_one():
     turned = replace(leg(method()), C_bi=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
     rpy = combine([turned], CONFIG).imu_rotation_rpy
     assert rpy[2] == pytest.approx(np.pi / 2 + 0.01)
+
+
+def test_a_combination_states_its_budget_and_correlation():
+    whole = combine_method('two_point', [method(), method()])
+    assert set(whole.details['budget']) == {s.name for s in whole.sources}
+    total = {p: sum(row[p]**2 for row in whole.details['budget'].values())
+             for p in (YAW, 'scale_factor')}
+    for name, variance in total.items():
+        assert np.sqrt(variance) == pytest.approx(whole.estimates[name].sigma)
+    assert all(abs(rho) <= 1 + 1e-12 for rho in whole.details['correlation'].values())

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from odocal_ros.grades import Grade, GRADES
+from odocal_ros.nav.angles import heading_from_yaw, wrap
 from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, Start
@@ -317,3 +318,19 @@ def test_contact_point_beside_the_axle_sees_the_turn():
     wanted = contact_travel(drive.motion.at(t), (0.0, 0.7, 0.0))
     assert_allclose(rolled, wanted - wanted[0], atol=1e-10)
     assert abs(rolled[-1] - drive.motion.distance) > 0.1
+
+
+def test_heading_topic_is_of_the_body_frame_and_the_orientation_of_the_sensors():
+    sideways = (np.pi / 2, 0.0, -np.pi / 2)
+    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=20.0,
+                                mounting_rpy=sideways, heading_sigma=1e-9,
+                                orientation_sigma=1e-9))
+
+    def yaw(q):
+        C = matrix_from_quat(q)
+        return np.arctan2(C[0, 1, 0], C[0, 0, 0])
+
+    assert heading_from_yaw(yaw(drive.heading.q_ni)) == pytest.approx(drive.truth.heading)
+    # the sensor's own x axis points to the side
+    off = wrap(yaw(drive.imu.q_ni) - yaw(drive.heading.q_ni))
+    assert abs(off) > 1.0
