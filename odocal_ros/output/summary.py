@@ -12,6 +12,8 @@ WIDTH = 98
 PPM = 1e6
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
+DEG_PER_HOUR = DEG * 3600
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
@@ -90,10 +92,17 @@ def _values(calibration):
         lines.append(_line(f'{word} mounting', text))
     for name in estimates:
         estimate = known(estimates, name)
-        if name not in ('scale_factor', 'scale_ratio', *ANGLES) and estimate.value is not None:
+        if name not in ('scale_factor', 'scale_ratio', *ANGLES, *BIASES) \
+                and estimate.value is not None:
             lines.append(_line(name.replace('_', ' '), _with_unit(estimate)))
+    biases = [known(estimates, name) for name in BIASES]
+    if all(bias.value is not None for bias in biases):
+        shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
+        lines.append(_line('gyro bias x, y, z', f'{shown} deg/h'))
     if calibration.imu_rotation_rpy is not None:
-        rpy = ', '.join(f'{angle * DEG:.3f}' for angle in calibration.imu_rotation_rpy)
+        # + 0.0: no minus before a zero
+        rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
+                        for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return lines
 
