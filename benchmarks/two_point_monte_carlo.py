@@ -1,5 +1,5 @@
 """
-Monte Carlo of the two-point method over whole simulated drives, to see whether the stated sigmas hold.
+Monte Carlo of the two-point method over whole simulated drives: whether stated sigmas hold.
 
     python benchmarks/two_point_monte_carlo.py [--drives 100] [--first-seed 1000] [--only TEXT]
 
