@@ -292,3 +292,18 @@ def test_changes_of_a_drive_change_what_they_say():
     half = drive.until(300.0, 20.0)
     assert half.distance == pytest.approx(20 * 300 - 400, rel=1e-2)
     assert predict(half, Sigmas(config=config())).standing[1] == pytest.approx(20.0, abs=0.2)
+
+
+def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest():
+    drive = simulate(SimOptions(scenario='town', imu_grade='consumer', imu_rate=50.0, seed=4))
+    assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to take out
+    leg = drive.leg()
+    profile = profile_of(leg, with_settings(Config(), {'imu.grade': 'consumer'}))
+    t = (leg.start_ns - drive.options.start_ns) * 1e-9 + profile.t
+    true = drive.motion.at(t).yaw
+    turned, truly = profile.yaw - profile.yaw[0], true - true[0]
+    # noise over 20 s at rest leaves 2e-5 rad/s of the bias, 0.012 rad in ten minutes; five of that
+    np.testing.assert_allclose(turned, truly, atol=0.06)
+    # and the first course by fixes of 1.5 m over kilometres: a milliradian, the bow of above on it
+    off = np.median(profile.yaw - true)
+    assert abs((off + math.pi) % (2 * math.pi) - math.pi) < 0.06

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.check import fix_noise_factor
-from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.marks import MarkFix, mean_fix
 from odocal_ros.calib.slow_errors import no_better, slow_share, slow_variance
 
 RATE, RUNS = 0.5, 60        # s between fixes, drives
@@ -95,3 +95,15 @@ def test_the_noise_factor_leaves_out_what_the_marks_put_into_the_track():
     assert factors[0][1] == 1.0
     assert factors[1][1] == pytest.approx(2.0, rel=0.1)
     assert factors[1][0] > 1.1 * factors[1][1]
+
+
+def test_chance_scatter_does_not_widen_white_fixes():
+    rng, stated = np.random.default_rng(8), np.tile(np.diag([1.0, 1.0, 4.0]), (60, 1, 1))
+    t, variances = np.arange(60) * RATE, []
+    for _ in range(300):
+        _, covariance, used, _ = mean_fix(t, rng.standard_normal((60, 3)) * [1.0, 1.0, 2.0],
+                                          stated)
+        variances.append(covariance[0, 0] * used)
+    # the larger of 1 and a scatter that errs by 1 / sqrt(60) would make 1.05 on the mean; one
+    # drive in a thousand is judged slow or scattered, beyond three sigmas
+    assert np.mean(np.isclose(variances, 1.0)) > 0.98
