@@ -20,6 +20,7 @@ from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.slip import find_slips, slip_reason
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.fix_screen import origin_amid
@@ -213,6 +214,11 @@ class LegRun:
             if self.holdout:
                 more |= self._held_out(chord, before, f)
             self._judge_track(chord, f, fixes, residual, more['after'], drift, distance)
+        slips = find_slips(inputs.t_imu, inputs.f_b, self.track, f, self.origin.latitude,
+                           inputs.travel.quantum)
+        held = (slips[0] >= chord.start.t) & (slips[0] <= chord.end.t)
+        chord = replace(chord, slips=tuple(x[held] for x in slips))
+        self.reasons += slip_reason(*chord.slips)
         method = fit(chord, self.nominal, inputs.scale_unit, inputs.travel.quantum, factor,
                      config)
         if not chord.alignment.heading_separable and chord.M[:2, 0] @ chord.M[:2, 0] > 0 \

@@ -42,7 +42,8 @@ class Code(Enum):
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
     REVERSING_UNSIGNED = REJECT, ('Do not reverse during a leg, or use an odometer that counts '
                                   'backwards (odometer.signed).')
-    ODOMETER_REVERSED = REJECT, 'Set odometer.reversed to true (or false if it is).'
+    ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '
+                                 'faces backwards, set imu.mounting_rpy or imu.nominal_yaw.')
     ODOMETER_STILL = REJECT, 'Check wheel sensor and topic: the fixes move, the counter does not.'
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
                          'imu.gyro_scale.')
@@ -69,6 +70,8 @@ class Code(Enum):
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
     TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
                                'fixes; drive again on a firm straight road with open sky.')
+    WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '
+                           'the sigma was widened by the slip seen.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
                                   'alignment.heading with its sigma, a dual-antenna heading '

@@ -23,6 +23,7 @@ from odocal_ros.calib.budget import (
 )
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.slip import slip_source
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
@@ -32,6 +33,8 @@ from odocal_ros.reasons import Code, Reason
 
 CHORD_SHARE = 0.2        # of the path: under it, the chord is no measure of the path
 PITCH_PRIOR = 0.05       # rad, what is believed of the pitch where heights say nothing
+BACKWARDS = np.deg2rad(160.0)    # of yaw from nominal: no mounting, but the other way round
+FAR = np.deg2rad(20.0)           # of yaw from nominal: a nominal rotation or heading is wrong
 PITCH_LIMIT = 0.26       # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
 PLANE_LIMIT = 3e-5       # relative: a plane about the leg keeps ratios of chords far better
 
@@ -49,6 +52,8 @@ class Chord:
     alignment: Alignment
     # travel in doubt: where, s, and how much, scale units
     doubt: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.empty(0), np.empty(0))
+    # wheel slips: when, s, and how far, m
+    slips: tuple[NDArray[np.float64], NDArray[np.float64]] = (np.empty(0), np.empty(0))
 
     @property
     def M(self) -> NDArray[np.float64]:
@@ -196,14 +201,17 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
 
 
 def _doubt(chord, f):
-    """Return the source of travel lost in gaps and resets, empty where there are none."""
+    """Return the sources of travel lost in gaps and resets, and of slip; empty where none."""
+    gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
+    sources: tuple[Source, ...] = ()
+    if len(chord.slips[0]):
+        sources += (slip_source(chord.track, f, gradient, *chord.slips),)
     t, size = chord.doubt
     inside = (t >= chord.start.t) & (t <= chord.end.t) & (size > 0)
-    if not inside.any():
-        return ()
-    along_n = chord.track.C_nb_at(t[inside]) @ f * size[inside, None]      # (k, 3) m
-    gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
-    return (Source('odometer_gaps', gradient @ along_n.T),)
+    if inside.any():
+        along_n = chord.track.C_nb_at(t[inside]) @ f * size[inside, None]      # (k, 3) m
+        sources += (Source('odometer_gaps', gradient @ along_n.T),)
+    return sources
 
 
 def _blind_height(mark, sigma=0.0):
@@ -228,13 +236,14 @@ def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
                            f'{np.rad2deg(asked):.3f} deg: end points see but their sum'),)
     nominal = config.imu.nominal_yaw
     far = abs(float(wrap(yaw - (0.0 if np.isnan(nominal) else nominal))))
-    if not reasons and far > np.pi / 2:
+    if alignment.heading_separable and far > BACKWARDS:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
                            f'counts mean backwards, or the Imu faces backwards (yaw '
                            f'{np.rad2deg(yaw):+.1f} deg)'),)
-    elif not reasons and far > np.deg2rad(20.0):
-        reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.2f} deg '
-                           f'is {np.rad2deg(far):.1f} deg from the nominal one'),)
+    elif alignment.heading_separable and far > FAR:
+        reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
+                           f'course make a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
+                           f'{np.rad2deg(far):.1f} deg from the nominal one'),)
     if not vertical_known:
         reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height good enough for '
                            f'the pitch; taken as 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg'),)

@@ -34,7 +34,7 @@ FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
 class Truth:
     """What a calibration of the drive should find."""
 
-    scale: float                 # m/pulse, 1 or m/rad; of two wheels the mean
+    scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
     scale_ratio: float           # K / K0
     wheel_scales: tuple[float, ...]
     yaw: float                   # rad, mounting

@@ -113,10 +113,16 @@ def wheel_arms(options: SimOptions):
 
 
 def wheel_scales(options: SimOptions):
-    """Return the true scale of each wheel; the mean of two is ``options.scale``."""
-    half = options.wheel_difference / 2
-    return ([options.scale * (1 - half), options.scale * (1 + half)] if options.two_wheels
-            else [options.scale])
+    """
+    Return the true scale of each wheel.
+
+    ``options.scale`` is what turns the mean of two counts into metres: their harmonic mean.
+    """
+    if not options.two_wheels:
+        return [options.scale]
+    ratio = 1 + options.wheel_difference        # right over left
+    left = options.scale * (1 + 1 / ratio) / 2
+    return [left, left * ratio]
 
 
 def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:

@@ -183,8 +183,9 @@ def test_two_wheels_roll_on_their_own_sides_with_their_own_scales():
     left, right = drive.odometer, drive.odometer_right
     assert np.array_equal(left.stamp_ns, right.stamp_ns)
     k_left, k_right = drive.truth.wheel_scales
-    assert k_right / k_left == pytest.approx(1.01 / 1.0, rel=1e-4)
-    assert (k_left + k_right) / 2 == pytest.approx(drive.truth.scale)
+    assert k_right / k_left == pytest.approx(1.01)
+    # the mean of both counts times the scale is the way: the harmonic mean of the two
+    assert 2 / (1 / k_left + 1 / k_right) == pytest.approx(drive.truth.scale)
     t = (left.stamp_ns - drive.options.start_ns) * 1e-9
     state = drive.motion.at(t)
     apart = k_right * (right.value - right.value[0]) - k_left * (left.value - left.value[0])

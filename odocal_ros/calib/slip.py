@@ -1,0 +1,113 @@
+"""
+Wheel slip: where the odometer runs farther than the Imu's acceleration allows.
+
+Over a few seconds the way is the integral of speed, and the speed that of the specific force along
+the forward axis less gravity. With the speed pinned to the odometer's at both ends of the window,
+a steady accelerometer bias, a tilt and a late odometer drop out; what a wheel spun in between does
+not.
+"""
+
+import numpy as np
+
+from odocal_ros.calib.result import Source
+from odocal_ros.nav.earth import gravity
+from odocal_ros.reasons import Code, Reason
+
+WINDOW = 4.0       # s, longer than a spin, shorter than a hill
+STEP = 0.2         # s, grid
+PINS = 2           # steps each side that the speed at an end is taken over
+LEAST = 0.45       # m: 0.1 m/s^2 of tilt wandering within a window makes a third of it
+TURN = 0.1         # rad in a window: more is a turn
+COUNTS = 8.0       # odometer counts: what pins by counts may make of a window
+
+
+def find_slips(t_imu, f_b, track, f, latitude, quantum):
+    """
+    Return when and how far the odometer ran ahead of the Imu.
+
+    Parameters
+    ----------
+    t_imu, f_b : (n,), (n, 3) arrays
+        Specific force, s, m/s^2.
+    track : Track
+        Attitude and travel.
+    f : (3,)
+        Scale times forward axis.
+    latitude : float
+        rad.
+    quantum : float
+        Size of an odometer count, scale units.
+
+    Returns
+    -------
+    t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
+
+    """
+    K = float(np.linalg.norm(f))
+    grid = np.arange(max(track.t[0], t_imu[0]), min(track.t[-1], t_imu[-1]), STEP)
+    span = round(WINDOW / STEP)
+    if len(grid) < 2 * span:
+        return np.empty(0), np.empty(0)
+    acceleration = _acceleration(grid, t_imu, f_b, track, f / K, latitude)
+    excess = _excess(span, acceleration, K * np.interp(grid, track.t, track.s))
+    # in a turn the level error comes to bear on another axis: no window is judged there
+    C = track.C_nb_at(grid)
+    yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))[PINS:-PINS]
+    excess[np.abs(yaw[span:] - yaw[:-span]) > TURN] = 0.0
+    # what the drive as a whole does (rough road, soft suspension) is no event
+    usual = np.median(np.abs(excess[excess != 0.0])) / 0.6745 if excess.any() else 0.0
+    limit = max(LEAST, COUNTS * quantum * K, 6 * usual)
+    return _events(grid[PINS:-span - PINS] + WINDOW / 2, excess, limit)
+
+
+def _acceleration(grid, t_imu, f_b, track, forward, latitude):
+    """Return the mean acceleration along the forward axis from each grid time to the next."""
+    along = f_b @ forward
+    total = np.concatenate([[0.0], np.cumsum((along[:-1] + along[1:]) / 2 * np.diff(t_imu))])
+    force = np.diff(np.interp(grid, t_imu, total)) / STEP
+    rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
+    return force - gravity(latitude, 0.0) * rise
+
+
+def _excess(span, acceleration, way):
+    """
+    Return the odometer's way over each window less that by acceleration: (m,) m.
+
+    The speed by acceleration is set to the odometer's at both ends by a straight line; both are
+    taken as means over the same few steps, so that a jump of acceleration there does no harm.
+    """
+    u = np.concatenate([[0.0], np.cumsum(acceleration) * STEP])        # speed but for a constant
+    x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * STEP])
+    ahead = way - x                 # its slope is what the speed by acceleration lacks
+    lacks = (ahead[2 * PINS:] - ahead[:-2 * PINS]) / (2 * PINS * STEP)
+    ahead = ahead[PINS:-PINS]
+    return ahead[span:] - ahead[:-span] - (lacks[:-span] + lacks[span:]) / 2 * span * STEP
+
+
+def _events(middle, excess, limit):
+    """
+    Return time and size of each event.
+
+    An event is seen by every window that holds it, from both flanks on: the windows beyond the
+    limit are one group, and in its middle stand those that hold the event whole.
+    """
+    far = np.flatnonzero(np.abs(excess) > limit)
+    groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > WINDOW / 2) + 1)
+    centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
+    k = np.array([c for c in centres if abs(excess[c]) > limit], int)
+    return middle[k], excess[k]
+
+
+def slip_source(track, f, gradient, t, size) -> Source:
+    """Return slips as a source of error: one for all of them, since wheels spin one way."""
+    along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
+    return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
+
+
+def slip_reason(t, size) -> tuple[Reason, ...]:
+    """Return WHEEL_SLIP with what was seen, empty where nothing was."""
+    if not len(t):
+        return ()
+    return (Reason(Code.WHEEL_SLIP, f'at {len(t)} place{"s" * (len(t) > 1)} the odometer and the '
+                   f'Imu part by {np.abs(size).sum():.2f} m in all, first by {size[0]:+.2f} m at '
+                   f't = {t[0]:.1f} s: the wheel spun or slid'),)

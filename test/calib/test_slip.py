@@ -1,0 +1,56 @@
+"""Wheel slip is seen where odometer and Imu part, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.result import Source
+from odocal_ros.config import Config, with_settings
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
+
+
+def result(**options):
+    drive = simulate(SimOptions(**LOW | options))
+    config = with_settings(Config(), {
+        'odometer.nominal_scale': drive.options.nominal_scale,
+        'imu.grade': drive.options.imu_grade})
+    return drive, calibrate(drive.leg(), config)
+
+
+def slips(leg):
+    return [r for r in leg.reasons if r.code is Code.WHEEL_SLIP]
+
+
+@pytest.mark.parametrize('seed', [1, 2, 5])
+def test_spins_are_named_and_the_sigma_holds_what_they_did(seed):
+    drive, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0, seed=seed)
+    (reason,) = slips(leg)
+    assert 'place' in reason.text
+    scale = leg.methods['two_point'].estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 2 * scale.sigma
+    slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
+    # all spins together: about what they moved the scale by, within the two ends' fix noise
+    off = abs(scale.value / drive.truth.scale - 1)
+    assert abs(np.linalg.norm(slip.effects[0]) - off) < 0.5 * off + 1e-4
+
+
+@pytest.mark.parametrize('options', [
+    {'scenario': 'straight'}, {'scenario': 'town'}, {'scenario': 'town', 'odometer': 'speed'},
+    {'scenario': 'straight', 'slope': 0.15}, {'scenario': 'town', 'imu_grade': 'tactical'},
+    {'scenario': 'straight', 'scale': 0.35, 'nominal_scale': 0.35},
+    {'scenario': 'straight', 'odometer_delay': 0.1}])
+def test_no_slip_is_seen_where_there_is_none(options):
+    assert not slips(result(**options)[1])
+
+
+def test_a_source_of_slip_adds_spins_rather_than_averaging_them():
+    _, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0)
+    slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
+    assert isinstance(slip, Source)
+    assert slip.effects.shape[1] == 1
+    assert not replace(slip).shared
