@@ -5,10 +5,13 @@ What the node costs while it records: beside a bare typed subscriber of the same
 
 A publisher process sends Imu, pulses and fixes; the calibrator and a bare rclpy node that
 subscribes to the same topics, typed, with an empty callback, run beside it, all at once. Printed:
-CPU of one core for each, messages lost, and the latency of a service call during a leg.
+CPU of one core for each, messages lost, and the latency of a service call during a leg. The fixes
+drive east at 10 m/s while the pulses count, so that the node has something to foresee: how often
+it did is printed too.
 """
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 import statistics
 import subprocess
@@ -19,6 +22,8 @@ import time
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
+SPEED = 10.0          # m/s
+EAST = 85_390.0       # m in a degree of longitude, at latitude 40
 TICKS = 100   # per second in /proc/<pid>/stat, on every Linux
 
 
@@ -34,6 +39,7 @@ def publish(rates) -> None:
     imu, fix = Imu(), NavSatFix()
     imu.header.frame_id, fix.header.frame_id = 'imu_link', 'gnss'
     imu.linear_acceleration.z, imu.orientation_covariance[0] = 9.81, -1.0
+    fix.status.status = 0
     fix.latitude, fix.longitude, fix.position_covariance_type = 40.0, 116.0, 2
     fix.position_covariance[0] = fix.position_covariance[4] = fix.position_covariance[8] = 1.0
     pulses = Int64()
@@ -51,6 +57,8 @@ def publish(rates) -> None:
                         message.header.stamp = node.get_clock().now().to_msg()
                     else:
                         message.data += 1
+                    if message is fix:
+                        fix.longitude = 116.0 + SPEED / EAST * sent[i] * period
                     publisher.publish(message)
                     sent[i] += 1
             if now > last + 0.2:
@@ -117,7 +125,7 @@ def measure(args) -> None:
         client.call('cancel_leg')
         load.terminate()
         sent = [int(x) for x in load.communicate()[0].split()[-3:]]
-        report(args, client, sent, used, latencies)
+        report(args, client, sent, used, latencies, foreseen(client))
     finally:
         for process in (load, bare):
             process.terminate()
@@ -125,7 +133,13 @@ def measure(args) -> None:
         client.close()
 
 
-def report(args, client, sent, used, latencies) -> None:
+def foreseen(client) -> list[str]:
+    """Return the sigmas foreseen, one after the other, ppm."""
+    told = [status['predicted_scale_sigma_ppm'] for status in client.statuses]
+    return [now for before, now in pairwise(['', *told]) if now and now != before]
+
+
+def report(args, client, sent, used, latencies, told) -> None:
     """Print the figures."""
     time.sleep(2.5)   # the last /diagnostics comes within its period of 1 s
     health = [client.health[f'calibrator: {name}'] for name in ('imu', 'odometer', 'gnss')]
@@ -140,6 +154,8 @@ def report(args, client, sent, used, latencies) -> None:
     print(f'service call in a leg, {len(latencies)} calls: median '
           f'{statistics.median(latencies):.1f} ms, p90 {ordered[int(0.9 * len(ordered))]:.1f} ms, '
           f'max {ordered[-1]:.1f} ms')
+    print(f'predictions meanwhile: {len(told)}' + (
+        f', scale sigma {float(told[0]):.0f} to {float(told[-1]):.0f} ppm' if told else ''))
 
 
 def main() -> None:

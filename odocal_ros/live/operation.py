@@ -15,6 +15,7 @@ from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Refused, Session, State
 from odocal_ros.live.status import clocks_differ
+from odocal_ros.live.watch import Watch
 from odocal_ros.live.worker import Worker
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
@@ -36,6 +37,8 @@ class Operation:
         self._recording, self._outlets, self._config = recording, outlets, config
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._worker = Worker()
+        self._watch = Watch(self._worker, self._log)
+        recording.tap = self._watch.feed
         self._waiting: list[Future] = []
         self._job: object | None = None       # token of the computation awaited
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
@@ -52,6 +55,8 @@ class Operation:
             self._start_time_anew()
         self._stop_when_too_long()
         self._close_when_complete()
+        if self.session.state is State.RECORDING:
+            self._watch.look(self._recording.newest_imu_ns)
 
     def pump(self) -> None:
         """Decode what has arrived."""
@@ -59,6 +64,7 @@ class Operation:
 
     def close(self) -> None:
         """Let the worker end."""
+        self._watch.end()
         self._worker.close()
 
     def _start_time_anew(self) -> None:
@@ -80,6 +86,7 @@ class Operation:
         self._outlets.show_status(
             self._recording, session=session, saved=self._saved, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(),
+            outlook=self._watch.outlook,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 
     # a leg's way
@@ -103,6 +110,7 @@ class Operation:
         mark_ns = self._mark_ns()
         self._distance_m = self._recording.progress.distance_m()
         self.session.stop(mark_ns)
+        self._watch.end()
         self._close_by_ns = self._steady.now().nanoseconds + round(PATIENCE_S * 1e9)
         self.show_status()
         self._close_when_complete()
@@ -165,6 +173,7 @@ class Operation:
 
     def _drop_leg(self, text: str) -> None:
         self.session.cancel()
+        self._watch.end()
         self._job = self._close_by_ns = self._snapshot = None
         self.show_status()
         self._answer(False, text)
@@ -216,6 +225,7 @@ class Operation:
             raise Refused('no leg can be started: ' + clocks_differ(clocks))
         session.start(mark_ns, self._config())
         self._recording.progress.begin_leg()
+        self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
         self.show_status()
         text = f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}'
         self._log.info(text)

@@ -11,6 +11,7 @@ from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder, SLOTS
 from odocal_ros.live.inputs import Input, Inputs
 from odocal_ros.live.progress import Progress
+from odocal_ros.samples import Samples
 
 BACKWARD_S = 0.1   # a clock that steps back by more has jumped
 MARGIN_S = 1.0     # kept beyond the pre-roll, since forgetting goes by whole blocks
@@ -29,6 +30,7 @@ class Recording:
         self.inputs = Inputs(node, config)
         self.recorder, self.progress = LegRecorder(), Progress()
         self._remember = remember
+        self.tap: Callable[[str, Samples], None] | None = None  # hears every block as well
         self._clock = node.get_clock()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clock_jumped = False
@@ -47,6 +49,8 @@ class Recording:
             for slot, block in source.decode(raws, sent_ns, max_gap_s):
                 self.recorder.feed(slot, block)
                 self.progress.feed(slot, block, config, self.inputs.form, found_scale)
+                if self.tap is not None:
+                    self.tap(slot, block)
 
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""

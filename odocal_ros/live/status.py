@@ -7,6 +7,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from odocal_ros.config import Config
 from odocal_ros.live.health import Health
+from odocal_ros.live.outlook import as_keys, Outlook
 from odocal_ros.live.session import Session, State
 from odocal_ros.reasons import Code, Verdict
 
@@ -28,6 +29,7 @@ class Situation:
     duration_s: float = 0.0
     max_speed: float = 0.0
     still_s: float = 0.0
+    outlook: Outlook | None = None               # of the leg that is recorded
     saved: str = ''
     heard: bool = True                           # any message on any topic so far
 
@@ -53,7 +55,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
-    }
+    } | as_keys(now.outlook)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v)) for k, v in keys.items()])
@@ -138,9 +140,11 @@ def _recording_hint(now: Situation) -> str:
         wants.append(f'drive faster than {leg.min_speed:g} m/s')
     if wants:
         return ', '.join(wants)
-    if now.still_s < leg.standstill:
-        return 'stand still at the end point, then call ~/stop_leg'
-    return 'call ~/stop_leg'
+    end = 'call ~/stop_leg' if now.still_s >= leg.standstill \
+        else 'stand still at the end point, then call ~/stop_leg'
+    if now.outlook is None:
+        return end
+    return now.outlook.words() + (f'; {end}' if now.outlook.complete else '')
 
 
 def _gravest(calibration):

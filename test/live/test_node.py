@@ -85,6 +85,8 @@ def _first_leg(seen, client, player, sent):
     seen.set_in_leg = client.set(leg__min_distance=50.0)
     player.play(part(sent, 60, 115), SPEED)
     seen.recording = client.until(state='recording')
+    seen.foreseen = wait_for(lambda: client.status['predicted_scale_sigma_ppm'] and client.status,
+                             'a prediction')
     stopping = client.ask('stop_leg')
     seen.computing = client.until(state='computing')
     player.play(part(sent, 115, 117), SPEED)
@@ -253,6 +255,30 @@ def test_status_has_every_key_and_bare_numbers(session):
     assert float(session.recording['imu_rate_hz']) == pytest.approx(50, rel=0.01)
     assert float(session.recording['odometer_rate_hz']) == pytest.approx(25, rel=0.02)
     assert float(session.recording['fix_rate_hz']) == pytest.approx(5, rel=0.07)
+
+
+def test_while_it_records_a_leg_is_foreseen(session):
+    status = session.foreseen
+    assert status['state'] == 'recording'
+    scale_ppm, yaw_deg, metres = (float(status[key]) for key in (
+        'predicted_scale_sigma_ppm', 'predicted_yaw_sigma_deg', 'metres_to_go_scale'))
+    # fixes of 2 cm at both ends: 28 mm over what was driven when it looked, 5 s to 55 s of it
+    assert 28e3 / 700 < scale_ppm < 28e3 / 20
+    assert (metres == 0.0) == (scale_ppm <= 1000)
+    # a heading of 0.002 rad is in every yaw; what comes on top is the fixes' part of the scale
+    assert math.degrees(0.002) < yaw_deg < math.degrees(0.002 + 28e-3 / 20)
+    assert status['largest_error_source_scale'] in ('fix_start', 'fix_end', 'height')
+    assert 'initial_heading 0.115' in status['predicted_yaw_sources_deg']
+    assert ('enough: yaw', 'enough: scale')[metres == 0.0] in status['hint']
+
+
+def test_nothing_is_foreseen_but_of_a_leg_that_is_recorded(session):
+    foreseen = [key for key in session.foreseen
+                if key.startswith(('predicted_', 'metres_to_go_', 'largest_error_source_'))]
+    assert len(foreseen) == 8
+    for status in (session.waiting, session.idle, session.computing, session.calibrated,
+                   session.cancelled, session.two_legs, session.after_reset):
+        assert not any(status[key] for key in foreseen)
 
 
 def test_live_distance_is_near_the_computed_one(session):

@@ -1,0 +1,78 @@
+"""What is foreseen of a leg while it is recorded, and how it is said."""
+
+from dataclasses import dataclass
+import math
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """
+    What is foreseen of one parameter.
+
+    sigma, asked : relative or rad; sigma None: not determined by the way so far.
+    metres : m more for what is asked, 0: enough, None: no way makes it.
+    sources : (name, sigma) of the errors that matter, the largest first.
+    why : what keeps it from what is asked where no way helps.
+    """
+
+    sigma: float | None
+    asked: float
+    metres: float | None
+    sources: tuple[tuple[str, float], ...] = ()
+    why: str = ''
+
+    def words(self, name: str, unit: str, factor: float) -> str:
+        """Return it for people, sigmas times ``factor`` in ``unit``."""
+        asked = _three_digits(self.asked * factor)
+        now = None if self.sigma is None else _three_digits(self.sigma * factor)
+        if self.metres is None:
+            return f'{name}: {self.why}' if now is None else f'{name} {now} {unit}: {self.why}'
+        if self.metres == 0.0:
+            return f'enough: {name} {now} {unit} (asked {asked})'
+        more = f'{_rounded_up(self.metres)} m more bring it to the asked {asked} {unit}'
+        if now is None:
+            return f'{name} is not determined yet; {more}'
+        return f'{name} would be good to {now} {unit} now; {more}'
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is foreseen of a leg that ends where the vehicle is."""
+
+    scale: Prospect
+    yaw: Prospect
+
+    def words(self) -> str:
+        """Return it as a sentence: what is enough, what more makes it so, what never will be."""
+        return '; '.join([self.scale.words('scale', 'ppm', 1e6),
+                          self.yaw.words('yaw', 'deg', math.degrees(1))])
+
+    @property
+    def complete(self) -> bool:
+        """Return whether driving on would bring nothing that was asked for."""
+        return not (self.scale.metres or self.yaw.metres)
+
+
+def as_keys(outlook: Outlook | None) -> dict:
+    """Return the keys of ``~/status``; what is not foreseen is empty."""
+    keys: dict = {}
+    for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
+        of = Prospect(None, 0.0, None) if outlook is None else getattr(outlook, name)
+        keys |= {
+            f'predicted_{name}_sigma_{unit}': '' if of.sigma is None else of.sigma * factor,
+            f'metres_to_go_{name}': '' if of.metres is None else of.metres,
+            f'largest_error_source_{name}': of.sources[0][0] if of.sources else '',
+            f'predicted_{name}_sources_{unit}': ', '.join(
+                f'{source} {_three_digits(sigma * factor)}' for source, sigma in of.sources)}
+    return keys
+
+
+def _rounded_up(metres: float) -> int:
+    """Return metres in two digits, not fewer than they are."""
+    step = 10 ** max(0, math.floor(math.log10(max(metres, 1.0))) - 1)
+    return math.ceil(metres / step) * step
+
+
+def _three_digits(value: float) -> str:
+    """Return a number in three digits, never as a power of ten where it is large."""
+    return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'

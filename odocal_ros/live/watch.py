@@ -1,0 +1,107 @@
+"""The running estimate: looks at a leg every few seconds while it is recorded, in the worker."""
+
+from functools import partial
+import threading
+import time
+
+from odocal_ros.config import Config
+from odocal_ros.leg import LegRecorder, SLOTS
+from odocal_ros.live.answers import one_line
+from odocal_ros.live.foresight import Abandoned, outlook_of
+from odocal_ros.live.outlook import Outlook
+from odocal_ros.live.sketch import Sketch
+from odocal_ros.live.worker import Worker
+from odocal_ros.samples import join
+
+EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
+SHARE = 1 / 50             # of one core is what looking may cost in the long run
+
+
+class Watch:
+    """
+    Keeps the newest outlook of the leg that is recorded, None without one.
+
+    The callback thread only collects blocks; cells and prediction are made in the worker, one look
+    at a time. ``end`` makes a look that is under way give up at its next step, so that the result
+    of the leg need not wait for it. What fails here is a note in the log, never more.
+    """
+
+    def __init__(self, worker: Worker, log) -> None:
+        self._worker, self._log = worker, log
+        self.outlook: Outlook | None = None
+        self._sketch: Sketch | None = None
+        self._before: LegRecorder | None = None
+        self._fresh: list = []
+        self._over = threading.Event()
+        self._start_ns = self._due_ns = 0
+        self._config = Config()
+        self._looking = self._warm = False
+        self._pause_until = 0.0
+
+    def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
+        """Watch a leg that starts at a mark; ``recorder`` holds what came before."""
+        self.end()
+        self._over, self._start_ns, self._config = threading.Event(), start_ns, config
+        self._sketch, self._before = Sketch(recorder.form), recorder
+        self._due_ns = start_ns + EVERY_NS
+
+    def end(self) -> None:
+        """Let go of the leg."""
+        self._over.set()
+        self.outlook = self._sketch = self._before = None
+        self._fresh = []
+        self._looking = self._warm = False
+        self._pause_until = 0.0
+
+    def feed(self, slot: str, block) -> None:
+        """Remember a block as it went into the recorder."""
+        if self._sketch is not None:
+            self._fresh.append((slot, block))
+
+    def look(self, newest_ns: int) -> None:
+        """Have the worker look if it is time to."""
+        if (self._sketch is None or self._looking or newest_ns < self._due_ns
+                or time.monotonic() < self._pause_until):
+            return
+        self._due_ns, self._looking = newest_ns + EVERY_NS, True
+        before, self._before = self._before, None
+        fresh, self._fresh = self._fresh, []
+        self._worker.submit(
+            partial(_look, self._sketch, before, fresh, self._start_ns, self._config, self._over),
+            partial(self._take, self._over))
+
+    def _take(self, over: threading.Event, look, error: Exception | None) -> None:
+        if over.is_set():
+            return
+        self._looking = False
+        self.outlook, seconds, failure = look or (None, 0.0, error)
+        # the first look brings in the pre-roll, and modules: a cost that comes once
+        self._pause_until = time.monotonic() + seconds / SHARE if self._warm else 0.0
+        self._warm = True
+        if failure is not None:
+            self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')
+
+
+def _look(sketch: Sketch, before: LegRecorder | None, fresh: list, start_ns: int, config: Config,
+          over: threading.Event) -> tuple[Outlook | None, float, Exception | None]:
+    """Return the outlook, the seconds of CPU it took and what went wrong; for the worker."""
+    begin = time.thread_time()
+    outlook, failure = None, None
+    try:
+        _bring_up_to_date(sketch, before, fresh, over)
+        outlook = outlook_of(sketch.leg(start_ns), sketch.fix_rate(), config,
+                             lambda: not over.is_set())
+    except Exception as error:  # whatever is wrong with a look, the leg goes on
+        failure = error
+    return outlook, time.thread_time() - begin, failure
+
+
+def _bring_up_to_date(sketch, before, fresh, over) -> None:
+    for slot in SLOTS:
+        if over.is_set():
+            raise Abandoned
+        blocks = [before.rows(slot)] if before is not None else []
+        blocks += [block for name, block in fresh if name == slot]
+        blocks = [block for block in blocks if len(block.stamp_ns)]
+        if blocks:
+            sketch.feed(slot, join(blocks))
