@@ -29,9 +29,10 @@ def combine(legs, config: Config) -> Calibration:
 
     """
     legs = tuple(legs)
-    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
+    twice = _driven_twice(legs)
+    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED and leg not in twice]
     used = good or legs
-    reasons = _leg_reasons(legs, good)
+    reasons = _leg_reasons(legs, good, twice)
     names = dict.fromkeys(n for leg in used for n in leg.methods)
     methods = {n: combine_method(n, [leg.methods[n] for leg in used if n in leg.methods])
                for n in names}
@@ -53,14 +54,29 @@ def combine(legs, config: Config) -> Calibration:
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy)
 
 
-def _leg_reasons(legs, good):
+def _driven_twice(legs):
+    """Return legs that share more than a tenth of their time with one before: not independent."""
+    twice = []
+    for i, leg in enumerate(legs):
+        for other in legs[:i]:
+            shared = min(leg.stop_ns, other.stop_ns) - max(leg.start_ns, other.start_ns)
+            if other not in twice and shared > 0.1 * (leg.stop_ns - leg.start_ns):
+                twice.append(leg)
+                break
+    return twice
+
+
+def _leg_reasons(legs, good, twice):
     """Return the legs' own reasons, numbered where there are several."""
     reasons = []
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         own = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
                                if len(legs) == 1 or r.code not in PER_LEG)]
-        if good and leg not in good:
+        if leg in twice:
+            reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
+                                  'covers; not used'))
+        elif good and leg not in good:
             why = '; '.join(r.text for r in own if r.code.gravity is Verdict.REJECTED)
             reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: {why}'))
         else:

@@ -50,7 +50,8 @@ def usable_fixes(fix, sent, gnss):
         (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m')) if m.any()]
     if bad:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
-        found += (Reason(code, f'of {sent} fixes are not used: {", ".join(bad)}'),)
+        found += (Reason(code, f'{sent - int(use.sum())} of {sent} fixes are not used: '
+                         f'{", ".join(bad)}'),)
     return use, covariance, found
 
 

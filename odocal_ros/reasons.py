@@ -91,6 +91,7 @@ class Code(Enum):
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
+    LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'
     LEG_REJECTED = CAUTION, 'See the reasons of that leg; drive it again or leave it out.'
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs: verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'

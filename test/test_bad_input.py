@@ -108,7 +108,7 @@ def test_a_handful_of_rows(made, leg, slot, keep):
 def test_all_fixes_status_none(made, leg):
     result, said = run(replace(leg, fix=changed(leg.fix, status=lambda a: a * 0 - 1)),
                        settings(made))
-    assert said[Code.FIXES_UNUSABLE] == 'of 1000 fixes are not used: 1000 with status below 0'
+    assert said[Code.FIXES_UNUSABLE] == '1000 of 1000 fixes are not used: 1000 with status below 0'
     assert 'gnss.min_status' in Code.FIXES_UNUSABLE.remedy
 
 

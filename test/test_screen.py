@@ -48,7 +48,7 @@ def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, lab
     inputs, _, texts = said(replace(leg, **{slot: bad}))
     t = seconds(leg, bad)[40]
     if slot == 'fix' and value == 1e200:
-        assert texts == [f'of {len(bad.stamp_ns)} fixes are not used: 3 at no real position']
+        assert texts == [f'3 of {len(bad.stamp_ns)} fixes are not used: 3 at no real position']
     else:
         assert texts == [f'3 of {len(bad.stamp_ns)} {label} messages hold NaN, Inf or a value '
                          f'beyond any sensor, first at t = {t:.2f} s; dropped']
@@ -157,10 +157,11 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
                        longitude=lambda a: a.__setitem__(rows, np.nan))
     n = len(leg.fix.stamp_ns)
     inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(0, 9))))
-    assert codes == {Code.BAD_ROWS_DROPPED: f'of {n} fixes are not used: 9 with status below 0'}
+    assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} fixes are not used: 9 with status below 0'}
     assert inputs.fixes_rejected == 9
     inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(None))))
-    assert codes == {Code.FIXES_UNUSABLE: f'of {n} fixes are not used: {n} with status below 0'}
+    assert codes == {
+        Code.FIXES_UNUSABLE: f'{n} of {n} fixes are not used: {n} with status below 0'}
     assert len(inputs.t_fix) == 0
     # asked for, even a fix that is none is no position
     inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(0, 9))),

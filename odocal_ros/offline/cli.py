@@ -48,6 +48,8 @@ def _parser(names) -> argparse.ArgumentParser:
 def main(argv=None) -> int:
     """Run a command line; return its exit code (design.md section 1)."""
     argv = sys.argv[1:] if argv is None else list(argv)
+    if sys.stdout is None:       # closed by whoever started us
+        sys.stdout = open(os.devnull, 'w', encoding='utf-8')     # noqa: SIM115 until exit
     for stream in (sys.stdout, sys.stderr):      # a terminal without ± shows ? instead
         if hasattr(stream, 'reconfigure'):
             stream.reconfigure(errors='replace')
@@ -57,7 +59,9 @@ def main(argv=None) -> int:
         if args.command is None:
             parser.print_help()
             return WRONG_USE
-        return args.run(args)
+        code = args.run(args)
+        sys.stdout.flush()       # here, where a full disk can still be told
+        return code
     except OdocalError as error:
         print(f'odocal: {error}' if not isinstance(error, _Usage) else error, file=sys.stderr)
         return WRONG_USE
@@ -67,6 +71,10 @@ def main(argv=None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
+    except OSError as error:       # a full disk, a stream that went away
+        what = error.filename or 'output'
+        print(f'odocal: {what}: {error.strerror or error}', file=sys.stderr)
+        return WRONG_USE
     except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
         return _internal(error)
 

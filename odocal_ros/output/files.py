@@ -87,6 +87,7 @@ def _check(check: TrackCheck | None) -> dict | None:
 
 def _leg(leg: LegResult) -> dict:
     return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
+            'start_ns': leg.start_ns, 'stop_ns': leg.stop_ns,
             'distance': leg.distance, 'duration': leg.duration, 'imu_samples': leg.imu_samples,
             'pulses': leg.pulses, 'fixes': leg.fixes, 'rejected_fixes': leg.rejected_fixes,
             'verdict': leg.verdict.value, 'reasons': [r.as_dict() for r in leg.reasons],

@@ -1,6 +1,7 @@
 """Several legs: own errors average down, shared ones do not, disagreement widens."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from odocal_ros.config import Config, with_settings
 from odocal_ros.reasons import Code, Reason
 
 CONFIG = Config()
+LEGS = count(1)
 SCALE, YAW, PITCH = PARAMETERS
 OWN, HEADING = 1e-4, 1e-3       # of ln K and yaw; of yaw alone
 
@@ -31,8 +33,10 @@ def method(scale=0.02, yaw=0.01, own=OWN, heading=HEADING, refused=(), reasons=(
 
 
 def leg(result, *codes):
-    return LegResult(start_ns=1, stop_ns=2, distance=1e3, duration=100.0, imu_samples=1, pulses=1,
-                     fixes=1, rejected_fixes=0, reasons=tuple(Reason(c, c.name) for c in codes),
+    start_ns = 1_000 * next(LEGS)        # one after the other
+    return LegResult(start_ns=start_ns, stop_ns=start_ns + 900, distance=1e3, duration=100.0,
+                     imu_samples=1, pulses=1, fixes=1, rejected_fixes=0,
+                     reasons=tuple(Reason(c, c.name) for c in codes),
                      methods={'two_point': result} if result else {}, C_bi=np.eye(3))
 
 
@@ -163,16 +167,16 @@ def test_legs_without_any_method_are_rejected_with_a_reason():
 
 def test_too_few_legs_are_a_caution():
     config = with_settings(CONFIG, {'verdict.min_legs': 3})
-    whole = combine([leg(method())] * 2, config)
+    whole = combine([leg(method()) for _ in range(2)], config)
     assert [r.text for r in whole.reasons] == ['2 good legs of 3']
     assert whole.verdict.value == 'caution'
-    assert combine([leg(method())] * 3, config).reasons == ()
+    assert combine([leg(method()) for _ in range(3)], config).reasons == ()
 
 
 def test_the_limits_are_asked_of_the_whole_not_of_each_leg():
     wide = method(own=1.5e-3, heading=0.0, reasons=[Reason(Code.SCALE_SIGMA_TOO_LARGE, 'leg')])
     assert combine([leg(wide)], CONFIG).verdict.value == 'caution'
-    assert combine([leg(wide)] * 4, CONFIG).reasons == ()
+    assert combine([leg(wide) for _ in range(4)], CONFIG).reasons == ()
 
 
 def test_the_rotation_is_the_mounting_on_top_of_the_nominal_one():
@@ -189,3 +193,13 @@ def test_a_combination_states_its_budget_and_correlation():
     for name, variance in total.items():
         assert np.sqrt(variance) == pytest.approx(whole.estimates[name].sigma)
     assert all(abs(rho) <= 1 + 1e-12 for rho in whole.details['correlation'].values())
+
+
+def test_a_drive_given_twice_counts_once():
+    one, apart = leg(method()), leg(method())
+    again = replace(apart, start_ns=one.start_ns + 100, stop_ns=one.stop_ns + 100)
+    whole = combine([one, again], CONFIG)
+    assert Code.LEGS_OVERLAP in {r.code for r in whole.reasons}
+    assert whole.estimates['scale_factor'].sigma == one.methods['two_point'].estimates[
+        'scale_factor'].sigma
+    assert Code.LEGS_OVERLAP not in {r.code for r in combine([one, apart], CONFIG).reasons}

@@ -23,6 +23,15 @@ def test_no_command_shows_help_and_fails(capsys):
     assert 'replay' in capsys.readouterr().out
 
 
+def test_a_full_disk_is_a_sentence_and_exit_2():
+    with open('/dev/full', 'w') as full:
+        done = subprocess.run([sys.executable, '-m', 'odocal_ros.offline.cli', 'paper', '--json'],
+                              stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr.count('\n') == 1
+    assert 'No space left' in done.stderr
+
+
 @pytest.mark.parametrize('argv', [
     ['fly'], ['replay'], ['replay', 'x', '--nonsense'], ['replay', 'x', '--method', 'magic']])
 def test_wrong_use_is_one_line_and_exit_2(argv, capsys):
