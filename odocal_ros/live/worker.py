@@ -4,20 +4,23 @@ from collections.abc import Callable
 import queue
 import threading
 
+GRACE_S = 2.0      # files take some 20 ms
+
 
 class Worker:
     """
     Runs jobs one after the other in a thread of its own.
 
     ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
-    the job itself ever runs beside the callbacks. The thread is a daemon: a node told to end does
-    not wait for a computation.
+    the job itself ever runs beside the callbacks. A node told to end waits a moment for it, so
+    that result files just asked for are written, but not for a long computation.
     """
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
-        threading.Thread(target=self._run, name='odocal_worker', daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
+        self._thread.start()
 
     def submit(self, job: Callable[[], object],
                then: Callable[[object, Exception | None], None]) -> None:
@@ -31,8 +34,9 @@ class Worker:
             then(result, error)
 
     def close(self) -> None:
-        """Let the thread end after the job it is at."""
+        """Let the thread end after the jobs it was given, waiting a moment for them."""
         self._jobs.put(None)
+        self._thread.join(GRACE_S)
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
