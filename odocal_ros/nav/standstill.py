@@ -5,6 +5,7 @@ import numpy as np
 CELL = 0.1            # s, grid of the detector
 WINDOW = 0.5          # s, each side
 MOVE = 0.03           # m, travel within the window that still counts as standing
+COARSE = 0.5          # m, a count beyond which one is motion
 CREEP = 0.02          # m/s, mean speed at which a long slow stretch is no standstill
 TURN = 0.02           # rad/s, wander of the gyro that still counts as standing
 MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
@@ -49,7 +50,9 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
 
 def _allowed(travel, metres_per_unit):
     """Return the travel, m, of one that stands: MOVE, or a count or so of jitter."""
-    return max(MOVE, 1.5 * travel.quantum * metres_per_unit)
+    count = travel.quantum * metres_per_unit
+    # a few counts a turn of the wheel: one of them is motion, not jitter
+    return max(MOVE, (1.5 if count <= COARSE else 0.5) * count)
 
 
 def _spans(quiet, edges, shortest):

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from odocal_ros.config import Config
 from odocal_ros.grades import GRADES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import MOVE, standstills
+from odocal_ros.screen import screen
+from odocal_ros.sim.scenarios import SimOptions, simulate
 
 RATE = 100.0       # Hz
 K = 0.02           # m per count
@@ -166,3 +169,14 @@ def test_too_little_data(n):
     assert standstills(few, np.zeros((n, 3)), many, K, 2.0).shape == (0, 2)
     assert standstills(T, gyro(T), Travel(few, few, 1.0), K, 2.0).shape == (0, 2)
     assert standstills(T + 1e3, gyro(T), many, K, 2.0).shape == (0, 2)
+
+
+@pytest.mark.parametrize('scale', [0.35, 1.0, 1.7])
+def test_one_pulse_a_turn_of_the_wheel_still_shows_a_stop(scale):
+    drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_rate=50.0,
+                                odometer_rate=20.0, scale=scale, nominal_scale=scale))
+    inputs, _ = screen(drive.leg(), Config())
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, 2.0)
+    assert len(spans) == 2
+    # 0.5 m/s^2: within two counts of the onset, sqrt(2 * 2 * scale / 0.48)
+    assert 0 <= spans[0, 1] < np.sqrt(4 * scale / 0.48)
