@@ -38,8 +38,8 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
     scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) \
         or nominal_scale(config, inputs.scale_unit)
     if not scale:
-        raise BadData('the fixes move too little for a scale, and odometer.nominal_scale is not '
-                      'set: a profile needs either')
+        raise BadData('the scale is not known yet: the fixes moved too little, and '
+                      'odometer.nominal_scale is not set')
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
     t = np.linspace(first, last, max(2, int((last - first) / max(STEP, (last - first) / 5e4))))
