@@ -101,7 +101,7 @@ def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):
     paths, ratio = [], None
     for seed in (1, 2, 3):
         drive = simulate(SimOptions(scenario='straight', duration=240.0, imu_grade='tactical',
-                                    seed=seed, **LOW))
+                                    seed=seed, start_ns=seed * 10**12, **LOW))
         ratio = drive.truth.scale_ratio
         paths.append(write_bag(tmp_path / f'drive{seed}', drive_topics(drive)))
     common = ['--set', f'odometer.nominal_scale={drive.options.nominal_scale!r}', '--set',
