@@ -29,8 +29,9 @@ def combine(legs, config: Config) -> Calibration:
 
     """
     legs = tuple(legs)
-    twice = _driven_twice(legs)
-    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED and leg not in twice]
+    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
+    twice = _driven_twice(good)
+    good = [leg for leg in good if leg not in twice]
     used = good or legs
     reasons = _leg_reasons(legs, good, twice)
     names = dict.fromkeys(n for leg in used for n in leg.methods)

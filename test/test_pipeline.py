@@ -92,7 +92,8 @@ def test_the_check_shows_the_correction(made):
 
 
 def test_several_legs_of_one_vehicle(made):
-    others = [drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s)
+    others = [drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
+                    start_ns=s * 10**12)
               for s in (5, 6, 7, 8)]
     legs = [calibrate(d.leg(), settings(d)) for d in others]
     whole = combine(legs, settings(made))

@@ -151,7 +151,8 @@ def test_bags_without_any_input(data_dir, capsys, name):
     assert codes(told) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
     assert told['command'] == ''
     assert 'replay needs help: no odometer' in text
-    assert ('metadata.yaml is missing' in text) == ('no_metadata' in name)
+    unwrapped = ' '.join(text.split())       # a long path moves the line breaks
+    assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)
 
 
 def test_bag_that_cannot_be_read(tmp_path, capsys):
