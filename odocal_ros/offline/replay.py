@@ -154,5 +154,7 @@ def _report(calibration, config, inputs, output, args) -> int:
         print()
     elif not args.quiet:
         print(screen(calibration))
+        if args.holdout:
+            print('\ntrack against fixes: on the last fifth of each leg, which the fit did not see')
         print(f'\nwritten: {output}/ ({", ".join(p.name for p in written)})')
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK

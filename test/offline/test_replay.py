@@ -130,6 +130,8 @@ def test_no_heading_refuses_yaw_with_a_remedy_but_gives_scale(drive, bag, tmp_pa
 def test_holdout_checks_on_what_was_not_fitted(drive, bag, tmp_path, capsys):
     assert replay(bag, *known(drive), '--holdout', '--json', '--output', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
+    replay(bag, *known(drive), '--holdout', '--output', tmp_path / 'again')
+    assert 'last fifth' in capsys.readouterr().out
     whole = drive.truth.distance
     assert told['check']['after']['rms'] < told['check']['before']['rms']
     # K0 is 6 % off and the mounting 1 deg: a fifth of the way strays by 6 % of it at its end
