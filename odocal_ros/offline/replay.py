@@ -155,6 +155,6 @@ def _report(calibration, config, inputs, output, args) -> int:
     elif not args.quiet:
         print(screen(calibration))
         if args.holdout:
-            print('\ntrack against fixes: on the last fifth of each leg, which the fit did not see')
+            print('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
         print(f'\nwritten: {output}/ ({", ".join(p.name for p in written)})')
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK
