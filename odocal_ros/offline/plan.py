@@ -187,26 +187,9 @@ def _shown(parameter, sigma):
 
 def _budget(before):
     """Return the sources that matter, with their shares of the variance."""
-    from odocal_ros.calib.budget import PARAMETERS
-    table = before.method.details.get('budget')
-    if not table:
-        return []
-    total = [sum(row[p]**2 for row in table.values()) for p in PARAMETERS]
-    lines = [f'  {"error budget":<20}{"scale, ppm":>14}{"yaw, deg":>16}{"pitch, deg":>16}']
-    small = []
-    for name, row in table.items():
-        shares = [row[p]**2 / whole if whole else 0.0
-                  for p, whole in zip(PARAMETERS, total, strict=True)]
-        if max(shares) < SHOWN:
-            small.append(name)
-            continue
-        cells = ['-' if share < SHOWN else
-                 f'{row[p] * (1e6 if p == PARAMETERS[0] else math.degrees(1.0)):.2g} {share:>4.0%}'
-                 for p, share in zip(PARAMETERS, shares, strict=True)]
-        lines.append(f'  {name.replace("_", " "):<20}{cells[0]:>14}{cells[1]:>16}{cells[2]:>16}'
-                     f'{"   shared by all legs" if row["shared"] else ""}')
-    return [*lines, *textwrap.wrap(f'under 0.1 %: {", ".join(small).replace("_", " ")}', 96,
-                                   initial_indent='  ', subsequent_indent='    '), '']
+    from odocal_ros.output.budget_table import budget_lines
+    lines = budget_lines(before.method.details.get('budget'), 1.0, SHOWN)
+    return [*lines, ''] if lines else []
 
 
 def _helps(before, found):

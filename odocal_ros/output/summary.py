@@ -1,15 +1,18 @@
 """A calibration in words: one screen for a terminal, one sentence for an answer."""
 
+from dataclasses import replace
 from datetime import datetime, UTC
 import math
 import textwrap
 
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
+from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, time_span, with_sigma
 from odocal_ros.reasons import Reason, Verdict
 
 WIDTH = 98
 PPM = 1e6
+SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
@@ -24,7 +27,7 @@ NONE = Estimate(None, None, '')
 def screen(calibration: Calibration) -> str:
     """Return everything a person needs to judge a calibration, as plain text."""
     parts = [_head(calibration), _values(calibration), _leg_table(calibration.legs),
-             _check(calibration.legs), _reasons(calibration.reasons)]
+             _check(calibration.legs), _budget(calibration), _reasons(calibration.reasons)]
     return '\n\n'.join('\n'.join(part) for part in parts if part)
 
 
@@ -53,7 +56,7 @@ def known(estimates: dict[str, Estimate], name: str) -> Estimate:
     found = estimates.get(name, NONE)
     value, sigma = (x if x is not None and math.isfinite(x) else None
                     for x in (found.value, found.sigma))
-    return Estimate(value, sigma, found.unit)
+    return replace(found, value=value, sigma=sigma)
 
 
 def inverse(scale: Estimate) -> str:
@@ -189,6 +192,16 @@ def _check(legs):
     head = ('rms', 'mean', 'max', 'at the end', 'of distance')
     return [f'  {"track against fixes":<20}' + ''.join(f'{word:>12}' for word in head), *rows] \
         if rows else []
+
+
+def _budget(calibration):
+    estimates = calibration.estimates
+    scale = known(estimates, 'scale_factor')
+    method = calibration.methods.get(scale.method)
+    if method is None or not scale.value:
+        return []
+    hidden = {name for name in estimates if known(estimates, name).value is None}
+    return budget_lines(method.details.get('budget'), scale.value, SHOWN, hidden)
 
 
 def _reasons(reasons: tuple[Reason, ...]):

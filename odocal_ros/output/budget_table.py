@@ -1,0 +1,48 @@
+"""The error budget as people read it: each source with its share of each parameter's variance."""
+
+import math
+import textwrap
+
+COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
+WIDTHS = (14, 16, 16)
+
+
+def budget_lines(table: dict, scale: float, shown: float, hidden=()) -> list[str]:
+    """
+    Return the lines of a budget, none without one.
+
+    Parameters
+    ----------
+    table : dict
+        Source to one-sigma share of each parameter, as calibration.json has it.
+    scale : float
+        Scale factor that its scale column belongs to.
+    shown : float
+        Share of the variance below which a source is but named.
+    hidden : collection of str
+        Parameters that are not determined: their column stays empty.
+
+    """
+    if not table:
+        return []
+    factor = {COLUMNS[0]: 1e6 / scale}
+    wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in COLUMNS]
+    lines = [f'  {"error budget":<20}' + ''.join(
+        f'{word:>{width}}' for word, width in zip(HEAD, WIDTHS, strict=True))]
+    small = []
+    for name, row in table.items():
+        shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
+                  for p, whole in zip(COLUMNS, wholes, strict=True)]
+        if max(shares) < shown:
+            small.append(name)
+            continue
+        cells = ['-' if share < shown else
+                 f'{row[p] * factor.get(p, math.degrees(1.0)):.2g} {share:>4.0%}'
+                 for p, share in zip(COLUMNS, shares, strict=True)]
+        lines.append(f'  {name.replace("_", " "):<20}' + ''.join(
+            f'{cell:>{width}}' for cell, width in zip(cells, WIDTHS, strict=True))
+            + ('   shared by all legs' if row.get('shared') else ''))
+    rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
+    return lines + textwrap.wrap(rest.replace('_', ' '), 96, initial_indent='  ',
+                                 subsequent_indent='    ')
