@@ -16,6 +16,7 @@ STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is no
 FASTEST = 100.0        # m/s: what goes faster is a counter reset
 CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
+CLOCK_REACH_NS = 200_000_000     # less than half of the limit, a few ticks
 
 
 def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -128,10 +129,15 @@ class Clocks:
         elif self._imu:
             received = np.concatenate([r for r, _ in self._imu])
             row = int(block.received_ns[-1])
-            if received.min() <= row <= received.max():
+            # one sent just after the Imu's newest has nothing behind it yet: carry on from there,
+            # at the pace of a bag that is played
+            beyond = max(0, row - int(received.max()))
+            if received.min() <= row and beyond <= CLOCK_REACH_NS:
                 stamps = np.concatenate([s for _, s in self._imu])
                 # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
-                imu_ns = np.interp(row - received[0], received - received[0], stamps - stamps[0])
+                pace = np.ptp(stamps) / max(np.ptp(received), 1)
+                imu_ns = beyond * pace + np.interp(row - received[0], received - received[0],
+                                                   stamps - stamps[0])
                 ahead = (int(block.stamp_ns[-1]) - int(stamps[0]) - imu_ns) * 1e-9
                 self._ahead_s.setdefault(slot, deque(maxlen=CLOCK_ROWS)).append(ahead)
 

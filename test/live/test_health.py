@@ -158,3 +158,15 @@ def test_scale_for_the_hint_comes_from_what_is_known_best():
     named = with_settings(config, {'odometer.nominal_scale': 0.019})
     assert nominal_scale(named, COUNTER) == 0.019
     assert nominal_scale(named, COUNTER, found=0.0188) == 0.0188
+
+
+def test_a_row_that_always_arrives_just_after_the_imu_is_compared_too():
+    """Two sensors in step: the tick always brings the Imu's row first and the other's last."""
+    clocks, config = Clocks(), Config()
+    for i in range(20):
+        arrival = 1000.0 + 0.05 * i + np.array([0.0, 0.025])
+        clocks.feed('imu', rows((arrival - 1000) * 10 + 50, received_s=arrival))
+        late = arrival + 0.002
+        clocks.feed('odometer', rows((late - 1000) * 10 + 50.7, received_s=late))
+    (slot, ahead), = clocks.differing(config)
+    assert (slot, ahead) == ('odometer', pytest.approx(0.7, abs=1e-6))
