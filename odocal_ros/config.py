@@ -147,6 +147,16 @@ class WheelsConfig:
     radius: float = setting(0.0, 'm', 0.0, 10.0, about='Nominal wheel radius; 0: unknown.')
     pulses_per_revolution: float = setting(0.0, 'pulses', 0.0, 1e9, about='Pulses per turn of the '
                                            'wheel; with the radius it gives the nominal scale.')
+    radius_range: float = setting(0.0, '1', 0.0, 0.9, about="Half of the range searched about "
+                                  "each wheel's nominal factor, relative: twice the stated error; "
+                                  '0: 0.05.')
+    heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half of the range searched about '
+                                   'the heading at the start; 0: twice its sigma, 10 deg where it '
+                                   'is not known.')
+    levels: int = setting(7, '', 2, 49, about='Levels of each parameter in the first search; 3 or '
+                          'more: the next prime power, an orthogonal array.')
+    robust: bool = setting(False, about='Weight fixes by their covariance and bound the pull of '
+                           'outliers in the search.')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -89,6 +89,35 @@ class Code(Enum):
     YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of '
                                     'their own.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
+    # left and right wheel
+    WHEELS_NOT_SEPARABLE = CAUTION, ('Use the gyro: give odometer.track_width, or drive straight '
+                                     'stretches at speed; the mean of both wheels is not touched.')
+    TRACK_WIDTH_NOT_DETERMINED = NOTE, ('Drive turns with a net change of heading (a loop, a '
+                                        'round about), or give odometer.track_width.')
+    WHEELS_SWAPPED = REJECT, 'Exchange odometer.left and odometer.right.'
+    WHEEL_DEAD = REJECT, ('Check the sensor and the wiring of that wheel, or calibrate the other '
+                          'alone: name one joint or index in odometer.field.')
+    WHEEL_REVERSED = REJECT, ('Make that wheel count forwards in its driver; odometer.reversed '
+                              'turns both.')
+    WHEEL_COUNTERS_DIFFER = CAUTION, ('Set odometer.wrap to the span of the counters, and let '
+                                      'both wheels send the same one.')
+    SEARCH_WIDENED = NOTE, ('Nothing, if the values are believable; else check '
+                            'odometer.nominal_scale and the heading: wheels.radius_range and '
+                            'wheels.heading_range set where the search begins.')
+    SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or give '
+                                   'better start values.')
+    # all the samples at once
+    NOT_CONVERGED = REJECT, ('See what the other methods say; check units, axes and clocks with '
+                             'odocal inspect, and drive a leg with stops and turns.')
+    SCALE_NOT_DETERMINED = REJECT, 'Drive farther, faster, or with better fixes.'
+    YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: acceleration is what '
+                                   'tells the heading, and so the yaw.')
+    PARAMETER_NOT_DETERMINED = NOTE, 'Drive with turns both ways, stops and starts.'
+    MODEL_MISMATCH = CAUTION, ('The residuals are not what the noise model says; the sigmas were '
+                               'widened. Check slip, lever arms, delays and the sky.')
+    METHODS_DISAGREE = CAUTION, ('See the values side by side; the likely cause is named. Drive '
+                                 'again with stops at both marks and turns in between.')
+    # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
     LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'
