@@ -1,0 +1,138 @@
+"""What a report draws of a leg: residuals by direction, scale by section, fixes left out."""
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.evidence import evidence, ROWS, sections
+from odocal_ros.calib.marks import MarkFix
+from odocal_ros.config import Config, with_settings
+from odocal_ros.leg import Leg
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.samples import FixSamples
+from odocal_ros.screen import screen
+
+START_NS = 1_700_000_000_000_000_000
+END = 100.0                                  # s; 10 m/s, east for half of it, then north
+
+
+def path_n(t):
+    """Return a drive at 10 m/s: standing for 10 s, east until t = 60, then north: (n, 3)."""
+    s = 10.0 * np.clip(t - 10.0, 0.0, None)
+    return np.stack([np.minimum(s, 500.0), np.maximum(s - 500.0, 0.0), 0.0 * t], -1)
+
+
+def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None):
+    """Return evidence of that drive; fixes lie by ``off`` to the east and north of the path."""
+    config = config or Config()
+    t = np.arange(0.0, END, 0.02)
+    yaw = np.where(t < 60.0, 0.0, np.pi / 2)
+    q_nb = np.stack([0 * t, 0 * t, np.sin(yaw / 2), np.cos(yaw / 2)], -1)
+    track = dead_reckon(t, q_nb, Travel(t, 10.0 * np.clip(t - 10.0, 0.0, None), 0.0))
+    t_fix = np.arange(0.0, END, 0.2)
+    n = len(t_fix)
+    status = np.zeros(n, int)
+    covariance = np.tile(np.eye(3) * sigma**2, (n, 1, 1))
+    for row, what in bad:
+        status[row] = -1 if what == 'status' else status[row]
+        covariance[row] *= 100.0**2 if what == 'sigma' else 1.0
+    stamp = START_NS + np.round(t_fix * 1e9).astype(np.int64)
+    fix = FixSamples(stamp, stamp, np.full(n, 0.8), np.full(n, 0.1), np.zeros(n), covariance,
+                     np.full(n, 2), status)
+    leg = Leg(START_NS, START_NS + round(END * 1e9), fix=fix)
+    inputs, _ = screen(leg, config)
+    fixes_n = path_n(inputs.t_fix) + [*off, 0.0]
+    kept = np.ones(len(inputs.t_fix), bool)
+    kept[[row for row, what in bad if what == 'far']] = False
+    pin = MarkFix(0.0, np.zeros(3), np.eye(3), True, 1, 1)
+    return evidence(leg, inputs, track, fixes_n, kept, pin,
+                    (lambda t: 1.1 * path_n(t) + 7.0, lambda t: path_n(t) - 3.0), config)
+
+
+def test_residuals_are_split_by_the_direction_driven():
+    found = drive(off=(2.0, 1.0))            # the track lies 2 m west and 1 m south of the fixes
+    east = (found.t_fix > 12) & (found.t_fix < 58)
+    north = (found.t_fix > 62) & (found.t_fix < 98)
+    np.testing.assert_allclose(found.residual[east], [[-2.0, -1.0]] * east.sum(), atol=1e-9)
+    np.testing.assert_allclose(found.residual[north], [[-1.0, 2.0]] * north.sum(), atol=1e-9)
+    # as configured: 10 % too far, so 0.1 of the way so far on the axis driven
+    late = found.t_fix > 62
+    np.testing.assert_allclose(found.residual_before[late, 0],
+                               -1.0 + 0.1 * (10.0 * (found.t_fix[late] - 10) - 500), atol=1e-9)
+
+
+def test_way_speed_and_turn_rate():
+    found = drive()
+    assert found.distance[-1] == pytest.approx(10.0 * (found.t[-1] - 10.0), rel=1e-12)
+    steady = (found.t > 12) & (found.t < 58)
+    np.testing.assert_allclose(found.speed[steady], 10.0, rtol=1e-12)
+    np.testing.assert_allclose(found.speed[found.t < 9], 0.0, atol=1e-12)
+    assert found.yaw_rate.sum() * 0.02 == pytest.approx(np.pi / 2, rel=0.001)
+    np.testing.assert_allclose(found.yaw_rate[steady], 0.0, atol=1e-12)
+    assert len(found.t) <= ROWS
+
+
+def test_fixes_left_out_are_named_with_the_reason():
+    found = drive(bad=((3, 'status'), (5, 'sigma')))
+    assert found.excluded == 2
+    np.testing.assert_allclose(found.t_excluded, [0.6, 1.0])
+    assert found.excluded_because == ('status below 0', 'sigma above 3 m')
+    assert found.fixes == 498
+    assert drive(bad=((7, 'far'),)).excluded_because == ('far off the track',)
+
+
+def test_many_rows_are_thinned_out_with_both_ends_kept():
+    found = drive()
+    assert found.t[0] == 0.0
+    assert found.t[-1] == pytest.approx(99.98)
+
+
+def test_a_section_gives_the_scale_whatever_the_heading():
+    way = np.arange(0.0, 1000.0, 2.0)
+    z = np.stack([way, 30 * np.sin(way / 80), 0 * way], -1)
+    turn = np.array([[np.cos(1.0), -np.sin(1.0), 0], [np.sin(1.0), np.cos(1.0), 0], [0, 0, 1]])
+    found = sections(way, z, 1.003 * z @ turn.T + [5.0, 6.0, 7.0], np.full(len(way), 0.02))
+    np.testing.assert_allclose(found.ratio, 1.003, rtol=1e-9)
+    np.testing.assert_allclose([found.begin[0], found.end[-1]], [0.0, 998.0])
+    # on a straight, the closed form of a line through n points: sigma sqrt(12 / n) / length
+    straight = np.stack([way, 0 * way, 0 * way], -1)
+    found = sections(way, straight, straight, np.full(len(way), 0.02))
+    np.testing.assert_allclose(found.sigma, 0.02 * np.sqrt(12 / 50) / 100, rtol=0.03)
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.8])
+def test_the_sigma_of_a_section_holds(memory):
+    # a first-order process, 1 m, in 100 drives of 10 sections of 60 fixes each
+    rng = np.random.default_rng(20261101)
+    way = np.arange(0.0, 6000.0, 10.0)
+    z = np.stack([way, 0 * way, 0 * way], -1)
+    pulls = []
+    for _ in range(100):
+        noise = rng.standard_normal((len(way), 2))
+        for i in range(1, len(way)):
+            noise[i] = memory * noise[i - 1] + np.sqrt(1 - memory**2) * noise[i]
+        fixes = z.copy()
+        fixes[:, :2] += noise
+        found = sections(way, z, fixes, np.ones(len(way)))
+        pulls += list((found.ratio - 1.0) / found.sigma)
+    # 1000 pulls: sqrt(1 / 2000) = 2.2 % of statistics; the likeness is taken from 60 fixes, a
+    # tenth of error in it moves the sigma by a fifth at 0.8
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.2)
+    assert abs(np.mean(pulls)) < 0.15
+
+
+def test_what_the_fixes_do_not_tell_is_nan_and_too_little_is_nothing():
+    way = np.linspace(0.0, 200.0, 20)
+    z = np.stack([way, 0 * way, 0 * way], -1)
+    assert len(sections(way[:5], z[:5], z[:5], np.ones(5)).ratio) == 0
+    assert len(sections(way[:0], z[:0], z[:0], np.ones(0)).ratio) == 0
+    found = sections(way, z, z, np.full(20, 500.0))
+    assert len(found.ratio) == 2
+    assert np.isnan(found.ratio).all()
+
+
+def test_offsets_of_the_clocks_are_followed():
+    config = with_settings(Config(), {'gnss.time_offset': 0.1, 'imu.time_offset': 0.03})
+    found = drive(bad=((3, 'status'),), config=config)
+    np.testing.assert_allclose(found.t_excluded, [0.67])
+    np.testing.assert_allclose(found.t_fix[:2], [0.07, 0.27])
