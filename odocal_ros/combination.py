@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.result import Calibration
@@ -33,23 +34,23 @@ def combine(legs, config: Config) -> Calibration:
     twice = _driven_twice(good)
     good = [leg for leg in good if leg not in twice]
     used = good or legs
-    reasons = _leg_reasons(legs, good, twice)
     names = dict.fromkeys(n for leg in used for n in leg.methods)
-    methods = {n: combine_method(n, [leg.methods[n] for leg in used if n in leg.methods])
+    methods = {n: _combined(n, [leg.methods[n] for leg in used if n in leg.methods])
                for n in names}
-    chosen = next(iter(methods.values()), None)
-    estimates = {} if chosen is None else {
-        name: replace(e, method=chosen.name) for name, e in chosen.estimates.items()}
-    if chosen is not None:
+    estimates, giving = choose(methods, config.method)
+    reasons = _leg_reasons(legs, good, twice, giving, estimates)
+    if giving:
         known = {(r.code, r.text) for r in reasons}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
-        reasons += [r for r in (*chosen.reasons, *judge(estimates, nominal, config))
+        own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
+               if len(legs) == 1 or r.code is Code.LEGS_DISAGREE]
+        reasons += [r for r in (*own, *judge(estimates, nominal, config))
                     if (r.code, r.text) not in known and (r.code not in PER_LEG or len(legs) == 1)]
         reasons = list(dict.fromkeys(reasons))
     if len(good) < config.verdict.min_legs and good:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} good leg'
                               f'{"s" * (len(good) > 1)} of {config.verdict.min_legs}'))
-    if chosen is None and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
+    if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy)
@@ -67,22 +68,46 @@ def _driven_twice(legs):
     return twice
 
 
-def _leg_reasons(legs, good, twice):
+def _combined(name, results):
+    """Return a method's combination of the legs where it is not rejected, of all if of none."""
+    good = [r for r in results if r.verdict is not Verdict.REJECTED]
+    whole = combine_method(name, good or results)
+    if good or len(results) == 1:
+        return whole
+    why = dict.fromkeys(r for one in results for r in one.reasons
+                        if r.code.gravity is Verdict.REJECTED)
+    return replace(whole, reasons=(*whole.reasons, *why))
+
+
+def _leg_reasons(legs, good, twice, giving, estimates):
     """Return the legs' own reasons, numbered where there are several."""
     reasons = []
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
-        own = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
+        methods = [leg.methods[n] for n in giving if n in leg.methods]
+        own = [*leg.reasons, *(r for m in methods
+                               for r in worth_saying(m.reasons, m.name, estimates)
                                if len(legs) == 1 or r.code not in PER_LEG)]
         if leg in twice:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
                                   'covers; not used'))
         elif good and leg not in good:
-            why = '; '.join(r.text for r in own if r.code.gravity is Verdict.REJECTED)
-            reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: {why}'))
+            every = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+            reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
+                                  + _why(every)))
         else:
-            reasons += [Reason(r.code, prefix + r.text) for r in own]
+            refused = [m for m in methods if good and m.verdict is Verdict.REJECTED]
+            reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
+                               + _why(m.reasons)) for m in refused]
+            reasons += [Reason(r.code, prefix + r.text) for r in own
+                        if not any(r in m.reasons for m in refused)]
     return reasons
+
+
+def _why(reasons):
+    """Return what rejects, in words."""
+    return '; '.join(dict.fromkeys(r.text for r in reasons
+                                   if r.code.gravity is Verdict.REJECTED))
 
 
 def _imu_rotation(estimates, C_bi):

@@ -1,43 +1,45 @@
-"""One leg on its way through the pipeline: align, propagate, dead reckon, fit, judge."""
+"""One leg on its way through the pipeline: align, propagate, dead reckon, each method, check."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from odocal_ros.align import align
-from odocal_ros.calib.budget import drift_sources
-from odocal_ros.calib.check import (
-    against_travel,
-    fix_noise_factor,
-    gyro_against_course,
-    mismatch,
-    pieces,
-    residuals,
-    steady,
-    track_check,
-)
+from odocal_ros.calib.agreement import disagreements
+from odocal_ros.calib.check import stray, track_check
+from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
-from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
-from odocal_ros.calib.slip import find_slips, slip_reason
-from odocal_ros.calib.slow_errors import marks_no_better
-from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
-from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
+from odocal_ros.two_point_run import two_point
 
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
+FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
+FEWEST_FIXES = 3        # for a check of the track
 FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
-FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 TRACK_ROWS = 5000       # of a track kept in a result
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
+
+
+@dataclass(frozen=True)
+class Member:
+    """A method of the pipeline: its name, how it runs, and on which legs it can."""
+
+    name: str
+    run: object
+    fits: object
+
+
+MEMBERS = (Member('two_point', two_point, lambda run: True),)     # always computed and shown
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -52,7 +54,14 @@ def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
 
 
 class LegRun:
-    """One leg on its way through the pipeline; nothing of it outlives the call."""
+    """
+    One leg on its way through the pipeline; nothing of it outlives the call.
+
+    What methods read: leg, inputs, config, origin, fixes_n (k, 3) m, fix_sigma m, nominal and
+    rough (scale, 0 or None unknown), lever_b (3,) m, spans (standstills), alignment, track,
+    distance m, t_fit s (fixes after it are held out); ``reasons`` takes what they find of the
+    data.
+    """
 
     def __init__(self, leg, inputs, config, reasons, alignment, holdout=False):
         self.leg, self.inputs, self.config, self.reasons = leg, inputs, config, reasons
@@ -69,52 +78,125 @@ class LegRun:
         self.rough = rough_scale(inputs.travel, inputs.t_fix, self.fixes_n,
                                  self.fix_sigma) or self.nominal
         self.alignment = alignment
+        self.lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
 
     def result(self) -> LegResult:
         """Return what the leg gives, however far it carries."""
+        if not self._moves():
+            return leg_result(self.leg, self.inputs, self.reasons)
+        self._prepare()
+        methods, paths = {}, {}
+        for member in MEMBERS:
+            if member.name in deciding(self.config.method, shown=True) and member.fits(self):
+                methods[member.name], paths[member.name] = member.run(self)
+        self.reasons += disagreements(methods)
+        estimates, _ = choose(methods, self.config.method)
+        scale = estimates.get('scale_factor')
+        if scale is None or paths.get(scale.method) is None:
+            return leg_result(self.leg, self.inputs, self.reasons, methods,
+                              distance=self.distance, deciding=deciding(self.config.method))
+        distance = self.distance
+        if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
+            distance *= scale.value / self.rough
+        before = self.path(np.array([self.nominal or self.rough, 0.0, 0.0]))
+        return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
+                          deciding=deciding(self.config.method),
+                          **self._tracks(before, paths[scale.method]))
+
+    def path(self, f, track=None):
+        """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
+        track = track or self.track
+
+        def at(t):
+            path = track.at(t) @ f
+            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+        return at
+
+    def mark(self, t, path, name=''):
+        """
+        Return the antenna's position at t, None without any.
+
+        By the fixes about it, or the surveyed point of the mark 'start' or 'end'.
+        """
+        point = self._surveyed(name, t)
+        if point:
+            position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
+            return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
+                           standing_at(t, self.spans) is not None, 0, 0, surveyed=True)
+        inputs, here = self.inputs, path(np.array(t))
+        rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
+        return fix_at(t, standing_at(t, self.spans),
+                      (inputs.t_fix, self.fixes_n, inputs.covariance_n),
+                      lambda times: path(times) - here,
+                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
+
+    def _surveyed(self, name, t):
+        """Return the reference point at a mark, () where the way does not begin or end there."""
+        if not name:
+            return ()
+        t_mark = 0.0 if name == 'start' else self.inputs.t_stop
+        span = standing_at(t_mark, self.spans)
+        if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
+            return getattr(self.config.reference, name)
+        return ()
+
+    def near(self, path, pin, between):
+        """Tell which fixes do not lie absurdly far from a path that fits: (k,) bool."""
+        if not between.any():
+            return between
+        off = np.hypot(*stray(path, pin, (self.inputs.t_fix, self.fixes_n))[:, :2].T)
+        usual = max(float(np.median(off[between])), self.fix_sigma)
+        far = between & (off > FAR * usual)
+        if far.any():
+            found = Reason(Code.BAD_ROWS_DROPPED, f'{int(far.sum())} of {int(between.sum())} '
+                           f'fixes lie more than {FAR * usual:.0f} m off the track; not used in '
+                           'the check')
+            if found.code not in {r.code for r in self.reasons if 'off the track' in r.text}:
+                self.reasons.append(found)
+        return ~far
+
+    def _moves(self):
+        """Tell whether there is a drive to speak of, and say what is not."""
         inputs = self.inputs
         still = not_moving(inputs.travel, inputs.t_fix, self.fixes_n, self.fix_sigma,
                            inputs.t_stop)
         if still or not self.rough:
             self.reasons += still or [Reason(Code.LEG_TOO_SHORT, 'the fixes move too little for a '
                                              'scale')]
-            return leg_result(self.leg, inputs, self.reasons)
+            return False
         covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
         if covered.sum() < FEWEST_ROWS:
             self.reasons += imu_gap(inputs, 0.0, 0.0)
-            return leg_result(self.leg, inputs, self.reasons)
+            return False
         self.reasons += uncovered(inputs.travel, inputs.t_stop)
+        return True
+
+    def _prepare(self):
+        """Align, reckon and judge the drive."""
+        inputs, config = self.inputs, self.config
         self.spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, self.rough,
-                                 self.config.leg.standstill)
+                                 config.leg.standstill)
         if self.alignment is None:
             self.alignment, why = align(inputs, self.spans, self.rough, self.fixes_n,
-                                        self.origin, self.config)
+                                        self.origin, config)
             self.reasons += why
-        self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), self.config.leg.max_gap)
-        self.track = self._reckon()
-        distance, found = judge_drive(self.track, inputs.t_stop, self.rough, self.config.leg)
+        self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
+        self.track = self.reckon(self.alignment)
+        self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
         self.reasons += found
         if self.holdout:
             self.t_fit = self._four_fifths()
-        chord = self._chord()
-        if chord is None:
-            return leg_result(self.leg, self.inputs, self.reasons, distance=distance)
-        method, more = self._two_point(chord, distance)
-        return leg_result(self.leg, self.inputs, self.reasons, {'two_point': method},
-                          **{'distance': distance} | more)
 
-    def _say(self, code, text):
-        self.reasons.append(Reason(code, text))
-
-    def _reckon(self):
-        inputs, a = self.inputs, self.alignment
-        pick = (inputs.t_imu >= a.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
+    def reckon(self, alignment, travel=None):
+        """Return the track of a travel (default: the mean of the wheels) from an alignment."""
+        inputs = self.inputs
+        pick = (inputs.t_imu >= alignment.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
         t = inputs.t_imu[pick]
         rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-        epochs, q_nb = attitude(t, inputs.w_b[pick] - a.gyro_bias, a.q_nb,
+        epochs, q_nb = attitude(t, inputs.w_b[pick] - alignment.gyro_bias, alignment.q_nb,
                                 earth_rate_n(self.origin.latitude),
                                 max(1, int(rate / EPOCH_RATE)))
-        return dead_reckon(epochs, q_nb, inputs.travel)
+        return dead_reckon(epochs, q_nb, travel or inputs.travel)
 
     def _four_fifths(self):
         """Return when four fifths of the distance are driven, s."""
@@ -123,183 +205,27 @@ class LegRun:
         way = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
         return float(self.track.t[inside][np.searchsorted(way, 0.8 * way[-1])])
 
-    def _chord(self):
-        """Return the chord between the marks, or None and say why."""
-        inputs, config = self.inputs, self.config
-        travel = inputs.travel
-        ends = (max(0.0, float(self.track.t[0]), float(travel.t[0])),
-                min(self.t_fit, float(self.track.t[-1]), float(travel.t[-1])))
-        forward = np.array([self.rough, 0.0, 0.0])
-        lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
-        marks = [self._mark(t, forward, lever_b, self._surveyed(name, t))
-                 for t, name in zip(ends, ('start', 'end'), strict=True)]
-        for mark, name in zip(marks, ('start', 'end'), strict=True):
-            if mark is None:
-                self._say(Code.NO_FIX, f'no usable fix at the {name} mark')
-        if None in marks:
-            return None
-        chord = Chord(self.track, self.origin, *marks, lever_b, self._velocity_change(marks),
-                      self.alignment, (inputs.doubt_t, inputs.doubt_sigma))
-        if not all(m.standing or m.surveyed for m in marks):     # the fit moves with the solution
-            if refusal(chord, self.rough):
-                return chord
-            forward, _ = solve(chord, np.inf)
-            marks = [m if m.surveyed else self._mark(m.t, forward, lever_b, ())
-                     for m in marks]
-            chord = replace(chord, start=marks[0], end=marks[1])
-        return chord
-
-    def _surveyed(self, name, t):
-        """Return the reference point at a mark, () where the chord does not begin or end there."""
-        t_mark = 0.0 if name == 'start' else self.inputs.t_stop
-        span = standing_at(t_mark, self.spans)
-        if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
-            return getattr(self.config.reference, name)
-        return ()
-
-    def _mark(self, t, forward, lever_b, surveyed):
-        if surveyed:
-            position = np.array([np.deg2rad(surveyed[0]), np.deg2rad(surveyed[1]), surveyed[2]])
-            return MarkFix(t, self.origin.to_n(position), np.eye(3) * surveyed[3]**2,
-                           standing_at(t, self.spans) is not None, 0, 0, surveyed=True)
-        here = self.track.at(np.array(t)) @ forward + self.track.C_nb_at(np.array(t)) @ lever_b
-
-        def displacement_n(times):
-            return (self.track.at(times) @ forward + self.track.C_nb_at(times) @ lever_b) - here
-
-        inputs = self.inputs
-        rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
-        return fix_at(t, standing_at(t, self.spans),
-                      (inputs.t_fix, self.fixes_n, inputs.covariance_n), displacement_n,
-                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
-
-    def _velocity_change(self, marks):
-        """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
-        change = np.zeros((3, 3))
-        for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
-            if not mark.standing:
-                low, high = np.clip([mark.t - 0.5, mark.t + 0.5], *self.track.t[[0, -1]])
-                rate = np.diff(np.interp([low, high], self.track.t, self.track.s))[0]
-                change += sign * self.track.C_nb_at(np.array(mark.t)) * rate / max(
-                    high - low, 1e-6)
-        return change
-
-    def _two_point(self, chord, distance):
-        """Return the method's result and the tracks and checks around it."""
-        inputs, config = self.inputs, self.config
-        refused = refusal(chord, self.rough)
-        if refused:
-            return unsolved(refused, inputs.scale_unit), {}
-        f, _ = solve(chord, np.inf)
-        between = self._between(chord, f)
-        fixes = inputs.t_fix[between], self.fixes_n[between]
-        before = np.array([self.nominal or self.rough, 0.0, 0.0])
-
-        def strays(f):
-            return residuals(self.track, f, chord.start, fixes, chord.lever_b)
-
-        more, factor = {}, np.ones(3)
-        if between.sum() >= 3:
-            drift_n = self._drift(chord, f)
-            drift = float(np.linalg.norm(drift_n))
-            residual = strays(f)
-            residual[:, 2] = strays(solve(chord)[0])[:, 2]     # the pitch is no noise of heights
-            covariance = inputs.covariance_n[between]
-            factor = self._noise_factor(residual, covariance, drift, chord)
-            chord = self._with_slow_errors(chord, f, fixes[0], residual, covariance, drift_n,
-                                           factor[0])
-            f, _ = solve(chord, factor[2])
-            more = {'before': track_check(strays(before), distance),
-                    'after': track_check(strays(f), distance)}
-            if self.holdout:
-                more |= self._held_out(chord, before, f)
-            self._judge_track(chord, f, fixes, residual, more['after'], drift, distance)
-        slips = find_slips(inputs.t_imu, inputs.f_b, self.track, f, self.origin.latitude,
-                           inputs.travel.quantum)
-        held = (slips[0] >= chord.start.t) & (slips[0] <= chord.end.t)
-        chord = replace(chord, slips=tuple(x[held] for x in slips))
-        self.reasons += slip_reason(*chord.slips)
-        method = fit(chord, self.nominal, inputs.scale_unit, inputs.travel.quantum, factor,
-                     config)
-        if not chord.alignment.heading_separable and chord.M[:2, 0] @ chord.M[:2, 0] > 0 \
-                and self.track.s[-1] < self.track.s[0]:
-            self._say(Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive '
-                      'counts mean backwards, or the vehicle was reversed all the way')
-        method = replace(method, reasons=method.reasons + judge(
-            method.estimates, self.nominal, config))
-        step = max(1, len(self.track.t) // TRACK_ROWS)
-        P = self.track.P[::step] - self.track.at(chord.start.t)
-        scale = method.estimates['scale_factor']
-        if scale.sigma < WORTH * scale.value:        # truer than the rough scale
-            more['distance'] = distance * scale.value / self.rough
-        more |= {'track_n': chord.start.position_n + P @ f,
-                 'track_before_n': chord.start.position_n + P @ before,
-                 'reference_n': fixes[1],
-                 'origin': (self.origin.latitude, self.origin.longitude, self.origin.height)}
-        return method, more
-
-    def _between(self, chord, f):
-        """Tell which fixes lie between the marks and not absurdly far from the corrected track."""
-        inputs = self.inputs
-        between = (inputs.t_fix >= chord.start.t) & (inputs.t_fix <= chord.end.t)
-        if not between.any():
-            return between
-        off = np.hypot(*residuals(self.track, f, chord.start,
-                                  (inputs.t_fix, self.fixes_n), chord.lever_b)[:, :2].T)
-        usual = max(float(np.median(off[between])), self.fix_sigma)
-        far = between & (off > FAR * usual)
-        if far.any():
-            self._say(Code.BAD_ROWS_DROPPED, f'{int(far.sum())} of {int(between.sum())} fixes lie '
-                      f'more than {FAR * usual:.0f} m off the track; not used in the check')
-        return between & ~far
-
-    def _held_out(self, chord, before, f):
-        """Return the check on the last fifth, from a fix at its begin, not used in the fit."""
-        inputs = self.inputs
-        late = (inputs.t_fix > self.t_fit) & (inputs.t_fix <= inputs.t_stop)
-        if late.sum() < 3:
+    def _tracks(self, before, after):
+        """Return the tracks as configured and as calibrated, and how far both stray."""
+        start = self.mark(max(0.0, float(self.track.t[0]), float(self.inputs.travel.t[0])), after,
+                          'start')
+        if start is None:
             return {}
-        fixes = inputs.t_fix[late], self.fixes_n[late]
-        begin = chord.end
-        way = np.abs(np.diff(self.track.s[self.track.t >= begin.t])).sum() * self.rough
-
-        return {name: track_check(residuals(self.track, g, begin, fixes, chord.lever_b), way)
-                for name, g in (('before', before), ('after', f))}
-
-    def _drift(self, chord, f):
-        """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
-        keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
-        D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
-        sources = drift_sources(self.track.t[keep], D, matrix_from_quat(self.track.q_nb[keep]),
-                                self.alignment)
-        # the bow of a pinned track is a quarter of what its free end would stray
-        return np.concatenate(list(sources.values()), axis=1) / 4
-
-    def _with_slow_errors(self, chord, f, t, residual, covariance, drift_n, factor):
-        """Return the chord with marks no better than the slow part of the fix errors."""
-        if not np.isnan(self.config.gnss.correlation_time):
-            return chord        # told, not judged
-        start, end = marks_no_better(
-            (chord.start, chord.end), self.spans, t, self.track.at(t) @ f, chord.M @ f,
-            residual / factor, covariance, drift_n / factor)     # in sigmas as stated
-        return replace(chord, start=start, end=end)
-
-    def _noise_factor(self, residual, covariance, drift, chord):
-        factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
-        if factor.max() > 1.0:
-            self._say(Code.FIXES_NOISIER_THAN_SAID, 'the fixes stray from the track '
-                      f'{factor[0]:.1f} times (in height {factor[2]:.1f} times) as far as their '
-                      'covariance says')
-        return factor
-
-    def _judge_track(self, chord, f, fixes, residual, check, drift, distance):
-        """Compare the corrected track with the fixes: units, signs, reversing, sanity."""
-        t, p = fixes
-        track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
-        keep, sigma = steady(residual, self.fix_sigma)
-        middle, direction, course = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
-        C = matrix_from_quat(self.track.q_nb)
-        yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
-        found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
-        found += against_travel(direction, course, self.config.odometer.signed)
-        self.reasons += found or mismatch(check, self.fix_sigma, drift, distance)
+        step = max(1, len(self.track.t) // TRACK_ROWS)
+        t = self.track.t[::step]
+        more = {name: start.position_n + path(t) - path(np.array(start.t))
+                for name, path in (('track_before_n', before), ('track_n', after))}
+        more |= {'origin': (self.origin.latitude, self.origin.longitude, self.origin.height)}
+        pin, begin, end = start, start.t, self.t_fit
+        if self.holdout:
+            pin, begin, end = self.mark(self.t_fit, after), self.t_fit, self.inputs.t_stop
+        between = (self.inputs.t_fix >= begin) & (self.inputs.t_fix <= end)
+        if pin is not None:
+            between &= self.near(after, pin, between)
+        fixes = self.inputs.t_fix[between], self.fixes_n[between]
+        more['reference_n'] = fixes[1]
+        if between.sum() < FEWEST_FIXES or pin is None:
+            return more
+        way = np.abs(np.diff(self.track.s[(self.track.t >= begin) & (self.track.t <= end)])).sum()
+        return more | {name: track_check(stray(path, pin, fixes), way * self.rough)
+                       for name, path in (('before', before), ('after', after))}

@@ -13,29 +13,22 @@ LOOSE = 4.0               # sigmas of disagreement that name a mismatch
 SLOP = 0.002              # of the distance: slip, suspension, road
 
 
-def residuals(track, f, start, fixes, lever_b):
+def stray(path, pin, fixes):
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
     Parameters
     ----------
-    track : Track
-        Of the leg.
-    f : (3,)
-        Scale times forward axis.
-    start : MarkFix
-        Where the track is pinned.
+    path : callable
+        t (n,) to the antenna's path, (n, 3) m, but for a constant.
+    pin : MarkFix
+        Where the path is pinned.
     fixes : (t, position_n)
         Within the leg.
-    lever_b : (3,) array
-        Antenna from the odometer's point, m; its turn since the start is taken with it.
 
     """
     t, position_n = fixes
-    reckoned = start.position_n + (track.at(t) - track.at(start.t)) @ f
-    if np.any(lever_b):
-        reckoned = reckoned + (track.C_nb_at(t) - track.C_nb_at(start.t)) @ lever_b
-    return reckoned - position_n
+    return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
 
 
 def track_check(residual, distance) -> TrackCheck:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
 
@@ -87,12 +88,15 @@ class LegResult:
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
     bag: str = ''                             # where it was recorded, empty when live
     C_bi: NDArray | None = None               # (3, 3) nominal rotation used, imu frame to b
+    deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
+    evidence: Evidence | None = None          # what a report draws, None where no track was fit
 
     @property
     def verdict(self) -> Verdict:
-        """Return the gravest of the leg's reasons and its best method's verdict."""
+        """Return the gravest of the leg's reasons and its best deciding method's verdict."""
         order = list(Verdict)
-        best = min((m.verdict for m in self.methods.values()), key=order.index,
+        best = min((m.verdict for name, m in self.methods.items()
+                    if name in (self.deciding or self.methods)), key=order.index,
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
 

@@ -1,0 +1,57 @@
+"""Methods on one leg held against each other: a difference beyond the sigmas has a cause."""
+
+from itertools import combinations
+import math
+
+from odocal_ros.calib.choice import ORDER
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.reasons import Code, Reason, Verdict
+
+LOOSE = 3.0     # sigmas of the difference, as if independent: methods that share data differ less
+NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+CAUSES = {
+    'scale_factor': {
+        'two_point': 'slip or bad fixes at one of the marks',
+        'wheels': 'one wheel that slips or a wrong track width'},
+    'yaw_mounting_angle': {
+        'two_point': 'the heading it was given (alignment.heading_source) is wrong by about as '
+        'much', 'wheels': 'the heading it was given (alignment.heading_source) is wrong by about '
+        'as much'},
+    'pitch_mounting_angle': {
+        'two_point': 'heights at the marks, or an accelerometer bias',
+        'wheels': 'heights of the fixes, or an accelerometer bias'},
+}
+
+
+def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
+    """
+    Compare what the methods say of one leg.
+
+    Parameters
+    ----------
+    methods : dict of MethodResult
+        By name; rejected ones are left out.
+
+    Returns
+    -------
+    METHODS_DISAGREE for each parameter of a pair that differs by more than three times the root
+    of the sum of both variances, with the likely cause.
+
+    """
+    sound = [methods[n] for n in ORDER if n in methods
+             and methods[n].verdict is not Verdict.REJECTED]
+    found = []
+    for name, word in NAMES.items():
+        for better, other in combinations(sound, 2):
+            a, b = (m.estimates.get(name) for m in (better, other))
+            if a is None or b is None or a.value is None or b.value is None:
+                continue
+            sigma = math.hypot(a.sigma, b.sigma)
+            if abs(b.value - a.value) > LOOSE * sigma:
+                off = (f'{(b.value / a.value - 1) * 1e6:+.0f} ppm' if name == 'scale_factor'
+                       else f'{math.degrees(b.value - a.value):+.3f} deg')
+                found.append(Reason(
+                    Code.METHODS_DISAGREE, f'{word} by {other.name} differs from that by '
+                    f'{better.name} by {off}, {abs(b.value - a.value) / sigma:.1f} sigma; likely '
+                    f'cause: {CAUSES[name][other.name]}'))
+    return found

@@ -1,0 +1,69 @@
+"""Which method gives which value: the first in order whose verdict allows it."""
+
+from dataclasses import replace
+
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.reasons import Code, Verdict
+
+ORDER = ('smoother', 'wheels', 'two_point')
+ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
+# what a reason speaks of: nothing to say where another method gives it
+ABOUT = {
+    Code.SCALE_NOT_DETERMINED: 'scale_factor', Code.SCALE_SIGMA_TOO_LARGE: 'scale_factor',
+    Code.SCALE_FAR_FROM_NOMINAL: 'scale_factor',
+    Code.YAW_NOT_SEPARABLE: 'yaw_mounting_angle', Code.YAW_NOT_DETERMINED: 'yaw_mounting_angle',
+    Code.YAW_SIGMA_TOO_LARGE: 'yaw_mounting_angle',
+    Code.YAW_FAR_FROM_NOMINAL: 'yaw_mounting_angle',
+    Code.PITCH_NOT_DETERMINED: 'pitch_mounting_angle',
+    Code.WHEELS_NOT_SEPARABLE: 'scale_factor_left',
+    Code.TRACK_WIDTH_NOT_DETERMINED: 'track_width',
+}
+
+
+def deciding(asked: str, shown: bool = False) -> tuple[str, ...]:
+    """
+    Return the methods whose figures may be the result, the first choice first.
+
+    asked : the setting ``method``.   shown : with those that are only shown beside it.
+    """
+    if asked in ('auto', 'all'):
+        return ORDER
+    return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
+
+
+def choose(methods: dict[str, MethodResult], asked: str):
+    """
+    Take each parameter from the first method that has it and is not rejected.
+
+    Parameters
+    ----------
+    methods : dict of MethodResult
+        By name.
+    asked : str
+        The setting ``method``.
+
+    Returns
+    -------
+    estimates : dict of Estimate
+        Each with the method it is from; value None where no method has it.
+    giving : tuple of str
+        The methods that gave any, or all that were asked where none is usable.
+
+    """
+    found = [methods[name] for name in deciding(asked) if name in methods]
+    usable = [m for m in found if m.verdict is not Verdict.REJECTED] or found
+    estimates: dict[str, Estimate] = {}
+    for method in usable:
+        for name, estimate in method.estimates.items():
+            if name not in estimates or (estimates[name].value is None
+                                         and estimate.value is not None):
+                estimates[name] = replace(estimate, method=method.name)
+    giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
+    return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
+
+
+def worth_saying(reasons, method: str, estimates: dict[str, Estimate]):
+    """Return a method's reasons without those about values that another method gives."""
+    return tuple(r for r in reasons if r.code not in ABOUT or (
+        given := estimates.get(ABOUT[r.code])) is None or given.value is None
+        or given.method == method)

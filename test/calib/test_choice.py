@@ -1,0 +1,133 @@
+"""Which method gives which value, and what is said where methods differ."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.agreement import disagreements, LOOSE
+from odocal_ros.calib.choice import choose, deciding, worth_saying
+from odocal_ros.calib.result import Estimate, LegResult, MethodResult
+from odocal_ros.combination import combine
+from odocal_ros.config import Config
+from odocal_ros.reasons import Code, Reason, Verdict
+
+NO_YAW = Reason(Code.YAW_NOT_DETERMINED, 'no turns')
+REFUSED = Reason(Code.CHORD_TOO_SHORT, 'a loop')
+
+
+def method(name, scale=2.0, yaw=0.01, reasons=()):
+    """Return a result with a scale of sigma 1e-3 and a yaw of sigma 1e-4 rad."""
+    sigma = None if scale is None else 1e-3
+    return MethodResult(name, tuple(reasons), {
+        'scale_factor': Estimate(scale, sigma, 'm/pulse'),
+        'scale_ratio': Estimate(None, None, '1'),
+        'yaw_mounting_angle': Estimate(yaw, None if yaw is None else 1e-4, 'rad')},
+        ('scale_factor', 'yaw_mounting_angle'))
+
+
+def several(*methods):
+    return {m.name: m for m in methods}
+
+
+def test_the_first_in_order_gives_what_it_has():
+    methods = several(method('two_point', 2.0, 0.01), method('smoother', 2.1, None, [NO_YAW]))
+    estimates, giving = choose(methods, 'auto')
+    assert (estimates['scale_factor'].value, estimates['scale_factor'].method) == (2.1, 'smoother')
+    assert estimates['yaw_mounting_angle'].method == 'two_point'
+    assert giving == ('smoother', 'two_point')
+
+
+def test_a_rejected_method_gives_nothing_while_another_is_sound():
+    methods = several(method('wheels', 2.1, reasons=[REFUSED]), method('two_point'))
+    assert choose(methods, 'auto')[0]['scale_factor'].value == 2.0
+
+
+def test_where_all_are_rejected_the_values_computed_stay():
+    methods = several(method('wheels', 2.1, reasons=[REFUSED]),
+                      method('two_point', None, None, [REFUSED]))
+    estimates, giving = choose(methods, 'auto')
+    assert estimates['scale_factor'].value == 2.1
+    assert giving == ('wheels',)
+
+
+def test_a_method_asked_for_is_the_only_one():
+    methods = several(method('smoother', 2.1), method('two_point', None, None, [REFUSED]))
+    estimates, giving = choose(methods, 'two_point')
+    assert estimates['scale_factor'].value is None
+    assert giving == ('two_point',)
+    assert choose(several(method('two_point')), 'wheels') == ({}, ())
+
+
+@pytest.mark.parametrize(('asked', 'run'), [
+    ('two_point', ('two_point',)), ('wheels', ('wheels', 'two_point')),
+    ('auto', ('smoother', 'wheels', 'two_point')), ('all', ('smoother', 'wheels', 'two_point'))])
+def test_the_operators_own_marks_are_always_computed(asked, run):
+    assert deciding(asked, shown=True) == run
+
+
+def test_reasons_about_a_value_that_another_method_gives_are_not_said():
+    both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'auto')
+    alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'auto')
+    assert worth_saying([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
+    assert worth_saying([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
+
+
+def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
+    limit = LOOSE * 2**0.5 * 1e-3
+    near = several(method('smoother'), method('two_point', 2.0 + 0.99 * limit))
+    far = several(method('smoother'), method('two_point', 2.0 + 1.01 * limit))
+    assert disagreements(near) == []
+    (found,) = disagreements(far)
+    assert found.code is Code.METHODS_DISAGREE
+    assert 'scale by two_point differs from that by smoother by +2143 ppm, 3.0 sigma' in found.text
+    assert 'marks' in found.text
+
+
+def test_a_yaw_that_differs_points_at_the_heading():
+    far = several(method('smoother'), method('two_point', yaw=0.01 + 5e-3))
+    (found,) = disagreements(far)
+    assert '+0.286 deg' in found.text
+    assert 'heading' in found.text
+
+
+def test_a_rejected_method_is_not_compared():
+    assert disagreements(several(method('smoother'), method('two_point', 3.0,
+                                                            reasons=[REFUSED]))) == []
+
+
+def leg(number, *methods, reasons=(), deciding=()):
+    start = 10**18 + number * 10**12
+    return LegResult(start, start + 10**11, 1000.0, 100.0, 10_000, 5000, 500, 0, tuple(reasons),
+                     several(*methods), C_bi=np.eye(3), deciding=deciding)
+
+
+def test_a_leg_good_by_another_method_is_good_and_the_refusal_is_not_the_result():
+    one = leg(1, method('two_point', None, None, [REFUSED]), method('smoother'))
+    assert one.verdict is Verdict.ACCEPTED
+    whole = combine([one], Config())
+    assert whole.verdict is Verdict.ACCEPTED
+    assert whole.estimates['scale_factor'].method == 'smoother'
+    assert REFUSED not in whole.reasons
+    assert REFUSED in whole.methods['two_point'].reasons
+
+
+def test_a_leg_is_judged_by_the_methods_asked_for():
+    one = leg(1, method('two_point', reasons=[REFUSED]), method('smoother'))
+    assert replace(one, deciding=('two_point',)).verdict is Verdict.REJECTED
+
+
+def test_a_method_takes_only_the_legs_where_it_is_sound():
+    legs = [leg(1, method('two_point', 2.0), method('smoother', 2.2)),
+            leg(2, method('two_point', 2.0), method('smoother', None, None, [REFUSED]))]
+    whole = combine(legs, Config())
+    assert whole.estimates['scale_factor'].value == 2.2
+    assert whole.verdict is Verdict.CAUTION
+    assert [r.text for r in whole.reasons] == ['leg 2: not used for smoother: a loop']
+
+
+def test_a_method_rejected_on_every_leg_stays_rejected_in_the_combination():
+    legs = [leg(i, method('two_point', 2.0, reasons=[REFUSED])) for i in (1, 2)]
+    whole = combine(legs, Config())
+    assert whole.verdict is Verdict.REJECTED
+    assert whole.methods['two_point'].verdict is Verdict.REJECTED
