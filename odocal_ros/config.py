@@ -14,6 +14,7 @@ from odocal_ros.errors import BadConfig
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
+FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs')
 NAN = math.nan
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
@@ -185,9 +186,8 @@ class OutputConfig:
                              '.')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')
-    formats: tuple[str, ...] = setting(('params', 'autoware', 'transform'), choices=(
-        'params', 'autoware', 'transform'), about='Files written beside '
-        'calibration.json.')
+    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
+                                       'calibration.json.')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,20 +1,23 @@
-"""Texts of the files that other ROS programs load unchanged."""
+"""Texts of the files that other programs load unchanged."""
 
-import math
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
-from odocal_ros.output.summary import sentence
+from odocal_ros.output.controller_files import CONTROLLERS, controllers
+from odocal_ros.output.device_files import DEVICES, devices
+from odocal_ros.output.file_head import head, number
+from odocal_ros.output.geojson import geojson, TRACK
+from odocal_ros.output.leg_table import leg_table, LEGS
 from odocal_ros.reasons import Verdict
 
 PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
 IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
-NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND}
+NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS}
 IMU_FRAME = 'imu_link'      # REP-145, where frames.imu is left empty
 AXES = 'xyz'
 
@@ -32,36 +35,15 @@ def texts(calibration: Calibration, config: Config, content: dict) -> dict[str, 
         out[PARAMS] = _params(calibration, content)
     if calibration.verdict is Verdict.REJECTED:
         return out
-    head = _head(calibration, content)
-    if 'autoware' in formats:
-        factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
-        if factor is not None:
-            out[VELOCITY] = head + _velocity_converter(factor, config.frames.base)
-        if bias_i is not None:
-            out[IMU] = head + _imu_corrector(bias_i)
-    if 'transform' in formats and calibration.imu_rotation_rpy is not None:
-        out |= _transform(calibration, config, content)
+    for name, make in MAKERS.items():
+        if name in formats:
+            out |= make(calibration, config, content)
     return out
 
 
-def number(value: float | None) -> str:
-    """Return a double as YAML that every reader types as one: 1e-05 is text to YAML 1.1."""
-    if value is None or not math.isfinite(value):
-        return '.nan'
-    text = repr(float(value))
-    mantissa, e, exponent = text.partition('e')
-    return text if not e or '.' in mantissa else f'{mantissa}.0e{exponent}'
-
-
-def _head(calibration, content) -> str:
-    bags = ', '.join(str(i['bag']) for i in content['inputs'] if i.get('bag')) or 'live'
-    lines = [f'{content["software"]}, {content["created"]}, {len(calibration.legs)} leg'
-             f'{"s" * (len(calibration.legs) != 1)}, from: {bags}', sentence(calibration)]
-    return ''.join(f'# {line}\n' for line in lines)
-
-
 def _params(calibration, content) -> str:
-    lines = [_head(calibration, content).rstrip(),
+    lines = [head(calibration, content).rstrip(),
+             '# for the node calibrator: --params-file, or ros2 param load',
              '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)',
              '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
              'points left of forward',
@@ -76,6 +58,17 @@ def _params(calibration, content) -> str:
     return '\n'.join(lines) + '\n'
 
 
+def _autoware(calibration, config, content) -> dict[str, str]:
+    out = {}
+    top = head(calibration, content)
+    factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
+    if factor is not None:
+        out[VELOCITY] = top + _velocity_converter(factor, config.frames.base)
+    if bias_i is not None:
+        out[IMU] = top + _imu_corrector(bias_i)
+    return out
+
+
 def _speed_factor(calibration) -> float | None:
     """Return what to multiply reported speeds by; pulses have one only against a nominal K0."""
     scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
@@ -85,8 +78,8 @@ def _speed_factor(calibration) -> float | None:
 
 
 def _velocity_converter(factor, frame) -> str:
-    return ('# for autoware vehicle_velocity_converter; the two stddev are its defaults, not '
-            'measured here\n'
+    return ('# for autoware vehicle_velocity_converter, in place of its param file of this name;\n'
+            '# the two stddev are its defaults, not measured here\n'
             '/**:\n  ros__parameters:\n'
             f'    speed_scale_factor: {number(factor)}\n'
             '    velocity_stddev_xx: 0.2\n'
@@ -104,7 +97,8 @@ def _gyro_bias_i(calibration, config):
 
 
 def _imu_corrector(bias_i) -> str:
-    lines = ['# for autoware imu_corrector; the stddev are its defaults, not measured here',
+    lines = ['# for autoware imu_corrector, in place of its param file of this name;',
+             '# the stddev are its defaults, not measured here',
              '/**:', '  ros__parameters:']
     lines += [f'    angular_velocity_offset_{axis}: {number(b)}'
               for axis, b in zip(AXES, bias_i, strict=True)]
@@ -113,6 +107,8 @@ def _imu_corrector(bias_i) -> str:
 
 
 def _transform(calibration, config, content) -> dict[str, str]:
+    if calibration.imu_rotation_rpy is None:
+        return {}
     xyz = [repr(float(v)) for v in config.imu.lever_arm]
     rpy = [repr(float(v)) for v in calibration.imu_rotation_rpy]
     base, imu = config.frames.base, config.frames.imu or IMU_FRAME
@@ -120,18 +116,22 @@ def _transform(calibration, config, content) -> dict[str, str]:
                         *(f'--{a} {v}' for a, v in zip(('roll', 'pitch', 'yaw'), rpy,
                                                        strict=True)),
                         f'--frame-id {base}', f'--child-frame-id {imu}'])
-    note = _head(calibration, content).replace('# ', '').replace('--', '-').strip()
+    note = head(calibration, content).replace('# ', '').replace('--', '-').strip()
     urdf = (f'<!-- put into your URDF in place of the joint that carries the IMU\n{note} -->\n'
             f'<joint name={quoteattr(f"{base}_to_{imu}")} type="fixed">\n'
             f'  <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>\n'
             f'  <parent link={quoteattr(base)}/>\n  <child link={quoteattr(imu)}/>\n</joint>\n')
     launch = ('<?xml version="1.0"?>\n'
-              f'<!-- {note} -->\n<launch>\n'
+              f'<!-- include it in the launch file of your vehicle\n{note} -->\n<launch>\n'
               f'  <node pkg="tf2_ros" exec="static_transform_publisher" name='
               f'{quoteattr(f"{base}_to_{imu}")}\n        args={quoteattr(options)}/>\n</launch>\n')
-    command = (_head(calibration, content)
+    command = (head(calibration, content)
                + f'# The attitude of {imu} on {base}. robot_localization takes it from TF, which '
                'this command publishes;\n'
                '# it is not the yaw_offset of navsat_transform, which corrects a compass.\n'
                f'ros2 run tf2_ros static_transform_publisher {options}\n')
     return {LAUNCH: launch, URDF: urdf, COMMAND: command}
+
+
+MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,
+          'devices': devices, 'track': geojson, 'legs': leg_table}

@@ -101,7 +101,9 @@ def test_without_a_yaw_there_is_no_transform(good):
 
 def test_every_file_written_is_known_for_removal(good):
     bias = {f'gyro_bias_{a}': Estimate(0.1, 1e-5, 'rad/s') for a in 'xyz'}
-    assert set(texts(replace(good, estimates=good.estimates | bias))) == ros_files.NAMES
+    legs = tuple(replace(leg, origin=(0.8, 0.2, 100.0)) for leg in good.legs)
+    whole = replace(good, estimates=good.estimates | bias, legs=legs)
+    assert set(texts(whole)) == ros_files.NAMES
 
 
 @pytest.mark.parametrize('value', [1e-5, 1e22, -3e-7, 0.1, 0.0, 1.0, -123456.789])

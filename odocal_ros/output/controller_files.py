@@ -1,0 +1,72 @@
+"""Parameters of the drive controllers of ros2_controllers, from a calibration."""
+
+from math import tau
+
+from odocal_ros.calib.judge import nominal_scale
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config
+from odocal_ros.output.file_head import head, number
+from odocal_ros.output.summary import known
+
+CONTROLLERS = 'ros2_controllers.yaml'
+# controllers that take the radius itself, and their parameter for it
+RADIUS = {'ackermann_steering_controller': 'traction_wheels_radius',
+          'tricycle_steering_controller': 'traction_wheels_radius',
+          'bicycle_steering_controller': 'traction_wheel_radius',
+          'tricycle_controller': 'wheel_radius'}
+
+
+def controllers(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+    """Return the file by name, nothing when no value of it was determined."""
+    blocks = {}
+    multipliers = _multipliers(calibration, config)
+    if multipliers:
+        blocks['diff_drive_controller'] = multipliers
+    radius = wheel_radius(calibration, config)
+    if radius is not None:
+        blocks |= {name: {key: radius} for name, key in RADIUS.items()}
+    if not blocks:
+        return {}
+    lines = [head(calibration, content).rstrip(),
+             '# for ros2_controllers: take the block of your controller into its parameter file,',
+             '# under the name that your controller has there; the wheel calibrated must be one',
+             '# that the controller drives. The multipliers are against odometer.nominal_scale:',
+             '# with others in force during the drive, multiply those by these.',
+             '# Older releases name the radius rear_wheels_radius or rear_wheel_radius.']
+    for name, values in blocks.items():
+        lines += [f'{name}:', '  ros__parameters:',
+                  *(f'    {key}: {number(value)}' for key, value in values.items())]
+    return {CONTROLLERS: '\n'.join(lines) + '\n'}
+
+
+def _multipliers(calibration, config) -> dict[str, float]:
+    """Return those of diff_drive_controller: each wheel's own factor where there is one."""
+    estimates = calibration.estimates
+    common = known(estimates, 'scale_ratio').value
+    sides = [known(estimates, f'scale_factor_{side}') for side in ('left', 'right')]
+    nominal = nominal_scale(config, sides[0].unit or known(estimates, 'scale_factor').unit)
+    out = {}
+    if nominal and all(side.value is not None for side in sides):
+        out = {f'{name}_wheel_radius_multiplier': side.value / nominal
+               for name, side in zip(('left', 'right'), sides, strict=True)}
+    elif common is not None:
+        out = {f'{name}_wheel_radius_multiplier': common for name in ('left', 'right')}
+    width = known(estimates, 'track_width')
+    if width.value is not None and width.sigma and config.odometer.track_width:
+        out['wheel_separation_multiplier'] = width.value / config.odometer.track_width
+    return out
+
+
+def wheel_radius(calibration: Calibration, config: Config) -> float | None:
+    """Return the effective radius of the wheel, m; None where its pulses per turn are unknown."""
+    scale = known(calibration.estimates, 'scale_factor')
+    wheels = config.wheels
+    if scale.value is None:
+        return None
+    if scale.unit == 'm/rad':
+        return scale.value
+    if scale.unit == 'm/pulse' and wheels.pulses_per_revolution:
+        return scale.value * wheels.pulses_per_revolution / tau
+    if scale.unit == '1' and wheels.radius:     # a speed made with that radius
+        return scale.value * wheels.radius
+    return None

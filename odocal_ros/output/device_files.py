@@ -1,0 +1,49 @@
+"""What positioning systems with a wheel input want to be told of the wheel."""
+
+import textwrap
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config
+from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.file_head import head
+from odocal_ros.output.summary import inverse, known
+
+DEVICES = 'wheel_input.txt'
+MICRO = 1e6
+
+
+def devices(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+    """Return the file by name; nothing without a scale factor in metres per pulse."""
+    scale = known(calibration.estimates, 'scale_factor')
+    if scale.value is None or scale.unit != 'm/pulse':
+        return {}
+    micrometres = with_sigma(scale.value, scale.sigma, MICRO)
+    lines = [head(calibration, content).rstrip(),
+             '# for receivers and inertial systems that count the wheel themselves; the pulse is '
+             'that of the',
+             '# counter calibrated: a device that counts other edges wants a multiple',
+             f'# one pulse: {micrometres} um; {inverse(scale)}']
+    for where, setting in _settings(scale.value, config.wheels.pulses_per_revolution):
+        lines += ['', *textwrap.wrap(where, 98, initial_indent='# ', subsequent_indent='# ')]
+        lines += [setting] if setting else []
+    return {DEVICES: '\n'.join(lines) + '\n'}
+
+
+def _settings(scale: float, pulses: float) -> list[tuple[str, str]]:
+    """Return (where it goes, the line) for each system; a line is empty where it lacks a fact."""
+    per_metre = f'{1 / scale:.9g}'
+    wheel = ''
+    if pulses and pulses == round(pulses):
+        wheel = f'SETWHEELPARAMETERS {pulses:.0f} {pulses * scale:.9g} {scale:.9g}'
+    return [
+        ('u-blox F9 dead reckoning (UBX-CFG-VALSET, key 0x40070007, U4): whole um per tick',
+         f'CFG-SFODO-FACTOR = {scale * MICRO:.0f}'),
+        ('SBG Systems, sbg_ros2_driver with device configuration by ROS parameters: group odom; '
+         'with the sbgECom library: member gain of SbgEComOdoConf, sent by '
+         'sbgEComCmdOdoSetConf: pulses per metre',
+         f'gain: {per_metre}' if '.' in per_metre else f'gain: {per_metre}.0'),
+        ('OxTS, NAVconfig, advanced tools, tab Wheel speed input: pulses per metre',
+         f'Pulses per metre = {per_metre}'),
+        ('NovAtel SPAN, firmware up to 7.06: ticks per revolution, circumference m, spacing of '
+         'ticks m. Later firmware (DMICONFIG) is told no size and finds it itself.'
+         + ('' if wheel else ' Needs a whole number in wheels.pulses_per_revolution.'), wheel)]

@@ -1,0 +1,103 @@
+"""
+The legs as GeoJSON (RFC 7946): WGS 84 longitude and latitude in degrees, height in metres.
+
+Four features a leg: the corrected track, the track as configured, the fixes, the two marks.
+"""
+
+import json
+
+import numpy as np
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.config import Config
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.output.summary import sentence
+
+TRACK = 'track.geojson'
+MOST = 5000          # points of a feature: maps draw no more, and files stay small
+ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
+         'values found; as_configured: with the values before; fixes: of the receiver; both '
+         'tracks begin at the start mark')
+PLACES, HEIGHT_PLACES = 8, 3     # 1e-8 deg: 1 mm
+
+
+def geojson(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+    """Return the file by name, nothing when no leg has a track."""
+    features = [feature for n, leg in enumerate(calibration.legs, 1)
+                for feature in _features(n, leg)]
+    if not features:
+        return {}
+    whole = {'type': 'FeatureCollection', 'name': 'odocal', 'about': ABOUT,
+             'software': content['software'], 'created': content['created'],
+             'result': sentence(calibration), 'features': features}
+    return {TRACK: json.dumps(whole, allow_nan=False, ensure_ascii=False) + '\n'}
+
+
+def _features(number: int, leg: LegResult) -> list[dict]:
+    if leg.origin is None:
+        return []
+    out = []
+    for name, rows, make in (('corrected', leg.track_n, _line),
+                             ('as_configured', leg.track_before_n, _line),
+                             ('fixes', leg.reference_n, _points)):
+        positions = _positions(rows, leg)
+        if len(positions):
+            out.append(_feature(make(positions), number, leg, name,
+                                {'points': len(positions), 'of': len(rows)}))
+    track = _positions(leg.track_n, leg)
+    if len(track):
+        for name, row, stamp_ns in (('start', 0, leg.start_ns), ('stop', -1, leg.stop_ns)):
+            point = {'type': 'Point', 'coordinates': track[row].tolist()}
+            out.append(_feature(point, number, leg, 'mark', {'mark': name, 'stamp_ns': stamp_ns}))
+    return out
+
+
+def _feature(geometry, number, leg, kind, more):
+    return {'type': 'Feature', 'geometry': geometry,
+            'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,
+                           'verdict': leg.verdict.value} | more}
+
+
+def _positions(rows_n, leg) -> np.ndarray:
+    """Return rows of n, m, as (k, 2 or 3) longitude, latitude, deg, and height, m, if known."""
+    if rows_n is None or not len(rows_n):
+        return np.empty((0, 3))
+    few = np.linspace(0, len(rows_n) - 1, min(len(rows_n), MOST)).round().astype(int)
+    rows_n = np.array(rows_n, dtype=float)[few]
+    rows_n = rows_n[np.isfinite(rows_n[:, :2]).all(axis=1)]
+    level = np.isnan(rows_n[:, 2]).any()
+    geodetic = Origin(*leg.origin).to_geodetic(np.nan_to_num(rows_n))
+    degrees = np.rad2deg(geodetic[:, 1::-1]).round(PLACES)
+    if level:
+        return degrees
+    return np.column_stack([degrees, geodetic[:, 2].round(HEIGHT_PLACES)])
+
+
+def _points(positions):
+    return {'type': 'MultiPoint', 'coordinates': positions.tolist()}
+
+
+def _line(positions):
+    """Return a line, cut where it crosses the 180th meridian (RFC 7946, 3.1.9)."""
+    jumps = np.flatnonzero(np.abs(np.diff(positions[:, 0])) > 180)
+    if len(positions) < 2:
+        return {'type': 'Point', 'coordinates': positions[0].tolist()}
+    if not len(jumps):
+        return {'type': 'LineString', 'coordinates': positions.tolist()}
+    pieces, begin = [], []
+    for piece, after in zip(np.split(positions, jumps + 1), [*(jumps + 1), None], strict=True):
+        end = []
+        if after is not None:
+            end, following = _crossing(positions[after - 1], positions[after])
+        pieces.append([*begin, *piece.tolist(), *end])
+        begin = [] if after is None else following
+    return {'type': 'MultiLineString', 'coordinates': pieces}
+
+
+def _crossing(before, after):
+    """Return the point on the 180th meridian between two points, as seen from either side."""
+    side = 180.0 if before[0] > 0 else -180.0
+    beyond = after[0] + 2 * side
+    share = (side - before[0]) / (beyond - before[0])
+    rest = (before[1:] + share * (after[1:] - before[1:])).round(PLACES).tolist()
+    return [[side, *rest]], [[-side, *rest]]

@@ -1,0 +1,61 @@
+"""The legs as a table for a spreadsheet: one row a leg, plain numbers, units in the head."""
+
+import csv
+from datetime import datetime, UTC
+import io
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.config import Config
+from odocal_ros.output.summary import known
+from odocal_ros.reasons import Verdict
+
+LEGS = 'legs.csv'
+SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',
+         'scale_factor_right': '', 'track_width': 'm', 'yaw_mounting_angle': 'rad',
+         'pitch_mounting_angle': 'rad'}
+
+
+def leg_table(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+    """Return the file by name, nothing without legs."""
+    if not calibration.legs:
+        return {}
+    rows = [_row(n, leg, calibration) for n, leg in enumerate(calibration.legs, 1)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    return {LEGS: text.getvalue()}
+
+
+def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
+    """Return a row; what a leg does not know is an empty cell."""
+    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+    row = {'leg': number, 'bag': leg.bag, 'start [UTC]': _iso(leg.start_ns),
+           'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
+           'duration [s]': leg.duration, 'distance [m]': leg.distance,
+           'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,
+           'rejected_fixes': leg.rejected_fixes, 'verdict': leg.verdict.value,
+           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
+    for name, unit in SHOWN.items():
+        if name in calibration.estimates:
+            unit = unit or calibration.estimates[name].unit
+            found = _estimate(leg, calibration, name)
+            row |= {f'{name} [{unit}]': found.value, f'{name}_sigma [{unit}]': found.sigma}
+    for name in ('before', 'after'):
+        check = getattr(leg, name)
+        row |= {f'{name}_{part} [m]': None if check is None else getattr(check, part)
+                for part in ('rms', 'mean', 'max', 'end')}
+    return row
+
+
+def _estimate(leg, calibration, name):
+    """Return a leg's value by the method whose value the calibration gives, else by its best."""
+    method = leg.methods.get(calibration.estimates[name].method)
+    if method is None:
+        order = list(Verdict)
+        method = min(leg.methods.values(), key=lambda m: order.index(m.verdict), default=None)
+    return known({} if method is None else method.estimates, name)
+
+
+def _iso(stamp_ns: int) -> str:
+    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'

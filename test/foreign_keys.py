@@ -1,0 +1,24 @@
+"""
+Names that other systems give to what they load, and where each name was read.
+
+Facts only, noted by hand from the source named, apart from the code that writes the files.
+"""
+
+AUTOWARE_VELOCITY = {    # autoware.universe, sensing/vehicle_velocity_converter, README
+    'speed_scale_factor', 'velocity_stddev_xx', 'angular_velocity_stddev_zz', 'frame_id'}
+AUTOWARE_IMU = {         # autoware, sensing/autoware_imu_corrector/config/imu_corrector.param.yaml
+    *(f'angular_velocity_offset_{a}' for a in 'xyz'),
+    *(f'angular_velocity_stddev_{a}{a}' for a in 'xyz')}
+ROS2_CONTROLLERS = {     # ros2_controllers, <name>/src/<name>.yaml or <name>_parameter.yaml
+    'diff_drive_controller': {'left_wheel_radius_multiplier', 'right_wheel_radius_multiplier',
+                              'wheel_separation_multiplier'},
+    'ackermann_steering_controller': {'traction_wheels_radius'},
+    'tricycle_steering_controller': {'traction_wheels_radius'},
+    'bicycle_steering_controller': {'traction_wheel_radius'},
+    'tricycle_controller': {'wheel_radius'}}
+DEVICES = {              # how the line begins that the system is to be given
+    'u-blox': 'CFG-SFODO-FACTOR = ',          # ZED-F9R application note UBX-22035176, page 22
+    'SBG': 'gain: ',                          # sbg_ros2_driver, config/example; sbgEComCmdOdo.h
+    'OxTS': 'Pulses per metre = ',            # RT3000 manual, NAVconfig, wheel speed input
+    'NovAtel': 'SETWHEELPARAMETERS '}         # novatel_span_driver; OEM7 SPAN manual v14, page 119
+UBLOX_FACTOR_ID = '0x40070007'                # u-blox_config_keys.h of SparkFun; ublox_dgnss
