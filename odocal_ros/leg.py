@@ -39,7 +39,8 @@ class Leg:
 
     Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
     ``stop_ns``, in order of arrival, as sent. ``odometer`` is the left wheel where
-    ``odometer_right`` is not empty.
+    ``odometer_right`` is not empty; ``form_right`` is what its values mean where its messages are
+    not those of the left.
     """
 
     start_ns: int
@@ -51,6 +52,7 @@ class Leg:
     fix_velocity: VelocitySamples = field(default_factory=no_velocity)
     heading: HeadingSamples = field(default_factory=no_heading)
     form: OdometerForm = COUNTER
+    form_right: OdometerForm | None = None
 
 
 class LegRecorder:
@@ -60,6 +62,7 @@ class LegRecorder:
         self._blocks: dict[str, list] = {slot: [] for slot in SLOTS}
         self._newest = dict.fromkeys(SLOTS, 0)
         self.form = COUNTER
+        self.form_right: OdometerForm | None = None
 
     def feed(self, slot: str, block) -> None:
         """Append a block (one row or many) to a slot of SLOTS."""
@@ -88,7 +91,7 @@ class LegRecorder:
         could no longer be forgotten bit by bit.
         """
         copy = LegRecorder()
-        copy.form = self.form
+        copy.form, copy.form_right = self.form, self.form_right
         copy._newest = dict(self._newest)
         copy._blocks = {slot: list(blocks) for slot, blocks in self._blocks.items()}
         return copy
@@ -115,7 +118,8 @@ class LegRecorder:
         """
         first_ns = start_ns - round(preroll * 1e9)
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
-        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form, **rows)
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,
+                   form_right=self.form_right, **rows)
 
 
 def _key(samples) -> np.ndarray:

@@ -5,13 +5,12 @@ False rows are dropped where the counter goes on beside them as if nothing had b
 be known of the travel (a reset, a gap of speeds or increments) becomes a doubt of the budget.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.glitches import speed_glitches
-from odocal_ros.nav.odometer import mean_travel, Travel, travel
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import take
 
@@ -24,45 +23,12 @@ BESIDE = 5           # steps beside a jump or a gap that tell the speed there
 LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
 
 
-@dataclass(frozen=True, eq=False)
-class Wheels:
-    """Travel of the wheels, and what of it is in doubt."""
-
-    mean: Travel
-    left: Travel | None
-    right: Travel | None
-    doubt_t: NDArray[np.float64]        # (k,) s, where
-    doubt_sigma: NDArray[np.float64]    # (k,) scale units, how much
-
-
-def wheels(leg, config, rows, found) -> Wheels:
-    """
-    Return the travel of the wheels of a leg.
-
-    rows : callable, a slot's usable rows and their times, s.   found : list that findings join.
-    """
-    def one(slot):
-        samples, t = rows(slot)
-        samples, t = _mended(samples, t, leg.form, found)
-        way, reasons = travel(t, samples.value, leg.form, config.odometer.reversed)
-        found.extend(reasons)
-        return _doubted(way, samples.value, leg.form)
-
-    left, t_left, sigma_left = one('odometer')
-    if not len(leg.odometer_right.stamp_ns):
-        return Wheels(left, None, None, t_left, sigma_left)
-    right, t_right, sigma_right = one('odometer_right')
-    mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
-    return Wheels(mean, left, right, np.append(t_left, t_right),
-                  np.append(sigma_left, sigma_right) / 2)
-
-
-def _mended(samples, t, form, found):
+def mended(samples, t, form, found, name='odometer'):
     """Return rows without the false ones, increments with the false ones smoothed."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
-            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} odometer '
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
                                 'counts hang or jump away and come back, first at '
                                 f't = {t[np.argmax(false)]:.2f} s; dropped'))
         return take(samples, ~false), t[~false]
@@ -72,7 +38,7 @@ def _mended(samples, t, form, found):
             good = np.interp(t, t[~false], samples.value[~false].astype(float))
             kept = np.where(false, good, samples.value).astype(samples.value.dtype)
             samples = replace(samples, value=kept)
-            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} odometer '
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
                                 'increments stand alone far from their neighbours, first at '
                                 f't = {t[np.argmax(false)]:.2f} s; taken like those beside'))
     return samples, t
@@ -133,7 +99,7 @@ def _comes_back(t, net, step, a, b, top):
     return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
 
 
-def _doubted(way: Travel, value, form):
+def doubted(way: Travel, value, form):
     """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
     none = np.empty(0)
     if len(way.t) < ENOUGH:

@@ -18,9 +18,9 @@ from odocal_ros.glitches import beyond, frozen, imu_glitches, speed_glitches
 from odocal_ros.leg import Leg
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.odometer_care import wheels
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import take
+from odocal_ros.wheel_travel import wheels
 
 GAP_FACTOR = 5.0         # a gap in odometer or fixes, in median intervals
 NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
@@ -76,7 +76,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         sent = getattr(leg, slot)
         clean = _rising(_finite(sent, slot, leg, found), slot, leg, found)
         t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset[slot]
-        spikes = _spikes(slot, clean, t, leg.form, config)
+        form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
+        spikes = _spikes(slot, clean, t, form, config)
         if spikes.any():
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                                 f'{LABEL[slot]} messages stand alone far from their neighbours, '
@@ -95,6 +96,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     found += why
     t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
     _gaps('odometer', travelled.mean.t, found)
+    if travelled.right is not None:      # the mean stands on the left wheel's rows
+        _gaps('odometer_right', travelled.right.t, found)
     found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
     _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)

@@ -262,6 +262,12 @@ class Inputs:
         reader = self.by_slot['odometer'].reader
         return reader.form if reader else None
 
+    @property
+    def form_right(self):
+        """Return the form of the right wheel's values where it has a topic of its own."""
+        right = self.by_slot.get('odometer_right')
+        return right.reader.form if right and right.reader else None
+
     def set_sim_time(self, active: bool) -> None:
         """Stamp arrivals with the node clock (sim time) or the sender's (else)."""
         for one in self.by_slot.values():

@@ -82,6 +82,7 @@ class Recording:
         copy = self.recorder.snapshot()
         if self.inputs.form is not None:
             copy.form = self.inputs.form
+        copy.form_right = self.inputs.form_right
         return copy
 
     @property

@@ -30,7 +30,8 @@ class Travel:
         return np.interp(t, self.t, self.s)
 
 
-def travel(t, value, form, reversed_counts=False) -> tuple[Travel, tuple[Reason, ...]]:
+def travel(t, value, form, reversed_counts=False,
+           name='the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
     Sum an odometer's rows up to travel.
 
@@ -44,6 +45,8 @@ def travel(t, value, form, reversed_counts=False) -> tuple[Travel, tuple[Reason,
         What the value means.
     reversed_counts : bool
         Positive values mean backwards.
+    name : str
+        What findings call it.
 
     Returns
     -------
@@ -57,7 +60,7 @@ def travel(t, value, form, reversed_counts=False) -> tuple[Travel, tuple[Reason,
     elif form.quantity == 'increment':
         step = value[1:].astype(float)
     else:
-        step, reasons = _counter_steps(t, value, form.modulus)
+        step, reasons = _counter_steps(t, value, form.modulus, name)
     s = np.concatenate([[0.0], np.cumsum(step)]) if len(value) else np.empty(0)
     quantum = 1.0 if whole and form.quantity != 'rate' else 0.0
     return Travel(t, -s if reversed_counts else s, quantum), reasons
@@ -77,7 +80,7 @@ def mean_travel(left: Travel, right: Travel) -> Travel:
     return Travel(t, s - (s[0] if len(s) else 0.0), left.quantum / np.sqrt(2))
 
 
-def _counter_steps(t, value, modulus):
+def _counter_steps(t, value, modulus, name):
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
     whole = np.issubdtype(value.dtype, np.integer)
     raw = step = np.diff(value)                    # integers wrap at 2^64 by themselves
@@ -92,13 +95,13 @@ def _counter_steps(t, value, modulus):
         first = int(np.argmax(resets))
         step, count = _bridged(t, step, resets), int(resets.sum())
         jump = value[first + 1].item() - value[first].item()
-        reasons += (Reason(Code.COUNTER_RESET, f'the counter jumps by {jump:+.6g} at '
+        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {jump:+.6g} at '
                            f't = {t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
                            'reset, not motion; bridged at the speed beside it'),)
     rolled &= ~resets
     if rolled.any():
         first, count = int(np.argmax(rolled)), int(rolled.sum())
-        reasons += (Reason(Code.COUNTER_ROLLOVER, f'the counter rolled over {count} '
+        reasons += (Reason(Code.COUNTER_ROLLOVER, f'{name} rolled over {count} '
                            f'time{"s" * (count > 1)} (modulus {modulus}), first at '
                            f't = {t[first + 1]:.2f} s; undone'),)
     return step, reasons

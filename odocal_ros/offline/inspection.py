@@ -129,6 +129,8 @@ def _together(taps, mapping) -> LegRecorder:
         if slot == 'odometer':
             recorder.form = taps[topic].reader.form
             recorder.feed('odometer_right', rows.rows('odometer_right'))
+        if slot == 'odometer_right':
+            recorder.form_right = taps[topic].reader.form
         own = 'odometer' if slot == 'odometer_right' else taps[topic].reader.slot
         if own == slot or slot == 'odometer_right':
             recorder.feed(slot, rows.rows(own))

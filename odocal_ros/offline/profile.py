@@ -179,6 +179,8 @@ def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
         recorder = LegRecorder()
         bag.read(readers, recorder.feed, None)
         recorder.form = readers[chosen['odometer']].form or recorder.form
+        if 'odometer_right' in chosen:
+            recorder.form_right = readers[chosen['odometer_right']].form
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     return profile_of(leg, config), fix_figures(leg, config)

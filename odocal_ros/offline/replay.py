@@ -93,6 +93,8 @@ def _legs_of(path, args, asked, config):
         with _progress(f'reading {bag.name}', args) as progress:
             bag.read(readers, recorder.feed, progress)
         recorder.form = readers[topics['odometer']].form or recorder.form
+        if 'odometer_right' in topics:
+            recorder.form_right = readers[topics['odometer_right']].form
         marks = [] if asked else marked_legs(bag)
         spans = find_legs(recorder, bag, asked, marks, config)
         notes = tuple(n for n in bag.notes if not isinstance(n, str))

@@ -1,0 +1,124 @@
+"""
+Wheel counters that roll over elsewhere than their message type says, each wheel by itself.
+
+Two wheels behind two drivers need not count alike: one sends 64 bits, the other 16 in a message of
+64. A rollover that the type does not tell leaves jumps against the way, all of one size: the span.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.reasons import Code, Reason
+
+REACH = 7              # steps each side of the running median that tells the step a jump replaced
+LEAST = 8.0            # counts, smallest jump against the way
+ENOUGH = 20            # steps below which nothing is judged
+FEW = 3                # jumps of one size that make a span which is no power of two
+SURE = 0.01            # of the span, slack up to which one jump makes a power of two
+ALIKE = 0.8            # share of the jumps that must agree
+SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
+NAMED = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Where a counter rolls over: its span in counts, exact or not, and the rows before."""
+
+    size: float
+    sigma: float                 # 0: certain
+    rows: NDArray[np.int64]      # (k,)
+    turns: NDArray[np.int64]     # (k,) +1 rolled over upwards, -1 downwards
+
+
+def hidden_span(value, step) -> Span | None:
+    """
+    Return the span of a counter whose rollovers are not undone yet, None where it has none.
+
+    value : (n,) as sent.   step : (n - 1,) its steps, known rollovers undone.
+    """
+    if len(step) < ENOUGH or not step.any():
+        return None
+    usual = _running_median(step)
+    whole = np.issubdtype(value.dtype, np.integer)
+    off = step - usual
+    top = float(np.percentile(np.abs(usual), 99.9))
+    far = np.abs(off) > np.maximum(2 * np.abs(usual) + LEAST * whole, 1.5 * top)
+    rows = np.flatnonzero(far & (off * usual <= 0))      # a hung counter catches up along the way
+    if not len(rows):
+        return None
+    size = np.abs(off[rows])
+    slack = np.abs(usual[rows]) / 2 + (3.0 if whole else 1e-3 * size)
+    spans = SPANS['whole' if whole else 'angle']
+    middle = float(np.median(size))
+    known = float(spans[np.argmin(np.abs(spans - middle))])
+    typical = float(np.median(slack))
+    sigma = 0.0
+    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < SURE * known):
+        span = known
+    elif len(rows) >= FEW:
+        span, sigma = _measured(value, rows, middle, typical) if whole else (
+            middle, typical / np.sqrt(3 * len(rows)))
+    else:
+        return None
+    agree = np.abs(size - span) <= 2 * slack
+    if agree.mean() < ALIKE:
+        return None
+    rows = rows[agree]
+    return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
+
+
+def _running_median(step):
+    padded = np.pad(step, REACH, mode='edge')
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1), axis=-1)
+
+
+def _measured(value, rows, middle, slack):
+    """Return a span that is no power of two, and its sigma: the roundest number that fits."""
+    ends = np.stack([value[rows], value[rows + 1]]).astype(float)
+    low = ends.max() - ends.min() + 1              # the counter was seen to take so many values
+    high = max(low, middle + 2 * slack / np.sqrt(len(rows)))
+    for unit in (1e6, 1e5, 1e4, 1e3, 1e2):
+        span = np.ceil(low / unit) * unit
+        if span <= high:
+            return float(span), 0.0
+    return float(round((low + high) / 2)), max(1.0, (high - low) / np.sqrt(12))
+
+
+def unrolled(t, samples, step, side):
+    """
+    Return rows with hidden rollovers undone, what was found, and the doubt that is left.
+
+    Parameters
+    ----------
+    t, samples : (n,) s, OdometerSamples
+        Usable rows of a running count.
+    step : (n - 1,)
+        Its steps, rollovers of the type's span undone.
+    side : str
+        Whose counter it is, for people.
+
+    Returns
+    -------
+    samples; reasons; (k,) s and (k,) counts, where and how much of the travel is in doubt.
+
+    """
+    span = hidden_span(samples.value, step)
+    none = np.empty(0)
+    if span is None:
+        return samples, (), none, none
+    turns = np.zeros(len(t), np.int64)
+    turns[span.rows + 1] = span.turns
+    size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
+    value = samples.value + size * np.cumsum(turns)
+    times = len(span.rows)
+    about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED.get(
+        span.size, f'{span.size:.0f}')
+    found = Reason(Code.WHEEL_COUNTERS_DIFFER, f"the {side} wheel's count rolls over at {about}, "
+                   f'which its message type does not tell: {times} jump{"s" * (times > 1)} of '
+                   f'that size against the way, first at t = {t[span.rows[0] + 1]:.2f} s; undone')
+    # one error of the span for all jumps; the budget takes doubts as independent
+    doubt = np.full(times, span.sigma * np.sqrt(times))
+    return (replace(samples, value=value), (found,),
+            *((t[span.rows], doubt) if span.sigma else (none, none)))

@@ -1,0 +1,142 @@
+"""Two wheels that do not count alike: spans, kinds, rates and gaps of their own."""
+
+from dataclasses import replace
+
+from drives import changed, drive, seconds, settings
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.reasons import Code
+from odocal_ros.samples import OdometerForm, take
+from odocal_ros.screen import screen
+
+ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(**ROUTE)
+
+
+def screened(leg, made, **more):
+    inputs, found = screen(leg, settings(made, **more))
+    return inputs, {r.code: r.text for r in found}
+
+
+def with_right(made, change, **more):
+    return replace(made.leg(), odometer_right=changed(made.odometer_right, value=change), **more)
+
+
+@pytest.mark.parametrize('span', [65536, 4096, 256, 10_000, 9000])
+@pytest.mark.parametrize('signed', [False, True])
+def test_a_span_that_the_type_does_not_tell_is_found_and_undone_to_the_count(made, span, signed):
+    half = span // 2 * signed
+    leg = with_right(made, lambda a: (a + half) % span - half)
+    inputs, said = screened(leg, made)
+    clean, none = screened(made.leg(), made)
+    assert not none
+    text = said[Code.WHEEL_COUNTERS_DIFFER]
+    assert f"right wheel's count rolls over at {span}," in text
+    # bridging would lose counts; here none is
+    assert np.array_equal(inputs.travel_right.s, clean.travel_right.s)
+    assert not len(inputs.doubt_t)
+
+
+def test_the_wheel_and_the_first_time_are_named(made):
+    left = changed(made.odometer, value=lambda a: a % 32768)
+    rolled = np.flatnonzero(np.diff(left.value) < 0)
+    leg = replace(made.leg(), odometer=left)
+    _, said = screened(leg, made)
+    text = said[Code.WHEEL_COUNTERS_DIFFER]
+    assert text.startswith("the left wheel's")
+    assert f't = {seconds(leg, left)[rolled[0] + 1]:.2f} s' in text
+    assert f'{len(rolled)} jump' in text
+
+
+def test_both_wheels_of_one_hidden_span_are_both_undone(made):
+    leg = replace(with_right(made, lambda a: a % 4096),
+                  odometer=changed(made.odometer, value=lambda a: a % 4096))
+    inputs, _ = screened(leg, made)
+    clean, _ = screened(made.leg(), made)
+    assert np.array_equal(inputs.travel.s, clean.travel.s)
+
+
+def test_a_span_of_no_round_number_is_taken_with_its_doubt(made):
+    inputs, said = screened(with_right(made, lambda a: a % 4321), made)
+    clean, _ = screened(made.leg(), made)
+    assert 'about' in said[Code.WHEEL_COUNTERS_DIFFER]
+    off = inputs.travel_right.s[-1] - clean.travel_right.s[-1]
+    doubt = np.linalg.norm(inputs.doubt_sigma)          # of the mean: half the right wheel's
+    assert 0 < doubt < 1e-3 * clean.travel.s[-1]
+    assert abs(off / 2) < 3 * doubt
+
+
+def test_angles_wrapped_at_a_turn_are_unrolled():
+    made = drive(**ROUTE | {'odometer': 'angle', 'odometer_rate': 50.0})
+    inputs, said = screened(with_right(made, lambda a: np.angle(np.exp(1j * a))), made)
+    clean, _ = screened(made.leg(), made)
+    assert 'rolls over at 2 pi' in said[Code.WHEEL_COUNTERS_DIFFER]
+    assert_allclose(inputs.travel_right.s, clean.travel_right.s, atol=1e-6)
+
+
+def test_a_reset_is_no_rollover_and_the_wheel_is_named(made):
+    def reset(a):
+        a[3000:] -= a[3000]
+
+    _, said = screened(with_right(made, reset), made)
+    assert Code.WHEEL_COUNTERS_DIFFER not in said
+    assert said[Code.COUNTER_RESET].startswith("the right wheel's counter jumps")
+
+
+def test_one_wheel_of_another_integer_type_rolls_over_at_its_own_span(made):
+    leg = with_right(made, lambda a: a % 2**16,
+                     form_right=OdometerForm('cumulative', 2**16, 'm/pulse'))
+    inputs, said = screened(leg, made)
+    clean, _ = screened(made.leg(), made)
+    assert Code.WHEEL_COUNTERS_DIFFER not in said
+    assert np.array_equal(inputs.travel_right.s, clean.travel_right.s)
+
+
+def test_a_count_and_a_speed_have_no_mean(made):
+    leg = with_right(made, lambda a: a.astype(float), form_right=OdometerForm('rate', 0, '1'))
+    inputs, said = screened(leg, made)
+    text = said[Code.WHEEL_COUNTERS_DIFFER]
+    assert 'a speed (1)' in text
+    assert 'a running count (m/pulse)' in text
+    assert inputs.travel_right is None
+    assert_allclose(inputs.travel.s[-1], np.diff(made.odometer.value).sum())
+
+
+def test_a_right_wheel_that_never_speaks_is_dead(made):
+    silent = take(made.odometer_right, slice(0, 0))
+    _, said = screened(replace(made.leg(), odometer_right=silent), made,
+                       odometer__left='topic', odometer__right='topic')
+    assert 'right wheel sends no message' in said[Code.WHEEL_DEAD]
+    _, said = screened(replace(made.leg(), odometer_right=silent), made)     # one odometer
+    assert not said
+
+
+def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made):
+    """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
+    right = take(made.odometer_right, slice(101, 5001, 2))
+    right = changed(right, stamp_ns=lambda a: a - 7_000_000, value=lambda a: a)
+    # a row stamped early by 7 ms: as a wheel read 7 ms late
+    leg = replace(made.leg(), odometer_right=right)
+    inputs, said = screened(leg, made)
+    t = inputs.travel.t
+    assert t[0] >= seconds(leg, right)[0]
+    assert t[-1] <= seconds(leg, right)[-1]
+    clean, _ = screened(made.leg(), made)
+    late = clean.travel_right.at(t + 0.007)
+    want = (clean.travel_left.at(t) + late - clean.travel_left.at(t[0]) - late[0]) / 2
+    bound = 3.0 / 8 * 0.1**2 / 0.02 / 2 + 1.5
+    assert np.abs(inputs.travel.s - want).max() < bound
+
+
+def test_a_gap_of_the_right_wheel_is_said_though_the_mean_has_none(made):
+    right = take(made.odometer_right, np.r_[0:2000, 2060:len(made.odometer_right.value)])
+    inputs, said = screened(replace(made.leg(), odometer_right=right), made)
+    assert said[Code.TOPIC_GAP].startswith('right odometer gap of 3.05 s')
+    clean, _ = screened(made.leg(), made)
+    assert_allclose(inputs.travel.s[-1], clean.travel.s[-1])      # counts are not lost in a gap
