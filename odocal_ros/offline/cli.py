@@ -15,6 +15,7 @@ COMMANDS = {
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
     'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
+    'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 

@@ -1,0 +1,139 @@
+"""Reading calibration.json back, checked: what is compared must be what was written."""
+
+from dataclasses import dataclass, field
+import json
+import math
+from pathlib import Path
+
+from odocal_ros.calib.result import Estimate
+from odocal_ros.errors import BadUsage
+from odocal_ros.output.files import MAIN, SCHEMA
+from odocal_ros.reasons import Verdict
+
+BIGGEST = 2**28      # bytes; a day of legs is a thousandth of it
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """
+    A calibration as its file has it.
+
+    budget : parameter to {source: (one-sigma share in the parameter's unit, shared by all legs)},
+    of the method that gave the parameter. legs : (start, stop) ns. bags : sha256 of each known.
+    """
+
+    name: str
+    created: str
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    estimates: dict[str, Estimate]
+    legs: frozenset[tuple[int, int]]
+    bags: frozenset[str]
+    config: dict
+    budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
+
+    @property
+    def usable(self) -> bool:
+        """Return whether its values may be used."""
+        return self.verdict is not Verdict.REJECTED
+
+    def value(self, name: str) -> float | None:
+        """Return a value, None where it has none."""
+        found = self.estimates.get(name)
+        return None if found is None else found.value
+
+
+def read_stored(path: Path) -> Stored:
+    """
+    Return the calibration in a file, or in the calibration.json of a folder.
+
+    Raises
+    ------
+    BadUsage
+        Missing, unreadable, no JSON, of another schema, or without what every result has.
+
+    """
+    path = Path(path)
+    name = str(path)
+    try:
+        path = path / MAIN if path.is_dir() else path
+        if path.stat().st_size > BIGGEST:
+            raise BadUsage(f'{name}: too large for a calibration.json')
+        content = json.loads(path.read_text(encoding='utf-8'), parse_constant=_no_constant)
+        return _stored(content, name)
+    except OSError as error:
+        raise BadUsage(f'{name}: {error.strerror}; give a calibration.json or its folder') \
+            from None
+    except (ValueError, RecursionError) as error:      # of json, utf-8, or a value below
+        why = (str(error).splitlines() or ['nested too deep'])[0]
+        raise BadUsage(f'{name}: no calibration.json as odocal writes it ({why})') from None
+
+
+def _no_constant(text):
+    raise ValueError(f'{text} is no number')
+
+
+def _stored(content, name) -> Stored:
+    if not isinstance(content, dict):
+        raise ValueError('no object at the top')
+    schema = content.get('schema')
+    if schema != SCHEMA or isinstance(schema, bool):
+        raise ValueError(f'schema is {str(schema)[:20]}, this version reads {SCHEMA}')
+    verdict = _part(content, 'verdict', str)
+    if verdict not in [v.value for v in Verdict]:
+        raise ValueError(f'verdict is {verdict[:20]!r}')
+    result = _part(content, 'result', dict)
+    legs = [leg for leg in _part(content, 'legs', list) if isinstance(leg, dict)]
+    inputs = [i for i in _part(content, 'inputs', list) if isinstance(i, dict)]
+    methods = _part(content, 'methods', dict)
+    return Stored(
+        name, _part(content, 'created', str), Verdict(verdict),
+        tuple(str(r.get('code')) for r in _part(content, 'reasons', list) if isinstance(r, dict)),
+        {key: _estimate(entry, key) for key, entry in result.items() if key != 'imu_rotation'},
+        frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
+                  if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
+        frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
+        _part(content, 'config', dict),
+        {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
+         if key != 'imu_rotation'})
+
+
+def _part(content, key, kind):
+    if not isinstance(content.get(key), kind):
+        raise ValueError(f'{key!r} is missing or of the wrong kind')
+    return content[key]
+
+
+def _estimate(entry, key) -> Estimate:
+    if not isinstance(entry, dict) or not {'value', 'sigma', 'unit'} <= set(entry):
+        raise ValueError(f'result.{key} lacks value, sigma or unit')
+    value, sigma = (_number(entry[part], f'result.{key}.{part}') for part in ('value', 'sigma'))
+    if sigma is not None and sigma < 0:
+        raise ValueError(f'result.{key}.sigma is negative')
+    if key.startswith('scale_') and value is not None and value <= 0:
+        raise ValueError(f'result.{key}.value is not positive')
+    if entry['unit'] is not None and not isinstance(entry['unit'], str):
+        raise ValueError(f'result.{key}.unit is no text')
+    return Estimate(value, sigma, entry['unit'] or '', str(entry.get('method') or ''))
+
+
+def _number(value, what) -> float | None:
+    if value is None:
+        return None
+    try:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) \
+                or not math.isfinite(value):
+            raise ValueError(f'{what} is no number')
+        return float(value)
+    except OverflowError:
+        raise ValueError(f'{what} is too large') from None
+
+
+def _shares(methods, method, parameter) -> dict[str, tuple[float, bool]]:
+    """Return the budget of a parameter; empty where the file has none that can be read."""
+    entry = methods.get(method) if isinstance(method, str) else None
+    budget = entry.get('budget') if isinstance(entry, dict) else None
+    rows = budget.items() if isinstance(budget, dict) else ()
+    return {source: (float(row[parameter]), row.get('shared') is True) for source, row in rows
+            if isinstance(row, dict) and isinstance(row.get(parameter), float)
+            and math.isfinite(row[parameter])}

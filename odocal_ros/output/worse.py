@@ -1,0 +1,62 @@
+"""Whether a calibration is worse than the one that it is to replace."""
+
+import math
+from pathlib import Path
+
+from odocal_ros.calib.result import Estimate
+from odocal_ros.errors import BadUsage
+from odocal_ros.output.figures import with_sigma
+from odocal_ros.output.stored import read_stored, Stored
+
+CLEARLY = 2.0     # times the sigma: four times as many such legs would be needed
+JUDGED = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle')
+
+
+def is_worse(old: Stored, new: Stored) -> str:
+    """
+    Return why a new calibration should not quietly replace an old one, empty when it may.
+
+    The old one is good unless rejected. The new one is worse when it is rejected, when it lacks a
+    value that the old one has, or gives it with a sigma more than twice as large. One that holds
+    all legs of the old one and more knows better in any case: legs that disagree widen a sigma,
+    and the narrow one was wrong.
+    """
+    if not old.usable:
+        return ''
+    if not new.usable:
+        codes = ', '.join(dict.fromkeys(new.reasons[:3]))
+        return f'the new one is rejected ({codes}), the old one is {old.verdict.value}'
+    if old.legs and old.legs <= new.legs:
+        return ''
+    for name in JUDGED:
+        why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))
+        if why:
+            return why
+    return ''
+
+
+def _worse(label, old, new) -> str:
+    if old is None or old.value is None or not old.sigma:
+        return ''
+    if new is None or new.value is None:
+        return f'the new one has no {label}, the old one has {said(old)}'
+    if new.unit == old.unit and new.sigma and new.sigma > CLEARLY * old.sigma:
+        return (f'the {label} is {new.sigma / old.sigma:.1f} times less certain: {said(new)}, '
+                f'the old one has {said(old)}')
+    return ''
+
+
+def said(estimate: Estimate) -> str:
+    """Return a value with sigma and unit as people read them; angles in deg."""
+    if estimate.unit == 'rad':
+        return with_sigma(estimate.value, estimate.sigma, math.degrees(1.0), signed=True) + ' deg'
+    unit = '' if estimate.unit == '1' else f' {estimate.unit}'
+    return with_sigma(estimate.value, estimate.sigma) + unit
+
+
+def replacing(old: Path, new: Path) -> str:
+    """Return ``is_worse`` of two result folders; what cannot be read is no loss."""
+    try:
+        return is_worse(read_stored(old), read_stored(new))
+    except BadUsage:
+        return ''

@@ -1,0 +1,217 @@
+"""odocal compare: changes against sigmas, one line for what is no calibration."""
+
+import copy
+import json
+
+import pytest
+
+from odocal_ros.offline.cli import main
+from odocal_ros.offline.compare import CAUSES
+
+ENTRY = {'value': 0.02, 'sigma': 3e-6, 'unit': 'm/pulse', 'method': 'two_point'}
+YAW = {'value': 0.01, 'sigma': 0.004, 'unit': 'rad', 'method': 'two_point'}
+START = 10**18
+
+
+def content(scale=0.02, sigma=3e-6, yaw=0.01, verdict='accepted', start=START, **more):
+    """Return what a calibration.json holds, as far as it is read."""
+    result = {'scale_factor': ENTRY | {'value': scale, 'sigma': sigma},
+              'scale_ratio': {'value': scale / 0.019, 'sigma': sigma / 0.019, 'unit': '1',
+                              'method': 'two_point'},
+              'yaw_mounting_angle': YAW | {'value': yaw},
+              'pitch_mounting_angle': {'value': None, 'sigma': None, 'unit': 'rad',
+                                       'method': None},
+              'imu_rotation': {'quaternion_xyzw': None, 'rpy': None}}
+    budget = {'fix_start': {'yaw_mounting_angle': 0.0024, 'scale_factor': 3e-6, 'shared': False},
+              'initial_heading': {'yaw_mounting_angle': 0.0032, 'shared': True}}
+    return {'schema': 1, 'created': '2026-01-02T03:04:05+00:00', 'verdict': verdict,
+            'reasons': [{'code': 'GYRO_SIGN'}] if verdict == 'rejected' else [],
+            'result': result, 'methods': {'two_point': {'budget': budget}},
+            'legs': [{'start_ns': start, 'stop_ns': start + 10**11}], 'inputs': [],
+            'config': {'imu.mounting_rpy': [0.0, 0.0, 0.0]}} | more
+
+
+@pytest.fixture
+def compare(tmp_path, capsys):
+    """Return a function that writes contents and compares them: code, stdout, stderr."""
+    def run(*contents, options=()):
+        paths = []
+        for i, one in enumerate(contents):
+            path = tmp_path / f'{"abcdef"[i]}.json'
+            path.write_text(one if isinstance(one, str) else json.dumps(one))
+            paths.append(str(path))
+        code = main(['compare', *paths, *options])
+        out = capsys.readouterr()
+        return code, out.out, out.err
+    return run
+
+
+def changes(compare, *contents):
+    code, out, _ = compare(*contents, options=['--json'])
+    whole = json.loads(out)
+    return code, whole, {c['parameter']: c['values'] for c in whole['changes']}
+
+
+def test_a_change_is_measured_in_sigmas_of_the_difference(compare):
+    # 0.4 % of 0.02 is 80e-6; sigmas 3 and 4 make 5: 16 sigma
+    code, whole, found = changes(compare, content(), content(0.02008, 4e-6, start=2 * START))
+    assert code == 1
+    assert whole['changed'] is True
+    first, second = found['scale_factor']
+    assert first['to_first'] is first['to_previous'] is None
+    assert second['to_first'] == second['to_previous']
+    assert second['to_first']['change'] == pytest.approx(80e-6)
+    assert second['to_first']['sigma'] == pytest.approx(5e-6)
+    assert second['to_first']['sigmas'] == pytest.approx(16.0)
+    assert whole['sentence'].startswith('scale factor changed by +0.4 % (16.0 sigma) since ')
+    assert whole['sentence'].endswith(CAUSES['scale'])
+
+
+@pytest.mark.parametrize(('sigmas', 'code'), [(2.9, 0), (3.1, 1), (-2.9, 0), (-3.1, 1)])
+def test_three_sigma_is_the_limit(compare, sigmas, code):
+    other = content(0.02 + sigmas * 5e-6, 4e-6, start=2 * START)
+    found = compare(content(), other)
+    assert found[0] == code
+    assert ('no change beyond 3 sigma' in found[1]) == (code == 0)
+
+
+def test_the_first_and_the_one_before_are_told_apart(compare):
+    # a slow drift: each step 2.4 sigma, both together 4.7
+    steps = [content(0.02 + i * 10e-6, start=(i + 1) * START) for i in range(3)]
+    code, _, found = changes(compare, *steps)
+    third = found['scale_factor'][2]
+    assert third['to_first']['change'] == pytest.approx(20e-6)
+    assert third['to_previous']['change'] == pytest.approx(10e-6)
+    assert third['to_first']['since'].endswith('a.json')
+    assert third['to_previous']['since'].endswith('b.json')
+    assert code == 1
+    assert compare(*steps[:2])[0] == 0
+
+
+def test_what_shared_errors_would_take_off_is_told_but_not_taken(compare):
+    # sigma 0.004 each, 0.0032 of it the heading's: own 0.0024, of the difference 0.0034
+    code, whole, found = changes(compare, content(), content(yaw=0.022, start=2 * START))
+    change = found['yaw_mounting_angle'][1]['to_first']
+    assert change['sigmas'] == pytest.approx(0.012 / (0.004 * 2**0.5))
+    assert change['sigmas_if_shared_cancels'] == pytest.approx(0.012 / (0.0024 * 2**0.5))
+    assert code == 0
+    assert found['scale_factor'][1]['to_first']['sigmas_if_shared_cancels'] is None
+    text = compare(content(), content(yaw=0.022, start=2 * START))[1]
+    assert 'yaw mounting would be 3.5 sigma if' in text
+
+
+def test_a_rejected_calibration_is_shown_and_not_judged(compare):
+    bad = content(0.03, verdict='rejected', start=2 * START)
+    code, whole, found = changes(compare, content(), bad, content(start=3 * START))
+    assert code == 0
+    assert found['scale_factor'][1]['to_first']['sigmas'] > 1000
+    assert found['scale_factor'][2]['to_previous']['since'].endswith('a.json')
+    assert 'rejected (GYRO_SIGN)' in whole['notes'][0]
+    code, out, _ = compare(content(), bad)
+    assert code == 1
+    assert 'nothing to judge' in out
+
+
+def test_what_belongs_to_a_drive_is_not_compared(compare):
+    contents = [content(start=START * i) for i in (1, 2)]
+    for i, one in enumerate(contents):
+        one['result']['gyro_bias_z'] = {'value': 1e-3 * i, 'sigma': 1e-6, 'unit': 'rad/s',
+                                        'method': 'two_point'}
+    code, _, found = changes(compare, *contents)
+    assert code == 0
+    assert set(found) == {'scale_factor', 'yaw_mounting_angle'}
+
+
+def test_angles_from_different_nominal_mountings_are_not_compared(compare):
+    turned = content(yaw=0.5, start=2 * START, config={'imu.mounting_rpy': [0.0, 0.0, 1.0]})
+    code, whole, found = changes(compare, content(), turned)
+    assert code == 0
+    assert set(found) == {'scale_factor'}
+    assert 'imu.mounting_rpy differs' in whole['notes'][0]
+
+
+def test_one_drive_twice_is_said(compare):
+    assert 'the same drive' in compare(content(), content())[1]
+    assert 'the same drive' not in compare(content(), content(start=2 * START))[1]
+
+
+def test_a_zero_or_unknown_sigma_is_no_judgement(compare):
+    for sigma in (0.0, None):
+        pair = [content(start=START), content(0.021, start=2 * START)]
+        for one in pair:
+            one['result'].pop('yaw_mounting_angle')
+            one['result']['scale_factor']['sigma'] = sigma
+        code, whole, found = changes(compare, *pair)
+        assert found['scale_factor'][1]['to_first']['sigmas'] is None
+        assert code == 1
+        assert 'no sigma is known' in whole['sentence']
+
+
+def test_every_compared_name_has_a_cause():
+    from odocal_ros.offline.changes import NOT_COMPARED
+    names = ['scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
+             'yaw_mounting_angle', 'pitch_mounting_angle', 'odometer_delay', 'gnss_delay',
+             *(f'{what}_lever_arm_{a}' for what in ('odometer', 'antenna') for a in 'xyz')]
+    for name in names:        # all of design.md section 2 but those that are not compared
+        assert name not in NOT_COMPARED
+        assert [key for key in CAUSES if key in name.split('_')], name
+
+
+def broken(path, value):
+    """Return a content with one place changed or, by ..., taken out."""
+    one = copy.deepcopy(content())
+    *way, last = path
+    place = one
+    for key in way:
+        place = place[key]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    return one
+
+
+@pytest.mark.parametrize(('bad', 'word'), [
+    ('', 'no calibration.json'), ('{', 'no calibration.json'), ('[]', 'no object'),
+    ('[' * 100_000, 'no calibration.json'), ('{"schema": NaN}', 'NaN is no number'),
+    (broken(['schema'], 2), 'schema is 2'), (broken(['schema'], True), 'schema is True'),
+    (broken(['schema'], ...), 'schema is None'), (broken(['verdict'], 'fine'), 'verdict'),
+    (broken(['result'], ...), 'result'), (broken(['legs'], {}), 'legs'),
+    (broken(['result', 'scale_factor'], 0.02), 'scale_factor lacks'),
+    (broken(['result', 'scale_factor', 'sigma'], ...), 'scale_factor lacks'),
+    (broken(['result', 'scale_factor', 'value'], '0.02'), 'value is no number'),
+    (broken(['result', 'scale_factor', 'value'], True), 'value is no number'),
+    (broken(['result', 'scale_factor', 'value'], 10**400), 'too large'),
+    (broken(['result', 'scale_factor', 'value'], -0.02), 'not positive'),
+    (broken(['result', 'scale_factor', 'sigma'], -1.0), 'negative'),
+    (json.dumps(content()).replace('3e-06', '1e999'), 'no number'),
+    (broken(['result', 'scale_factor', 'unit'], 3), 'unit'),
+    (broken(['result', 'scale_factor', 'unit'], 'm/rad'), 'is in m/rad, in ')])
+def test_what_is_no_calibration_is_one_line_and_exit_2(compare, bad, word):
+    code, out, err = compare(content(), bad)
+    assert code == 2
+    assert out == ''
+    assert err.count('\n') == 1
+    assert word in err
+    assert 'b.json' in err
+
+
+@pytest.mark.parametrize(('path', 'value'), [
+    (['methods', 'two_point', 'budget'], 5), (['methods'], {}),
+    (['methods', 'two_point', 'budget', 'initial_heading'], []),
+    (['methods', 'two_point', 'budget', 'initial_heading', 'yaw_mounting_angle'], None),
+    (['legs'], [3]), (['inputs'], [None]), (['result', 'scale_factor', 'method'], ['x'])])
+def test_what_is_only_helpful_may_be_missing(compare, path, value):
+    assert compare(content(), broken(path, value))[0] == 0
+
+
+def test_missing_files_and_single_ones(tmp_path, capsys):
+    assert main(['compare', str(tmp_path / 'a'), str(tmp_path / 'b')]) == 2
+    assert 'No such file' in capsys.readouterr().err
+    (tmp_path / 'calibration.json').write_text(json.dumps(content()))
+    assert main(['compare', str(tmp_path)]) == 2
+    assert 'two or more' in capsys.readouterr().err
+    assert main(['compare', str(tmp_path), str(tmp_path)]) == 0      # a folder will do
+    (tmp_path / 'raw').write_bytes(b'\xff\xfe')
+    assert main(['compare', str(tmp_path), str(tmp_path / 'raw')]) == 2
+    assert capsys.readouterr().err.count('\n') == 1

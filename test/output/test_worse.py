@@ -1,0 +1,76 @@
+"""When a calibration must not quietly take the place of another."""
+
+from dataclasses import replace
+
+import pytest
+
+from odocal_ros.calib.result import Estimate
+from odocal_ros.config import Config
+from odocal_ros.output.files import write_results
+from odocal_ros.output.stored import read_stored
+from odocal_ros.output.worse import is_worse, replacing
+
+CREATED = '2026-01-02T03:04:05+00:00'
+
+
+@pytest.fixture
+def why(tmp_path):
+    """Return a function: why a calibration is worse than another, both by way of their files."""
+    def run(old, new):
+        for name, one in (('old', old), ('new', new)):
+            write_results(one, Config(), tmp_path / name, [], CREATED, force=True)
+        assert is_worse(read_stored(tmp_path / 'old'), read_stored(tmp_path / 'new')) \
+            == replacing(tmp_path / 'old', tmp_path / 'new')
+        return replacing(tmp_path / 'old', tmp_path / 'new')
+    return run
+
+
+def later(calibration, **estimates):
+    """Return a calibration of another drive, with other values."""
+    legs = tuple(replace(leg, start_ns=leg.start_ns + 10**13, stop_ns=leg.stop_ns + 10**13)
+                 for leg in calibration.legs)
+    return replace(calibration, legs=legs, estimates=calibration.estimates | estimates)
+
+
+def test_a_rejected_one_is_worse_than_any_good_one(why, good, rejected):
+    assert why(good, later(rejected)).startswith('the new one is rejected (')
+    assert 'GYRO_SIGN' in why(good, later(rejected))
+    assert why(good, rejected)        # of the same drive too
+
+
+def test_anything_may_replace_a_rejected_one(why, good, rejected, nothing):
+    assert why(rejected, good) == why(rejected, nothing) == why(nothing, rejected) == ''
+
+
+@pytest.mark.parametrize(('factor', 'worse'), [(0.5, False), (1.9, False), (2.1, True)])
+@pytest.mark.parametrize('name', ['scale_factor', 'yaw_mounting_angle'])
+def test_a_sigma_twice_as_large_is_worse(why, good, name, factor, worse):
+    old = good.estimates[name]
+    said = why(good, later(good, **{name: replace(old, sigma=old.sigma * factor)}))
+    assert bool(said) == worse
+    assert not worse or f'{name.replace("_", " ")} is 2.1 times less certain' in said
+
+
+def test_a_value_lost_is_worse_and_one_gained_is_not(why, good):
+    lost = later(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
+    assert why(good, lost) == ('the new one has no yaw mounting angle, the old one has '
+                               '-1.0000 ± 0.0029 deg')
+    assert why(lost, later(later(good))) == ''
+
+
+def test_more_legs_know_better_even_with_a_larger_sigma(why, good):
+    wider = later(good, scale_factor=Estimate(0.05, 1e-4, 'm/pulse'))
+    both = replace(wider, legs=(*good.legs, *wider.legs))
+    assert why(good, both) == ''
+    assert why(good, wider) != ''
+
+
+def test_another_unit_says_nothing(why, good):
+    assert why(good, later(good, scale_factor=Estimate(0.3, 1.0, 'm/rad'))) == ''
+
+
+def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):
+    why(good, good)
+    (tmp_path / 'old' / 'calibration.json').write_text('{}')
+    assert replacing(tmp_path / 'old', tmp_path / 'new') == ''
+    assert replacing(tmp_path / 'gone', tmp_path / 'new') == ''
