@@ -1,65 +1,89 @@
-"""The launch files: arguments described, names those of the code, both twins alike."""
+"""The launch files: twins that start the same, with names that the node has."""
 
-import ast
 from pathlib import Path
-import re
-from xml.etree import ElementTree
 
+from bench import wait_for
+from launch_stand_in import of_python, of_xml
 import pytest
+import yaml
 
 from odocal_ros.live.inputs import TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
-ARGUMENTS = ['params_file', 'imu_topic', 'odometer_topic', 'fix_topic', 'namespace',
-             'use_sim_time']
-REMAPPED = {'imu/data': 'imu_topic', 'odometer': 'odometer_topic', 'fix': 'fix_topic'}
+PYTHON, XML = (ROOT / 'launch' / f'calibrator.launch.{kind}' for kind in ('py', 'xml'))
+CASES = [
+    {}, {'rviz': 'true'}, {'method': 'two_point', 'use_sim_time': 'true'},
+    {'namespace': 'truck', 'rviz': 'true', 'params_file': '/tmp/mine.yaml'},
+    {name + '_topic': f'/a/{name}' for name in ('imu', 'odometer', 'odometer_right', 'fix',
+                                                'fix_velocity', 'heading')}]
 
 
-@pytest.fixture(scope='module')
-def python():
-    return (ROOT / 'launch' / 'calibrator.launch.py').read_text()
+@pytest.mark.parametrize('given', CASES, ids=lambda given: ' '.join(given) or 'as is')
+def test_both_start_the_same_nodes(given):
+    declared_python, python = of_python(PYTHON, given)
+    declared_xml, xml = of_xml(XML, given)
+    assert declared_python == declared_xml
+    assert all(description.endswith('.') or description.endswith(').')
+               for _, description in declared_xml.values())
+    assert set(given) <= set(declared_xml)
+    assert python == xml
+    assert [node.executable for node in python] == ['calibrator'] + [
+        'rviz2'] * (given.get('rviz') == 'true')
 
 
-@pytest.fixture(scope='module')
-def xml():
-    return ElementTree.parse(ROOT / 'launch' / 'calibrator.launch.xml').getroot()
+def test_every_input_can_be_remapped_and_stays_where_it_is_by_itself():
+    _, (node,) = of_python(PYTHON, {})
+    assert node.remappings == {topic: topic for topic in TOPICS.values()}
+    _, (node,) = of_python(PYTHON, CASES[-1])
+    assert set(node.remappings.values()) == set(CASES[-1].values())
 
 
-def described(text):
-    """Return argument -> description of the Python file, without running it."""
-    table = next(node.value for node in ast.parse(text).body
-                 if isinstance(node, ast.Assign) and node.targets[0].id == 'ARGUMENTS')
-    return {row.elts[0].value: row.elts[2].value for row in table.elts}
-
-
-def test_both_declare_the_same_arguments_with_descriptions(python, xml):
-    arguments = described(python)
-    assert list(arguments) == ARGUMENTS
-    assert arguments == {arg.get('name'): arg.get('description') for arg in xml.iter('arg')}
-    assert all(arguments.values())
-
-
-def test_the_remapped_topics_are_the_nodes(python, xml):
-    assert set(REMAPPED) == {TOPICS[slot] for slot in ('imu', 'odometer', 'fix')}
-    assert {r.get('from'): r.get('to') for r in xml.iter('remap')} == {
-        topic: f'$(var {argument})' for topic, argument in REMAPPED.items()}
-    pairs = re.findall(r"\('([a-z/]+)', '([a-z]+)'\)", python.split('remappings=')[1])
-    assert {topic: f'{name}_topic' for topic, name in pairs} == REMAPPED
-
-
-def test_the_executable_is_the_one_installed(python, xml):
+def test_the_files_named_are_installed():
+    _, (node, rviz) = of_xml(XML, {'rviz': 'true'})
     setup = (ROOT / 'setup.py').read_text()
-    node = xml.find('node')
-    assert f"'{node.get('exec')} = odocal_ros.live.node:main'" in setup
-    for key, value in (('package', node.get('pkg')), ('executable', node.get('exec')),
-                       ('name', node.get('name'))):
-        assert f"{key}='{value}'" in python
-    assert '"launch/*"' in setup or "'launch/*'" in setup
+    for path in (Path(node.parameters[0]), Path(rviz.arguments[1])):
+        assert path.exists()
+        assert f"glob('{path.parent.name}/*')" in setup
+    assert f"'{node.executable} = odocal_ros.live.node:main'" in setup
 
 
-def test_it_runs_where_launch_is_installed(python):
+def test_an_empty_method_leaves_the_one_of_the_file():
+    for read, path in ((of_python, PYTHON), (of_xml, XML)):
+        assert all('method' not in p for p in read(path, {})[1][0].parameters[1:])
+        _, (node,) = read(path, {'method': 'two_point'})
+        assert node.parameters[1]['method'] == 'two_point'
+
+
+@pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],
+                         ids=['python', 'xml'])
+def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, read, path):
+    import odocal_ros.live.inputs as inputs
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text(yaml.safe_dump({'/**/calibrator': {'ros__parameters': {
+        'odometer': {'type': 'std_msgs/msg/Int64', 'right': 'topic'},
+        'gnss': {'use_velocity': True}}}}))
+    given = {'params_file': str(mine), 'namespace': 'truck', 'method': 'two_point',
+             'imu_topic': '/a/imu', 'odometer_topic': '/a/left', 'odometer_right_topic': 'right',
+             'fix_topic': 'gps/fix', 'fix_velocity_topic': '/a/speed', 'heading_topic': 'compass'}
+    _, (node,) = read(path, given)
+    start(*node.command_line())
+    client = connect('/truck/calibrator')
+    names = {'/a/imu': inputs.IMU, '/a/left': 'std_msgs/msg/Int64',
+             '/truck/right': 'std_msgs/msg/Int64', '/truck/gps/fix': inputs.FIX,
+             '/a/speed': inputs.VELOCITY[0], '/truck/compass': inputs.IMU}
+    for name, kind in names.items():
+        client.node.create_publisher(inputs.message_class(kind), name, 10)
+    for name in names:
+        wait_for(lambda name=name: client.node.count_subscribers(name), f'a subscriber of {name}')
+    assert client.get('method', 'use_sim_time') == ['two_point', False]
+
+
+def test_it_runs_where_launch_is_installed():
     launch = pytest.importorskip('launch', reason='launch is not on PyPI')
     pytest.importorskip('launch_ros', reason='launch_ros is not on PyPI')
-    scope = {}
-    exec(compile(python, 'calibrator.launch.py', 'exec'), scope)
+    from launch.frontend import Parser
+    scope: dict = {}
+    exec(compile(PYTHON.read_text(), str(PYTHON), 'exec'), scope)
     assert isinstance(scope['generate_launch_description'](), launch.LaunchDescription)
+    entity, parser = Parser.load(str(XML))
+    assert isinstance(parser.parse_description(entity), launch.LaunchDescription)
