@@ -5,29 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.sections import Sections, sections
 from odocal_ros.nav.rotations import matrix_from_quat
 
 ROWS = 5000          # of each kind kept
 WINDOW = 0.5         # s to either side, over which speed, turn rate and direction are taken
 CREEP = 0.2          # m in the window, below which the direction of travel is that of before
-SECTIONS = 10        # equal parts of the way
-FEWEST_FIXES = 8     # of a section, for a scale and the likeness of its errors
-SHORTEST = 10.0      # m, of a section
-NEAR_MARK = 0.5      # s, fixes so far outside the marks still count as the leg's
-
-
-@dataclass(frozen=True, eq=False)
-class Sections:
-    """
-    Scale by section of the way: length by the fixes over length dead reckoned, corrected.
-
-    begin, end : (k,) m driven.   ratio, sigma : (k,), NaN where the fixes do not tell.
-    """
-
-    begin: NDArray[np.float64]
-    end: NDArray[np.float64]
-    ratio: NDArray[np.float64]
-    sigma: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +56,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
     fixes_n : (k, 3) array
         Usable fixes, m, at inputs.t_fix.
     kept : (k,) bool
-        Those that are not absurdly far off.
+        Those that are not absurdly far off; of these, the ones within the track are shown.
     pin : MarkFix
         Where the paths are pinned.
     paths : (before, after)
@@ -89,7 +72,8 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
     """
     inside = (track.t >= 0.0) & (track.t <= inputs.t_stop)
     t = track.t[inside]
-    kept = kept & (inputs.t_fix >= -NEAR_MARK) & (inputs.t_fix <= inputs.t_stop + NEAR_MARK)
+    span = (t[0], t[-1]) if len(t) else (0.0, -1.0)
+    kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
     before, after = (_pinned(path, pin) for path in paths)
     after_n, off_n = after(t), after(t_fix) - fix_n
@@ -100,7 +84,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
     forward = _forward_at(t_fix, t, after_n, sign)
     fix_distance = np.interp(t_fix, t, distance)
     sigma = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    status, t_out, because = _sent(leg, inputs, kept, config)
+    status, t_out, because = _sent(leg, inputs, kept, span, config)
 
     m, k, x = (_few(n) for n in (len(t), len(t_fix), len(because)))
     return Evidence(
@@ -118,63 +102,11 @@ def _pinned(path, pin):
     return lambda t: pin.position_n + path(t) - path(np.array(pin.t))
 
 
-def sections(way, reckoned_n, fix_n, sigma) -> Sections:
-    """
-    Return the scale of each tenth of the way, relative to the one used in dead reckoning.
-
-    The dead-reckoned piece is turned, stretched and shifted onto its fixes by least squares; the
-    stretch is the ratio, so no heading enters. Its sigma is widened where residuals exceed the
-    stated sigma and where one fix errs like the next (by their lag-one correlation r as by
-    sqrt((1 + r) / (1 - r)), the factor of a first-order process). Errors that last longer than a
-    section do not stretch it and are not in the sigma.
-
-    Parameters
-    ----------
-    way : (k,) array
-        m driven at each fix, rising.
-    reckoned_n, fix_n : (k, 3) arrays
-        Dead-reckoned and fixed positions, m.
-    sigma : (k,) array
-        Of a fix, m per horizontal axis.
-
-    """
-    whole = way[-1] - way[0] if len(way) else 0.0
-    count = int(min(SECTIONS, len(way) // FEWEST_FIXES, whole // SHORTEST))
-    if count < 1:
-        return Sections(*(np.empty(0) for _ in range(4)))
-    edges = way[0] + whole * np.linspace(0.0, 1.0, count + 1)
-    z, w = reckoned_n[:, 0] + 1j * reckoned_n[:, 1], fix_n[:, 0] + 1j * fix_n[:, 1]
-    part = np.clip(np.searchsorted(edges, way, side='right') - 1, 0, count - 1)
-    found = [_stretch(z[part == i], w[part == i], sigma[part == i]) for i in range(count)]
-    ratio, error = np.array(found).T
-    return Sections(edges[:-1], edges[1:], ratio, error)
-
-
-def _stretch(z, w, sigma):
-    """Return the stretch that takes z onto w (complex, m), and its sigma."""
-    n = len(z)
-    if n < FEWEST_FIXES:
-        return np.nan, np.nan
-    z, w = z - z.mean(), w - w.mean()
-    spread = float(np.vdot(z, z).real)
-    if spread <= 0.0:
-        return np.nan, np.nan
-    c = np.vdot(z, w) / spread
-    left = w - c * z
-    power = float(np.vdot(left, left).real)
-    seen = power / (2 * n - 4)               # per axis; shift, turn and stretch are taken out
-    likeness = float(np.vdot(left[:-1], left[1:]).real) / power if power > 0 else 0.0
-    likeness = min(max(likeness + 1.0 / n, 0.0), 0.98)      # its bias by the fit, and no more
-    wide = np.sqrt(max(seen, float(np.median(sigma))**2) * (1 + likeness) / (1 - likeness))
-    error = wide / np.sqrt(spread)
-    return (abs(c), error) if error < 1.0 else (np.nan, np.nan)
-
-
-def _sent(leg, inputs, kept, config):
+def _sent(leg, inputs, kept, span, config):
     """Return the status of the fixes kept, the times of the others, and why they are not."""
     fix, gnss = leg.fix, config.gnss
     t = (fix.stamp_ns - leg.start_ns) * 1e-9 + (gnss.time_offset - config.imu.time_offset)
-    near = (t >= -NEAR_MARK) & (t <= inputs.t_stop + NEAR_MARK)
+    near = (t >= span[0]) & (t <= span[1])
     row = {when: i for i, when in enumerate(t.tolist())}
     rows = np.array([row[when] for when in inputs.t_fix[kept].tolist()], int)
     near[rows] = False
