@@ -1,0 +1,50 @@
+"""What the shipped layouts name is what a running node has: topics, types, keys, services."""
+
+from bench import wait_for
+import pytest
+import shown
+
+from odocal_ros.live.inputs import message_class
+
+INPUT_TYPES = {'/imu/data': 'sensor_msgs/msg/Imu', '/fix': 'sensor_msgs/msg/NavSatFix',
+               '/odometer': 'std_msgs/msg/Int64'}       # as a pulse counter
+
+
+def has_field(msgtype, fields):
+    """Return whether a message has a number at these fields."""
+    kind = msgtype
+    for field in fields:
+        inner = message_class(kind).get_fields_and_field_types()
+        if field not in inner:
+            return False
+        kind = '{}/msg/{}'.format(*inner[field].split('/')) if '/' in inner[field] \
+            else inner[field]
+    return kind in ('double', 'float', 'int64')
+
+
+def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
+    start()
+    client = connect()
+    status = client.until(state='waiting')
+    node = client.node
+
+    def publishers():
+        return dict(node.get_publisher_names_and_types_by_node('calibrator', '/'))
+    wait_for(lambda: set(shown.published()) <= set(publishers()), 'all publishers')
+    for topic, kind in shown.published().items():
+        assert publishers()[topic] == [kind]
+        info, = node.get_publishers_info_by_topic(topic)
+        if topic != '/diagnostics':      # the display asks for it: latched
+            assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
+    assert shown.status_keys() <= set(status)
+    array = client.arrays[-1].status[0]
+    assert shown.status_names() == {(array.hardware_id, array.name)}
+    served = dict(node.get_service_names_and_types_by_node('calibrator', '/'))
+    for service in shown.services():
+        assert served[service] == ['std_srvs/srv/Trigger']
+
+
+@pytest.mark.parametrize(('topic', 'fields'), sorted(shown.of_inputs()))
+def test_the_inputs_have_the_fields_that_are_drawn(topic, fields):
+    assert has_field(INPUT_TYPES[topic], fields)
+    assert not has_field(INPUT_TYPES[topic], (*fields[:-1], 'nothing'))

@@ -1,0 +1,97 @@
+"""The layouts for RViz, Foxglove and PlotJuggler: whole, and of names that those programs know."""
+
+import re
+
+import shown
+
+from odocal_ros.config import SETTINGS
+
+# from rviz_default_plugins/plugins_description.xml of Jazzy, those that could be meant here
+RVIZ = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_common/Selection', 'rviz_common/Time',
+        *(f'rviz_default_plugins/{name}' for name in (
+            'Axes', 'Grid', 'Path', 'TF', 'MoveCamera', 'Measure', 'FocusCamera', 'Select',
+            'Interact', 'TopDownOrtho', 'Orbit', 'XYOrbit'))}
+# panel types of Foxglove's catalogue
+PANELS = {'3D', 'map', 'DiagnosticStatusPanel', 'DiagnosticSummary', 'StateTransitions', 'Plot',
+          'Parameters', 'RosOut', 'CallService', 'Tab'}
+OUTPUTS = {'/calibrator/status', '/diagnostics', '/calibrator/path/dead_reckoning',
+           '/calibrator/path/reference'}
+INPUTS = {'/imu/data', '/odometer', '/fix'}
+
+
+def all_values(tree, key):
+    """Return every value of a key, at any depth."""
+    if isinstance(tree, dict):
+        return [v for k, v in tree.items() if k == key] + [
+            v for sub in tree.values() for v in all_values(sub, key)]
+    return [v for sub in tree for v in all_values(sub, key)] if isinstance(tree, list) else []
+
+
+def leaves(layout):
+    """Return the panels that a split of Foxglove names."""
+    if isinstance(layout, str):
+        return [layout]
+    assert layout['direction'] in ('row', 'column')
+    assert 0 < layout['splitPercentage'] < 100
+    return leaves(layout['first']) + leaves(layout['second'])
+
+
+def test_rviz_names_classes_that_rviz_has():
+    classes = [c for c in all_values(shown.rviz(), 'Class') if c]
+    assert len(classes) > 8
+    assert set(classes) <= RVIZ
+
+
+def test_rviz_shows_both_paths_in_their_own_frame_latched():
+    options = shown.rviz()['Visualization Manager']['Global Options']
+    assert options['Fixed Frame'] == SETTINGS['frames.local'].default
+    paths = [d for d in shown.rviz_displays() if d['Class'].endswith('/Path')]
+    assert {d['Topic']['Value'] for d in paths} == {
+        f'calibrator/path/{name}' for name in ('dead_reckoning', 'reference')}
+    for display in paths:
+        # a volatile subscription misses what was published before RViz came
+        assert display['Topic']['Durability Policy'] == 'Transient Local'
+        assert display['Topic']['Reliability Policy'] == 'Reliable'
+        assert display['Enabled']
+        assert display['Value']
+    assert len({d['Color'] for d in paths}) == 2
+
+
+def test_foxglove_places_every_panel_once_and_knows_its_type():
+    layout = shown.foxglove()
+    placed = leaves(layout['layout'])
+    for panel in layout['configById'].values():
+        for tab in panel.get('tabs', ()):
+            placed += leaves(tab['layout'])
+    assert sorted(placed) == sorted(layout['configById'])
+    assert {name.partition('!')[0] for name in placed} == PANELS
+
+
+def test_foxglove_draws_paths_status_and_curves():
+    panels = shown.foxglove()['configById']
+    assert panels['3D!paths']['followTf'] == SETTINGS['frames.local'].default
+    assert all(topic['type'] == 'line' for topic in panels['3D!paths']['topics'].values())
+    paths = shown.foxglove_paths()
+    assert len(paths) == len(set(paths)) > 12
+    for path in paths:
+        assert shown.KEY.search(path) or re.fullmatch(r'/[a-z/]+(\.[a-z_]+)+', path), path
+
+
+def test_plotjuggler_has_its_parts_and_subscribes_what_it_draws():
+    root = shown.plotjuggler()
+    assert root.tag == 'root'
+    for splitter in root.iter('DockSplitter'):
+        assert int(splitter.get('count')) == len(splitter) == len(
+            splitter.get('sizes').split(';'))
+    assert len(list(root.iter('Tab'))) == 3
+    wanted = {t for t in ('/calibrator/status', '/imu/data', '/odometer')
+              if any(name.startswith(t + '/') for name in shown.curves())}
+    for plugin in root.iter('plugin'):
+        assert set(plugin.find('selected_topics').get('value').split(';')) == wanted
+
+
+def test_all_topics_are_those_of_the_node():
+    assert set(shown.published()) == OUTPUTS
+    assert {topic for topic, _ in shown.of_inputs()} <= INPUTS
+    assert shown.status_names() == {('odocal', 'calibrator: calibration')}
+    assert {s.rpartition('/')[0] for s in shown.services()} == {'/calibrator'}
