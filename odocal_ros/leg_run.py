@@ -1,6 +1,7 @@
 """One leg on its way through the pipeline: align, propagate, dead reckon, each method, check."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -181,22 +182,25 @@ class LegRun:
                                         self.origin, config)
             self.reasons += why
         self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
-        self.track = self.reckon(self.alignment)
+        self.track = self.reckon(inputs.travel)
         self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
         self.reasons += found
         if self.holdout:
             self.t_fit = self._four_fifths()
 
-    def reckon(self, alignment, travel=None):
-        """Return the track of a travel (default: the mean of the wheels) from an alignment."""
-        inputs = self.inputs
-        pick = (inputs.t_imu >= alignment.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
+    def reckon(self, travel):
+        """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
+        return dead_reckon(*self._epochs, travel)
+
+    @cached_property
+    def _epochs(self):
+        """Return the attitude through the leg: t (m,) s, q_nb (m, 4)."""
+        inputs, a = self.inputs, self.alignment
+        pick = (inputs.t_imu >= a.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
         t = inputs.t_imu[pick]
         rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-        epochs, q_nb = attitude(t, inputs.w_b[pick] - alignment.gyro_bias, alignment.q_nb,
-                                earth_rate_n(self.origin.latitude),
-                                max(1, int(rate / EPOCH_RATE)))
-        return dead_reckon(epochs, q_nb, travel or inputs.travel)
+        return attitude(t, inputs.w_b[pick] - a.gyro_bias, a.q_nb,
+                        earth_rate_n(self.origin.latitude), max(1, int(rate / EPOCH_RATE)))
 
     def _four_fifths(self):
         """Return when four fifths of the distance are driven, s."""

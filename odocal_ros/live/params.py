@@ -13,8 +13,10 @@ from odocal_ros.config import Config, Setting, SETTINGS, with_settings
 from odocal_ros.errors import BadConfig
 from odocal_ros.reasons import Verdict
 
-ESTIMATES = {'scale_factor': 'm/pulse, m/rad or 1', 'scale_ratio': '1',
-             'yaw_mounting_angle': 'rad', 'pitch_mounting_angle': 'rad'}
+SCALE = 'm/pulse, m/rad or 1'
+ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+             'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
+             'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
 PREFIX = 'result.'
 
 
