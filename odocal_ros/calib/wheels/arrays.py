@@ -1,0 +1,186 @@
+"""
+Orthogonal arrays: which parameter sets are tried first (source B, step 5).
+
+In an orthogonal array (of strength two) each pair of columns holds each pair of levels equally
+often. Bose's construction gives q^2 rows of q + 1 columns for any prime power q: the points of a
+plane over the field of q elements, a column for each direction of parallel lines.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations, product
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.errors import BadUsage
+
+FULL_UP_TO = 2    # levels for which all combinations are taken
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """
+    An array of level numbers from 0, a row for each set to try.
+
+    imbalance : how far the count of a pair of levels is from even at worst, 0: orthogonal.
+    """
+
+    name: str
+    rows: NDArray[np.int64]      # (n, columns)
+    levels: tuple[int, ...]      # of each column
+    imbalance: float
+
+    @property
+    def balanced(self) -> bool:
+        """Tell whether each pair of columns holds each pair of levels equally often."""
+        return self.imbalance == 0.0
+
+
+def prime_power(q: int) -> tuple[int, int] | None:
+    """Return (p, m) with q = p^m, p prime; None where there are none."""
+    p = next((d for d in range(2, math.isqrt(max(q, 0)) + 1) if q % d == 0), q)
+    if p < 2:
+        return None
+    m = 0
+    while q % p == 0:
+        q, m = q // p, m + 1
+    return (p, m) if q == 1 else None
+
+
+def next_prime_power(n: int, odd: bool = False) -> int:
+    """Return the least prime power not below n; odd: of an odd prime."""
+    q = max(n, 2)
+    while prime_power(q) is None or (odd and q % 2 == 0):
+        q += 1
+    return q
+
+
+@cache
+def field_tables(q: int):
+    """
+    Return addition and multiplication of the field of q elements: (q, q) each, of numbers 0..q-1.
+
+    An element is the number whose digits to base p are the coefficients of a polynomial.
+    """
+    power = prime_power(q)
+    if power is None:
+        raise BadUsage(f'{q} levels: no field has as many elements; give a prime power')
+    p, m = power
+    digits = np.array([_digits(k, p, m) for k in range(q)])
+    weight = p**np.arange(m)
+    add = ((digits[:, None] + digits) % p) @ weight
+    whole = np.zeros((q, q, 2 * m - 1), np.int64)
+    for i, j in product(range(m), repeat=2):
+        whole[..., i + j] += np.multiply.outer(digits[:, i], digits[:, j])
+    modulus = irreducible(p, m)
+    for k in range(2 * m - 2, m - 1, -1):      # x^k = -x^(k-m) * (the modulus less its head)
+        whole[..., k - m:k] -= whole[..., k, None] * np.array(modulus[:m], np.int64)
+    return add, (whole[..., :m] % p) @ weight
+
+
+def irreducible(p: int, m: int) -> tuple[int, ...]:
+    """Return the first monic polynomial of degree m over 0..p-1 that has no factor, low first."""
+    factors = [(*low, 1) for d in range(1, m // 2 + 1) for low in product(range(p), repeat=d)]
+    for low in product(range(p), repeat=m):
+        candidate = (*low, 1)
+        if not any(_divides(f, candidate, p) for f in factors):
+            return candidate
+    raise AssertionError('a field of every prime power exists')
+
+
+def _divides(factor, polynomial, p):
+    """Tell whether a monic factor divides a polynomial, both low first."""
+    rest, d = list(polynomial), len(factor) - 1
+    for k in range(len(rest) - 1, d - 1, -1):
+        head = rest[k]
+        for i, f in enumerate(factor):
+            rest[k - d + i] = (rest[k - d + i] - head * f) % p
+    return not any(rest[:d])
+
+
+def _digits(k, p, m):
+    return [k // p**i % p for i in range(m)]
+
+
+def bose(q: int, columns: int):
+    """
+    Return Bose's orthogonal array L(q^2)(q^columns): (q^2, columns) level numbers.
+
+    Raises
+    ------
+    BadUsage
+        q is no prime power, or more than q + 1 columns are asked.
+
+    """
+    add, multiply = field_tables(q)
+    if not 1 <= columns <= q + 1:
+        raise BadUsage(f'{columns} columns: an array of {q} levels has 1 to {q + 1}')
+    i, j = np.divmod(np.arange(q * q), q)
+    slopes = [add[i, multiply[c, j]] for c in range(q)]     # slope 0 is i itself
+    return np.stack([slopes[0], j, *slopes[1:]][:columns], -1)
+
+
+def full_factorial(levels) -> NDArray[np.int64]:
+    """Return all combinations: (product of levels, columns)."""
+    return np.stack([g.ravel() for g in np.indices(tuple(levels))], -1).astype(np.int64)
+
+
+def imbalance(rows, levels) -> float:
+    """Return how far the count of a pair of levels is from even, at worst over all pairs."""
+    worst = 0.0
+    for a, b in combinations(range(len(levels)), 2):
+        cells = levels[a] * levels[b]
+        counts = np.bincount(rows[:, a] * levels[b] + rows[:, b], minlength=cells)
+        worst = max(worst, float(np.abs(counts - len(rows) / cells).max()))
+    return worst
+
+
+def is_balanced(rows) -> bool:
+    """Tell whether each pair of columns holds each pair of its levels equally often."""
+    return imbalance(rows, tuple(int(n) + 1 for n in rows.max(axis=0))) == 0.0
+
+
+def least_rows(levels) -> int:
+    """Return the number of rows that an orthogonal array's must be a multiple of."""
+    return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \
+        else int(levels[0])
+
+
+def nearly_balanced(levels) -> Design:
+    """
+    Return a small array for unlike numbers of levels, by dummy levels.
+
+    An orthogonal array of the next prime power is folded: columns with fewer levels let some of
+    them stand for two, spread alike about the middle. Each pair of levels is still met.
+    """
+    levels = tuple(levels)
+    q = next_prime_power(max(*levels, len(levels) - 1))
+    rows = bose(q, len(levels))
+    for column, n in enumerate(levels):
+        fold = np.rint((np.arange(q) + 0.5) * n / q - 0.5).astype(np.int64)
+        rows[:, column] = np.clip(fold, 0, n - 1)[rows[:, column]]
+    return Design(f'L{q * q}({q}^{q + 1})', rows, levels, imbalance(rows, levels))
+
+
+def design_for(levels) -> Design:
+    """
+    Return the array for numbers of levels of each parameter.
+
+    One or two levels: all combinations. Equal prime powers: an orthogonal array. Else an
+    orthogonal array folded, unless all combinations are no more.
+    """
+    levels = tuple(int(n) for n in levels)
+    if min(levels) < 1:
+        raise BadUsage(f'{min(levels)} levels: give 1 or more for each parameter')
+    many = [n for n in levels if n > 1]
+    everything = math.prod(levels)
+    q = max(levels)
+    if q > FULL_UP_TO and len(many) > 2:
+        if len(set(levels)) == 1 and prime_power(q) and len(levels) <= q + 1:
+            return Design(f'L{q * q}({q}^{q + 1})', bose(q, len(levels)), levels, 0.0)
+        folded = nearly_balanced(levels)
+        if len(folded.rows) < everything:
+            return folded
+    return Design(f'all {everything} combinations', full_factorial(levels), levels, 0.0)

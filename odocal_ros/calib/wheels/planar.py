@@ -1,0 +1,145 @@
+"""
+Dead reckoning in the plane for many parameter sets at once (source B, steps 2 to 4).
+
+A parameter set is left scale, right scale (m per unit) and heading (rad, counter-clockwise): the
+angle by which the whole track is to be turned. Positions are linear in the two scales, so the
+wheels' tracks are summed once, at one metre per unit, and a set costs two products of matrices.
+Only horizontal components are used, of n itself: no sphere, no map.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import forward_b, Track
+
+CHUNK = 500_000          # distances held at once: 4 MB, which stays in the cache
+COURSE_BASELINE = 10.0   # m, least way between two fixes that give a course
+COURSE_CLEAR = 20.0      # fix sigmas, the same: the course is then good to 4 deg
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarLeg:
+    """
+    A leg of two wheels as the search sees it; n, metres, (k, 2) east and north.
+
+    t : (k,) s, times of the fixes.   fixes_n : (k, 2).   sigma : (k,) m, of each axis of a fix.
+    left_n, right_n : (k, 2) sum of direction over the wheel's travel from the start to each fix,
+        m per m/unit of scale factor, with the heading as configured.
+    start_n : (2,) antenna at the start, where every track begins.
+    scale_left, scale_right : start values, m per unit.
+    lever_n : (k, 2) what the antenna moved by the vehicle turning about the odometer's point.
+    pieces : (c, 2) rows of fixes that are far enough apart for a course over ground.
+    """
+
+    t: NDArray[np.float64]
+    left_n: NDArray[np.float64]
+    right_n: NDArray[np.float64]
+    fixes_n: NDArray[np.float64]
+    start_n: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    scale_left: float
+    scale_right: float
+    lever_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 2)))
+    pieces: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """Return the start values as a parameter set: (3,)."""
+        return np.array([self.scale_left, self.scale_right, 0.0])
+
+    @cached_property
+    def basis(self):
+        """
+        Return the rows that a set's coefficients mix into residuals turned back by its heading.
+
+        residual = (L K_L + R K_R) / 2 + lever - (fix - start) turned by -heading: (5, k) east,
+        (5, k) north for the coefficients K_L / 2, K_R / 2, 1, -cos heading, -sin heading.
+        """
+        east, north = (self.fixes_n - self.start_n).T
+        lever = np.broadcast_to(self.lever_n, self.fixes_n.shape)
+        rows = np.stack([self.left_n, self.right_n, lever])
+        return (np.vstack([rows[..., 0], [east, north]]),
+                np.vstack([rows[..., 1], [north, -east]]))
+
+
+def planar_leg(track_left: Track, track_right: Track, t_fix, fixes_n, covariance_n, start,
+               scales, pitch=0.0, lever_b=(0.0, 0.0, 0.0)) -> PlanarLeg:
+    """
+    Project a leg of two wheels on the plane.
+
+    Parameters
+    ----------
+    track_left, track_right : Track
+        Dead reckoned with the travel of each wheel alone, same attitude.
+    t_fix, fixes_n, covariance_n : (k,), (k, 2 or 3), (k, 3, 3) arrays
+        Fixes, s, m, m^2; those that the tracks do not reach are left out.
+    start : (t, position_n)
+        Time, s, and antenna position, m, at which the tracks begin.
+    scales : (left, right)
+        Start values, m per unit.
+    pitch : float
+        Pitch mounting angle, rad: the forward axis is that of yaw 0.
+    lever_b : (3,) array
+        Antenna from the odometer's point, m.
+
+    """
+    t_start, start_n = start
+    tracks = track_left, track_right
+    reach = (max(t_start, *(track.t[0] for track in tracks)),
+             min(track.t[-1] for track in tracks))
+    use = (t_fix >= reach[0]) & (t_fix <= reach[1])
+    t, fixes = t_fix[use], np.ascontiguousarray(fixes_n[use, :2])
+    forward, origin = forward_b(0.0, pitch), np.array(float(t_start))
+    left, right = (((track.at(t) - track.at(origin)) @ forward)[:, :2] for track in tracks)
+    turn = track_left.C_nb_at(t) - track_left.C_nb_at(origin)
+    sigma = np.sqrt((covariance_n[use, 0, 0] + covariance_n[use, 1, 1]) / 2)
+    return PlanarLeg(t, left, right, fixes, np.array(start_n[:2], dtype=float), sigma,
+                     float(scales[0]), float(scales[1]),
+                     lever_n=(turn @ np.asarray(lever_b))[:, :2],
+                     pieces=course_pieces(fixes, sigma))
+
+
+def course_pieces(fixes_n, sigma):
+    """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
+    if not len(fixes_n):
+        return np.empty((0, 2), np.int64)
+    need = max(COURSE_BASELINE, COURSE_CLEAR * float(np.median(sigma)))
+    x, y = fixes_n.T.tolist()
+    ends = [0]
+    for k in range(1, len(x)):
+        a = ends[-1]
+        if (x[k] - x[a])**2 + (y[k] - y[a])**2 >= need**2:
+            ends.append(k)
+    return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
+
+
+def coefficients(sets):
+    """Return what mixes the rows of ``PlanarLeg.basis``, of (m, 3) sets: (m, 5)."""
+    left, right, heading = np.asarray(sets, dtype=float).T
+    return np.stack([left / 2, right / 2, np.ones_like(left), -np.cos(heading),
+                     -np.sin(heading)], -1)
+
+
+def positions(leg: PlanarLeg, sets):
+    """Return the antenna's track at the fixes, m, of (m, 3) parameter sets: (m, k, 2)."""
+    mix = coefficients(sets)
+    body = mix[:, :3] @ leg.basis[0][:3] + 1j * (mix[:, :3] @ leg.basis[1][:3])
+    p = body * np.exp(1j * np.asarray(sets, dtype=float)[:, 2:])
+    return np.stack([p.real, p.imag], -1) + leg.start_n
+
+
+def squared_distances(leg: PlanarLeg, sets):
+    """Yield (rows, squared distances of track and fix, m^2: (len(rows), k)) by bounded chunks."""
+    east, north = leg.basis
+    mix = coefficients(sets)
+    step = max(1, CHUNK // max(1, len(leg.t)))
+    for first in range(0, len(mix), step):
+        rows = slice(first, first + step)
+        d2, other = mix[rows] @ east, mix[rows] @ north
+        d2 *= d2
+        other *= other
+        d2 += other
+        yield rows, d2

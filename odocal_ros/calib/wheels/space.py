@@ -1,0 +1,57 @@
+"""
+The parameters of the search: relative change of each wheel's scale, and heading.
+
+Outside they are the patent's: x = (left, right, heading), scale = start value (1 + x). Inside the
+search moves by mean, difference and heading, in which the criterion's long valley is no slant:
+left and right alike move the track by the distance, their difference by the track width at most.
+Where the fixes cannot tell left from right, the difference is held and two coordinates are left.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+NAMES = ('left', 'right', 'heading')
+# columns: mean, difference (right less left), heading; held: mean, heading
+FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
+HELD = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+WIDEST = np.array([0.9, 0.9, 1.5 * np.pi])     # of a half range: no scale turns negative
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """How the search's coordinates q make x = T q; held: without the wheels' difference."""
+
+    held: bool
+
+    @property
+    def T(self) -> NDArray[np.float64]:     # noqa: N802
+        """Return the matrix of x = T q."""
+        return HELD if self.held else FREE
+
+    @property
+    def S(self) -> NDArray[np.float64]:     # noqa: N802
+        """Return the matrix of v = S q: what the range bounds is x, or the mean where held."""
+        return np.eye(2) if self.held else FREE
+
+    def q_of(self, x):
+        """Return the coordinates of x; its difference is dropped where held."""
+        left, right, heading = x
+        mean = (left + right) / 2
+        return np.array([mean, heading] if self.held else [mean, right - left, heading])
+
+    def bounds(self, half):
+        """Return the half range of v for that of x: (n,)."""
+        return np.array([min(half[:2]), half[2]]) if self.held else np.array(half)
+
+    def widened(self, half, on_edge):
+        """Return the half range of x doubled where v lies on its edge, to WIDEST at most."""
+        edge = np.array([on_edge[0], *on_edge]) if self.held else np.asarray(on_edge)
+        return np.where(edge, np.minimum(2 * np.asarray(half), WIDEST), half)
+
+
+def sets_of(leg, x):
+    """Return parameter sets (scales in m per unit, heading in rad) of (m, 3) x."""
+    x = np.atleast_2d(np.asarray(x, dtype=float))
+    return np.stack([leg.scale_left * (1 + x[:, 0]), leg.scale_right * (1 + x[:, 1]), x[:, 2]], -1)

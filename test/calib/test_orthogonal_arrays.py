@@ -1,0 +1,139 @@
+"""Orthogonal arrays are balanced, as many as there are prime powers, and no smaller ones exist."""
+
+from itertools import combinations, product
+from math import gcd
+
+import numpy as np
+import pytest
+
+from odocal_ros.calib.wheels.arrays import (
+    bose,
+    design_for,
+    field_tables,
+    full_factorial,
+    imbalance,
+    irreducible,
+    is_balanced,
+    least_rows,
+    nearly_balanced,
+    next_prime_power,
+    prime_power,
+)
+from odocal_ros.calib.wheels.embodiment import FOUND, LEVELS, PRINTED
+from odocal_ros.errors import BadUsage
+
+PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]
+
+
+def test_prime_powers_are_told_from_other_numbers():
+    assert [q for q in range(18) if prime_power(q)] == [*PRIME_POWERS, 17]
+    assert prime_power(49) == (7, 2)
+    assert prime_power(64) == (2, 6)
+    assert prime_power(6) is None
+    assert [next_prime_power(n) for n in (1, 6, 10, 14, 18)] == [2, 7, 11, 16, 19]
+    assert [next_prime_power(n, odd=True) for n in (3, 4, 8, 14, 26, 50)] == [3, 5, 9, 17, 27, 53]
+
+
+@pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 27])
+def test_the_tables_are_those_of_a_field(q):
+    add, multiply = field_tables(q)
+    a, b, c = np.indices((q, q, q))
+    assert (add[add[a, b], c] == add[a, add[b, c]]).all()
+    assert (multiply[multiply[a, b], c] == multiply[a, multiply[b, c]]).all()
+    assert (multiply[a, add[b, c]] == add[multiply[a, b], multiply[a, c]]).all()
+    each = np.arange(q)
+    assert (np.sort(add, axis=1) == each).all()
+    assert (np.sort(multiply[1:], axis=1) == each).all()       # so each has an inverse
+    assert (add == add.T).all()
+    assert (multiply == multiply.T).all()
+    assert (multiply[1] == each).all()
+    assert (add[0] == each).all()
+
+
+@pytest.mark.parametrize(('p', 'm'), [(2, 2), (2, 4), (3, 2), (3, 3), (5, 2)])
+def test_the_polynomial_found_is_no_product(p, m):
+    found = irreducible(p, m)
+    assert found[-1] == 1
+    for d in range(1, m // 2 + 1):
+        for low, high in product(product(range(p), repeat=d), product(range(p), repeat=m - d)):
+            factors = np.polynomial.polynomial.polymul((*low, 1), (*high, 1))
+            assert tuple(factors.astype(int) % p) != found
+
+
+@pytest.mark.parametrize('q', [*PRIME_POWERS, 25, 49])
+def test_every_array_is_balanced(q):
+    array = bose(q, q + 1)
+    assert array.shape == (q * q, q + 1)
+    assert is_balanced(array)
+    pairs = {tuple(row) for row in array[:, [q - 1, q]].tolist()}
+    assert len(pairs) == q * q      # each pair of levels once
+
+
+def test_the_names_of_the_books():
+    assert bose(3, 4).shape == (9, 4)
+    assert bose(9, 10).shape == (81, 10)
+    assert bose(8, 9).shape == (64, 9)
+    assert design_for((9, 9, 9)).name == 'L81(9^10)'
+    # L9(3^4) of the source's figure 2, but for the order: three of each level in each column
+    assert all((np.bincount(column) == 3).all() for column in bose(3, 4).T)
+
+
+def test_one_wrong_cell_is_seen():
+    array = bose(5, 6)
+    array[7, 2] = (array[7, 2] + 1) % 5
+    assert not is_balanced(array)
+    assert imbalance(array, (5,) * 6) == 1.0
+
+
+def test_what_cannot_be_built_is_refused():
+    with pytest.raises(BadUsage, match='6 levels'):
+        bose(6, 3)
+    with pytest.raises(BadUsage, match='5 columns'):
+        bose(3, 5)
+    with pytest.raises(BadUsage, match='0 levels'):
+        design_for((0, 3, 3))
+
+
+def test_nothing_smaller_than_all_441_is_orthogonal_for_the_embodiment():
+    # each pair of columns needs a multiple of its 49 or 63 pairs of levels
+    assert least_rows(LEVELS) == 49 * 63 // gcd(49, 63) == 441 == len(full_factorial(LEVELS))
+    assert is_balanced(full_factorial(LEVELS))
+    assert least_rows((3, 3, 3)) == 9
+    assert least_rows((5,)) == 5
+
+
+def test_the_printed_combinations_are_levels_but_not_balanced():
+    errors = np.array(PRINTED)
+    rows = np.rint(errors / [0.01, 0.01, 0.25]).astype(int) + [3, 3, 4]
+    assert len(rows) == 7
+    assert (rows >= 0).all()
+    assert (rows < LEVELS).all()
+    assert imbalance(rows, LEVELS) > 0.8
+    assert FOUND not in PRINTED
+
+
+def test_the_small_array_is_nearly_balanced_and_says_by_how_much():
+    design = nearly_balanced(LEVELS)
+    assert design.rows.shape == (81, 3)
+    assert design.levels == LEVELS
+    assert (design.rows.max(axis=0) == [6, 6, 8]).all()
+    # two of seven levels stand for two of nine: their pair is met 4 times, even were 81 / 49
+    assert design.imbalance == pytest.approx(4 - 81 / 49)
+    assert not design.balanced
+    for a, b in combinations(range(3), 2):
+        met = {tuple(pair) for pair in design.rows[:, [a, b]].tolist()}
+        assert len(met) == LEVELS[a] * LEVELS[b]
+    # dummies lie alike about the middle: the mean of each column is the middle level
+    assert design.rows.mean(axis=0) == pytest.approx([3, 3, 4])
+
+
+@pytest.mark.parametrize(('levels', 'rows', 'balanced'), [
+    ((1, 1, 1), 1, True), ((2, 2, 2), 8, True), ((3, 3, 3), 9, True), ((7, 7, 7), 49, True),
+    ((4, 4, 4), 16, True), ((6, 6, 6), 49, False), ((7, 7, 9), 81, False), ((3, 3, 1), 9, True),
+    ((2, 2, 3), 9, False), ((2, 1, 9), 18, True)])
+def test_the_design_follows_the_levels(levels, rows, balanced):
+    design = design_for(levels)
+    assert design.rows.shape == (rows, 3)
+    assert design.balanced == balanced
+    assert imbalance(design.rows, levels) == design.imbalance
+    assert [len(set(column)) for column in design.rows.T.tolist()] == list(levels)
