@@ -1,5 +1,5 @@
 """
-Pages made from config.py and reasons.py: ``config/calibrator.yaml`` and the README's tables.
+Pages made from config.py and reasons.py: calibrator.yaml, docs/reasons.md, the README's tables.
 
 ``python -m odocal_ros.settings_page`` tells whether they agree with the code, ``--write`` makes
 them agree. A test says so too.
@@ -12,7 +12,8 @@ import sys
 import textwrap
 
 from odocal_ros.config import Setting, SETTINGS
-from odocal_ros.reasons import Code, Verdict
+from odocal_ros.reasons import Code
+from odocal_ros.reasons_page import reasons_md, WEIGHTS
 
 ROOT = Path(__file__).resolve().parent.parent
 YAML_HEAD = """\
@@ -23,7 +24,6 @@ YAML_HEAD = """\
 """
 TYPES = {'bool': 'bool', 'int': 'int', 'float': 'double', 'str': 'string', 'floats': 'double[]',
          'strs': 'string[]'}
-GRAVITY = {Verdict.ACCEPTED: 'note', Verdict.CAUTION: 'caution', Verdict.REJECTED: 'rejects'}
 
 
 def scalar_text(value) -> str:
@@ -78,7 +78,7 @@ def settings_table() -> str:
 def reasons_table() -> str:
     """Return the README's table of reasons."""
     rows = ['| reason | weight | what to do |', '|---|---|---|']
-    rows += [f'| `{code.name}` | {GRAVITY[code.gravity]} | {code.remedy} |' for code in Code]
+    rows += [f'| `{code.name}` | {WEIGHTS[code.gravity]} | {code.remedy} |' for code in Code]
     return '\n'.join(rows)
 
 
@@ -101,6 +101,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
     """Return each page's path and the text it should have."""
     readme = root / 'README.md'
     return {root / 'config' / 'calibrator.yaml': config_yaml(),
+            root / 'docs' / 'reasons.md': reasons_md(),
             readme: filled(readme.read_text(encoding='utf-8'))}
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from odocal_ros import settings_page
 from odocal_ros.offline import cli
+from odocal_ros.reasons import Code
+from odocal_ros.reasons_page import MEANINGS
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / name for name in ('README.md', 'CONTRIBUTING.md', 'docs/conventions.md',
-                                  'docs/method.md')] + sorted(
-    (ROOT / 'docs' / 'decisions').glob('*.md'))
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
 
 
@@ -31,13 +31,14 @@ def test_pages_made_from_the_code_are_fresh(path):
 
 def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
     (tmp_path / 'config').mkdir()
+    (tmp_path / 'docs').mkdir()
     (tmp_path / 'README.md').write_text(README.replace('| `method` | string |', '| old |'))
     (tmp_path / 'config' / 'calibrator.yaml').write_text('old')
     fresh = settings_page.pages
     monkeypatch.setattr(settings_page, 'pages', lambda: fresh(tmp_path))
     monkeypatch.setattr('sys.argv', ['settings_page'])
     assert settings_page.main() == 1
-    assert capsys.readouterr().out.count('stale: ') == 2
+    assert capsys.readouterr().out.count('stale: ') == 3
     monkeypatch.setattr('sys.argv', ['settings_page', '--write'])
     assert settings_page.main() == 0
     assert (tmp_path / 'README.md').read_text() == README
@@ -45,6 +46,12 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
     assert settings_page.main() == 0
     with pytest.raises(ValueError, match='the page has no'):
         settings_page.filled('no tables here')
+
+
+def test_each_reason_is_explained_once_in_the_order_of_the_enum():
+    explained = [code for codes in MEANINGS.values() for code in codes]
+    assert explained == list(Code), 'say what the code means in odocal_ros/reasons_page.py'
+    assert all(text.endswith('.') for codes in MEANINGS.values() for text in codes.values())
 
 
 def test_odocal_commands_parse():
@@ -80,7 +87,6 @@ def test_modules_of_the_method_page_exist():
 
 def test_settings_and_reasons_named_in_the_text_exist():
     from odocal_ros.config import SETTINGS
-    from odocal_ros.reasons import Code
     groups = {name.partition('.')[0] for name in SETTINGS if '.' in name}
     for page in PAGES:
         text = re.sub(r'<!-- (\w+): begin -->.*?<!-- \1: end -->', '',
