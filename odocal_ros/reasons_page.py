@@ -90,8 +90,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
     },
     'The estimate': {
         Code.YAW_NOT_SEPARABLE: 'End points see the sum of initial heading and yaw mounting '
-        'angle. The only heading here is the course over ground, or one less certain than the yaw is '
-        'asked to be. The scale is not touched by it.',
+        'angle. The only heading here is the course over ground, or one less certain than the '
+        'yaw is asked to be. The scale is not touched by it.',
         Code.GYROCOMPASS_REFUSED: 'The heading was to come from the turning of the Earth, but the '
         'gyro bias is too large or the rest too short for it.',
         Code.HEADING_UNAVAILABLE: 'The heading source that was asked for gave nothing usable; the '
