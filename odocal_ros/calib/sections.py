@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 
 SECTIONS = 10        # equal parts of the way
 FEWEST = 8           # fixes of a section
-MOST = 100           # fixes of a section that are used, evenly spread
+BLOCKS = 24          # means of fixes that a section is made of: noise from one to the next is gone
 SHORTEST = 10.0      # m, of a section
 LEAST = 0.01         # of a stated sigma: fixes are not better than that, one to the next
-MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])  # one fix to the next
+LAGS = (1, 3)        # blocks, at which the correlation is looked at
+FAR = 16             # blocks from which the longer lag tells
+MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])  # block to block
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +35,10 @@ def sections(way, reckoned_n, fix_n, sigma) -> Sections:
 
     The dead-reckoned piece is turned, stretched and shifted onto its fixes by least squares; the
     stretch is the ratio, so no heading enters. Its sigma is by what the fixes leave after that,
-    not by what the receiver states, most of which is the same at both ends of a section. One fix
-    errs like the next: a first-order process is matched to the residuals of all sections
-    together, their power and lag-one correlation as they are after such a fit. Errors that
-    change more slowly than over a section are not in it.
+    not by what the receiver states, most of which is the same at both ends of a section. Fixes
+    err like those before: of means of a few, a first-order process is matched to the residuals of
+    all sections together, their power and correlation as they are after such a fit.
+    Errors that change more slowly than over a section are not in it.
 
     Parameters
     ----------
@@ -59,9 +61,9 @@ def sections(way, reckoned_n, fix_n, sigma) -> Sections:
     fits = {}
     for i in range(count):
         rows = np.flatnonzero(part == i)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(int))]
         if len(rows) >= FEWEST and np.ptp(way[rows]) > 0:
-            fits[i] = _stretched(z[rows], w[rows])
+            blocks = np.array_split(rows, min(len(rows), BLOCKS))
+            fits[i] = _stretched(*(np.array([x[b].mean() for b in blocks]) for x in (z, w)))
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
                         strict=True):
         if found < 1.0:
@@ -82,12 +84,14 @@ def _errors(fits, stated):
     if not fits:
         return []
     n = int(np.median([len(left) for _, left, _ in fits]))
-    left_over, alike, widening = _process(n)
+    left_over, widening, *alike = _process(n)
     power = np.array([np.vdot(left, left).real / len(left) for _, left, _ in fits]) / 2
-    lag = sum(np.vdot(left[:-1], left[1:]).real for _, left, _ in fits)
     whole = sum(np.vdot(left, left).real for _, left, _ in fits)
-    memory = np.interp(lag / whole if whole else 0.0, alike, np.arange(len(MEMORIES)))
     at = np.arange(len(MEMORIES))
+    # white noise on top hides a memory at the next block, not further on: the longer one counts
+    memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
+                           / whole if whole else 0.0, row, at)
+                 for lag, row in zip(LAGS, alike, strict=True) if lag == 1 or n >= FAR)
     level = np.maximum(power, np.median(power)) / np.interp(memory, at, left_over)
     level = np.maximum(level, (LEAST * stated)**2)
     return [float(np.sqrt(v * np.interp(memory, at, widening) / spread))
@@ -98,8 +102,8 @@ def _process(n):
     """
     Return what a line fitted to n rows of a first-order process leaves, by its memory.
 
-    Mean power left and its lag-one correlation, and the variance of the slope over that of white
-    noise, of a process of variance 1: each (len(MEMORIES),). Closed form: traces with the
+    Mean power left, the variance of the slope over that of white noise, and the correlation left
+    at each lag, of a process of variance 1: each (len(MEMORIES),). Closed form: traces with the
     projector off a line.
     """
     x = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], -1)
@@ -110,6 +114,6 @@ def _process(n):
     for memory in MEMORIES:
         R = memory**apart
         left = off @ R @ off
-        table.append((np.trace(left) / n, np.trace(left, 1) / np.trace(left),
-                      x[:, 1] @ R @ x[:, 1]))
+        table.append((np.trace(left) / n, x[:, 1] @ R @ x[:, 1],
+                      *(np.trace(left, lag) / np.trace(left) for lag in LAGS)))
     return np.array(table).T

@@ -106,9 +106,9 @@ def test_a_section_gives_the_scale_whatever_the_heading():
     assert (found.sigma >= 0.99 * 0.02 * np.sqrt(12 / 50) / 100).all()
 
 
-@pytest.mark.parametrize('memory', [0.0, 0.8, 0.95])
-def test_the_sigma_of_a_section_holds(memory):
-    # a first-order process, 1 m, in 100 drives of 10 sections of 60 fixes each
+@pytest.mark.parametrize(('memory', 'white'), [(0.0, 0.0), (0.8, 0.0), (0.95, 0.0), (0.95, 1.0)])
+def test_the_sigma_of_a_section_holds(memory, white):
+    # a first-order process, 1 m, and white noise on it, 100 drives of 10 sections of 60 fixes
     rng = np.random.default_rng(20261101)
     way = np.arange(0.0, 6000.0, 10.0)
     z = np.stack([way, 0 * way, 0 * way], -1)
@@ -118,13 +118,13 @@ def test_the_sigma_of_a_section_holds(memory):
         for i in range(1, len(way)):
             noise[i] = memory * noise[i - 1] + np.sqrt(1 - memory**2) * noise[i]
         fixes = z.copy()
-        fixes[:, :2] += noise
+        fixes[:, :2] += noise + white * rng.standard_normal(noise.shape)
         found = sections(way, z, fixes, np.full(len(way), 3.0))
         pulls += list((found.ratio - 1.0) / found.sigma)
-    # 1000 pulls: sqrt(1 / 2000) = 2.2 % of statistics, of which three; and the process is matched
-    # to one drive, where 600 fixes of memory 0.95 are worth 15: sqrt(1 / (2 * 2 * 15)) = 13 % of
-    # its power, of which half may tell
-    assert np.std(pulls) == pytest.approx(1.0, abs=0.13)
+    # 1000 pulls: 2.2 % of statistics. The process is matched to one drive, where 600 fixes of
+    # memory 0.95 are worth 15: sqrt(1 / (2 * 2 * 15)) = 13 % of its sigma. The longer of two
+    # memories counts: bars may be too long, by a half, but not too short
+    assert 0.6 < np.std(pulls) < 1.2
     assert abs(np.mean(pulls)) < 0.1
 
 
