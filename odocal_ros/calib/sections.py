@@ -1,6 +1,7 @@
 """Scale by section of the way, each with the sigma that its own fixes leave."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +99,7 @@ def _errors(fits, stated):
             for v, (_, _, spread) in zip(level, fits, strict=True)]
 
 
+@lru_cache(maxsize=32)
 def _process(n):
     """
     Return what a line fitted to n rows of a first-order process leaves, by its memory.
