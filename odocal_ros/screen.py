@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
 from odocal_ros.fix_screen import usable_fixes
@@ -101,10 +102,13 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
     _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
+    t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
+    w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
+    f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
+    if travelled.right is not None:
+        found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
     return Inputs(
-        t_stop=(leg.stop_ns - leg.start_ns) * 1e-9, t_imu=t_imu,
-        w_b=_turned(imu.w_i, config.imu.gyro_scale, C_bi),
-        f_b=_turned(imu.f_i, config.imu.accel_scale, C_bi),
+        t_stop=t_stop, t_imu=t_imu, w_b=w_b, f_b=f_b,
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
         travel=travelled.mean, travel_left=travelled.left, travel_right=travelled.right,
         doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,

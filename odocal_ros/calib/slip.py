@@ -48,8 +48,8 @@ def find_slips(t_imu, f_b, track, f, latitude, quantum):
     span = round(WINDOW / STEP)
     if len(grid) < 2 * span:
         return np.empty(0), np.empty(0)
-    acceleration = _acceleration(grid, t_imu, f_b, track, f / K, latitude)
-    excess = _excess(span, acceleration, K * np.interp(grid, track.t, track.s))
+    a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
+    excess = excess_way(span, a, K * np.interp(grid, track.t, track.s))
     # in a turn the level error comes to bear on another axis: no window is judged there
     C = track.C_nb_at(grid)
     yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))[PINS:-PINS]
@@ -60,7 +60,7 @@ def find_slips(t_imu, f_b, track, f, latitude, quantum):
     return _events(grid[PINS:-span - PINS] + WINDOW / 2, excess, limit)
 
 
-def _acceleration(grid, t_imu, f_b, track, forward, latitude):
+def acceleration(grid, t_imu, f_b, track, forward, latitude):
     """Return the mean acceleration along the forward axis from each grid time to the next."""
     along = f_b @ forward
     total = np.concatenate([[0.0], np.cumsum((along[:-1] + along[1:]) / 2 * np.diff(t_imu))])
@@ -69,14 +69,14 @@ def _acceleration(grid, t_imu, f_b, track, forward, latitude):
     return force - gravity(latitude, 0.0) * rise
 
 
-def _excess(span, acceleration, way):
+def excess_way(span, a, way):
     """
     Return the odometer's way over each window less that by acceleration: (m,) m.
 
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
     taken as means over the same few steps, so that a jump of acceleration there does no harm.
     """
-    u = np.concatenate([[0.0], np.cumsum(acceleration) * STEP])        # speed but for a constant
+    u = np.concatenate([[0.0], np.cumsum(a) * STEP])        # speed but for a constant
     x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * STEP])
     ahead = way - x                 # its slope is what the speed by acceleration lacks
     lacks = (ahead[2 * PINS:] - ahead[:-2 * PINS]) / (2 * PINS * STEP)

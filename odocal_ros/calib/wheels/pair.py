@@ -1,0 +1,106 @@
+"""Two wheels and the gyro on one time grid, and the line that joins them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+TUKEY = 4.685        # robust sigmas beyond which a row has no weight
+PASSES = 20
+GAP = 5.0            # median intervals: what lies within is not known
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """
+    Ways of both wheels and the vehicle's turn at the edges of equal cells.
+
+    t : (n,) s.   left, right : (n,) scale units.   turn : (n,) rad about the vehicle's up axis,
+    gyro bias and all.   known : (n - 1,) cells within no gap.   quantum : scale units.
+    """
+
+    t: NDArray[np.float64]
+    left: NDArray[np.float64]
+    right: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    known: NDArray[np.bool_]
+    quantum: float
+
+    @property
+    def step(self):
+        """Return the length of a cell, s."""
+        return self.t[1] - self.t[0]
+
+
+def pair(left, right, imu, between, step, doubt_t=()) -> Pair | None:
+    """
+    Return the wheels on a grid of ``step`` s, None where they share less than 20 cells.
+
+    imu : (t, w_b, f_b), (n,) s, (n, 3), (n, 3).   between : s, the marks.   doubt_t : (d,) s.
+    """
+    t_imu, w_b, f_b = imu
+    if min(len(left.t), len(right.t), len(t_imu)) < 2:
+        return None
+    begin = max(left.t[0], right.t[0], t_imu[0], between[0])
+    end = min(left.t[-1], right.t[-1], t_imu[-1], between[1])
+    t = begin + step * np.arange(max(0, int((end - begin) / step) + 1))
+    if len(t) < 21:
+        return None
+    up_b = np.median(f_b, axis=0)          # the mean of gravity: roll and pitch of the mounting
+    rate = w_b @ (up_b / max(float(np.linalg.norm(up_b)), 1e-9))
+    turn = np.append(0.0, np.cumsum((rate[:-1] + rate[1:]) / 2 * np.diff(t_imu)))
+    known = np.ones(len(t) - 1, bool)
+    for times in (left.t, right.t, t_imu):
+        gap = np.diff(times)
+        for k in np.flatnonzero(gap > max(GAP * np.median(gap), 0.2)):
+            known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
+    for at in doubt_t:
+        known &= (t[1:] < at - step) | (t[:-1] > at + step)
+    return Pair(t, left.at(t), right.at(t), np.interp(t, t_imu, turn), known,
+                max(left.quantum, right.quantum))
+
+
+def robust_fit(A, y, floor, prior=None, start=None):
+    """
+    Return the coefficients of y = A x by least squares, rows far off left out by Tukey's weights.
+
+    Parameters
+    ----------
+    A, y : (n, k), (n,) arrays
+        Design and values.
+    floor : float
+        Least sigma of a value.
+    prior : (k,) array, optional
+        Sigmas of the coefficients about zero, inf: free.
+    start : (k,) array, optional
+        Coefficients that many rows are known to follow; default: least squares.
+
+    Returns
+    -------
+    x : (k,).   covariance : (k, k).   sigma : of a value, by the median of the residuals.
+
+    """
+    size = np.abs(A).max(axis=0)
+    size[size == 0] = 1.0
+    A = A / size
+    weak = np.zeros(A.shape[1]) if prior is None else 1 / (np.asarray(prior) * size)**2
+    weight, sigma = np.ones(len(y)), 0.0
+    x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * size
+    for turn in range(PASSES):
+        if turn or start is not None:
+            residual = y - A @ x
+            sigma = max(float(np.median(np.abs(residual))) / 0.6745, floor)
+            u = residual / (TUKEY * sigma)
+            # absolute values first (Huber): without a start Tukey's weights may settle anywhere
+            huber = start is None and turn < PASSES // 2
+            weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
+                np.abs(u) < 1, (1 - u**2)**2, 0.0)
+        H = (A * weight[:, None]).T @ A + np.diag(weak * max(sigma, floor)**2 + 1e-12 * len(y))
+        x = np.linalg.solve(H, A.T @ (weight * y))
+    return x / size, np.linalg.inv(H) * sigma**2 / np.outer(size, size), sigma
+
+
+def runs(flags):
+    """Return begin and end of the runs of True: (k, 2), ends exclusive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return edges.reshape(-1, 2)

@@ -1,0 +1,266 @@
+"""
+What the gyro says of the wheels: exchanged, one slipping, counting unlike each other.
+
+The ways of the two wheels differ by the track width times the turn. What is left of the
+difference is rounding and gyro noise, millimetres over seconds; a wheel that spins or slides on
+its own stands out of it by centimetres, where the Imu's acceleration alone sees half a metre.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.slip import acceleration, excess_way, PINS, STEP as SLIP_STEP
+from odocal_ros.calib.wheels.pair import pair, robust_fit, runs
+from odocal_ros.reasons import Code, Reason
+
+STEP = 0.1            # s, grid
+CELL = 10             # steps of a cell in the fit
+MEAN = 10             # steps the difference is averaged over at each end of a window
+GAPS = (10, 30, 80)   # steps between the ends: slips of up to 1, 3, 8 s are seen whole
+SURE = 6.0            # sigmas: a drive has some thousand windows, and sigmas have tails
+BLUR = 0.005          # m, what two tyres on real ground may do in any window, 1 sigma
+TURN_DOUBT = 0.01     # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
+TRACK = 3.0           # m, sigma of a track width that is not told
+LATE = 0.05           # s, sigma of the delay between wheels, and of wheels to Imu
+LOAD = 2e-3           # s^2/m, sigma of the change of rolling radius by sideways acceleration
+CHANCE = 5.0          # log of the odds at which a wheel is named
+BEFORE = 1.0          # s each side of a slip that acceleration is looked at
+QUIET = 0.1           # rad, turn within which acceleration tells the wheel
+NARROW = 0.1          # m: a track of less is no track
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSlips:
+    """
+    Slips of one wheel, in order of time.
+
+    begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
+    wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
+    """
+
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    size: NDArray[np.float64]
+    wheel: NDArray[np.int64]
+
+    @property
+    def t(self):
+        """Return the middle of each, s."""
+        return (self.begin + self.end) / 2
+
+
+NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
+
+
+def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, track_width=0.0,
+                 doubt_t=(), max_deviation=0.35):
+    """
+    Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
+
+    Parameters
+    ----------
+    left, right : Travel
+        Of the wheels, scale units.
+    imu : (t, w_b, f_b)
+        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
+    between : (2,)
+        The marks, s.
+    track : Track
+        Dead reckoned with their mean: attitude.
+    latitude : float
+        rad.
+    metres_per_unit : float
+        Rough scale of the mean of both.
+    track_width : float
+        m, 0 unknown.
+    doubt_t : (d,) array
+        s, where travel is in doubt for other reasons (gaps, resets).
+    max_deviation : float
+        Ratio of the counts less one, from which on it is said.
+
+    Returns
+    -------
+    Reasons (WHEELS_SWAPPED, WHEEL_COUNTERS_DIFFER, WHEEL_SLIP), and WheelSlips.
+
+    """
+    two = pair(left, right, imu, between, STEP, doubt_t)
+    if two is None or not metres_per_unit:
+        return (), NO_SLIPS
+    signals = _signals(two, metres_per_unit)
+    x, covariance = _fitted(two, signals, metres_per_unit)
+    if x is None or x[0] <= 0:
+        return (), NO_SLIPS
+    ratio = x[0]                                          # right counts over left ones
+    per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
+    reasons = _swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right)
+    reasons += _unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
+    apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
+    width = track_width or abs(x[1]) * per_right
+    events = _events(two, apart, per_right * (1 + ratio) / 2, width)
+    if not events:
+        return reasons, NO_SLIPS
+    mean = (two.left * ratio + two.right) / 2 * per_right
+    wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
+    slips = _slips(events, wheel)
+    return reasons + _slip_reason(slips), slips
+
+
+def _signals(two, metres_per_unit):
+    """
+    Return what the right way is made of, at the edges: (n, 6).
+
+    The left way, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
+    Imu's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
+    """
+    half = MEAN // 2
+    mean = (two.left + two.right) / 2
+    speed = _smooth(np.gradient(mean, two.step), half)
+    rate = _smooth(np.gradient(two.turn, two.step), half)
+    load = np.append(0.0, np.cumsum(metres_per_unit * (speed**2 * rate)[1:] * two.step))
+    return np.stack([two.left, two.turn, two.t - two.t[0], speed, rate, load], -1)
+
+
+def _smooth(x, reach):
+    padded = np.pad(x, reach, mode='edge')
+    return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
+
+
+def _fitted(two, signals, metres_per_unit):
+    """Return the coefficients of the signals by cells of a second, and their covariance."""
+    at = np.arange(0, len(two.t), CELL)
+    A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
+    keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)]
+    keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * two.quantum
+    if keep.sum() < 20:
+        return None, None
+    width = TRACK / metres_per_unit
+    prior = np.array([np.inf, width, np.inf, LATE, LATE * 1.5 / metres_per_unit, LOAD])
+    floor = 0.4 * two.quantum + 1e-3 / metres_per_unit
+    x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
+    return x, covariance
+
+
+def _swapped(width, sigma):
+    if width + SURE * sigma > 0 or width > -NARROW:
+        return ()
+    return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
+                   f'difference of the wheels give a track width of {width:.2f} m, +-'
+                   f'{sigma:.2g} m'),)
+
+
+def _unlike(ratio, width, limit):
+    """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
+    if max(ratio, 1 / ratio) <= 1 + limit:
+        return ()
+    # the mean count weighs each wheel by its counts a metre
+    off = (ratio / (1 + ratio) - 0.5) * width
+    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as much '
+                   'as the left one: the scale is that of the mean count, which stands for a '
+                   f'point {abs(off):.2f} m {"right" if off > 0 else "left"} of the middle of '
+                   'the axle'),)
+
+
+def _events(two, apart, quantum_m, width):
+    """Return (begin, end, size) of each jump of the difference: s, s, m, in order."""
+    total = np.append(0.0, np.cumsum(apart))
+    mean = (total[MEAN:] - total[:-MEAN]) / MEAN
+    unknown = np.append(0, np.cumsum(~two.known))
+    hits = np.zeros(len(two.t), bool)
+    windows = []
+    for span in (gap + MEAN for gap in GAPS):
+        jump = mean[span:] - mean[:-span]
+        if len(jump) < span:
+            continue
+        limit = _limit(two, jump, span, quantum_m * (two.quantum > 0), width)
+        far = np.abs(jump) > limit
+        far &= unknown[span + MEAN - 1:][:len(jump)] == unknown[:len(jump)]
+        for k in np.flatnonzero(far):
+            hits[k + MEAN:k + span] = True
+        windows.append((span, jump, limit, far))
+    return [_measured(two, apart, windows, a, b) for a, b in runs(hits)]
+
+
+def _limit(two, jump, span, quantum_m, width):
+    """Return how far each jump between two means may go by chance, m."""
+    n, ends = len(jump), span + MEAN - 1
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
+    turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
+    run = way[ends:][:n] - way[:n]
+    spread = np.zeros(n)
+    if (run > 0).any():
+        usual = np.median(np.abs(jump[run > 0])) / 0.6745
+        spread = usual * np.maximum(1.0, run / np.median(run[run > 0]))
+    turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
+    counts = (way[MEAN - 1:] - way[:len(way) - MEAN + 1]) / max(two.quantum, 1e-9)
+    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN)
+    # rounding is bounded: both ends of both wheels are off by a count at most
+    rounding = np.minimum(SURE**2 * (rounding[span:] + rounding[:-span]), (2 * quantum_m)**2)
+    return np.sqrt(SURE**2 * (spread**2 + BLUR**2 + turn**2) + rounding)
+
+
+def _measured(two, apart, windows, a, b):
+    """Return (begin, end, size) of the jump within steps a to b: the window that shows it best."""
+    found = (0.0, 0.0, 0, 0)
+    for span, jump, limit, far in windows:
+        low, high = max(0, a - MEAN), max(0, b - span + 1)
+        k = low + np.flatnonzero(far[low:high])
+        if len(k):
+            k = int(k[np.argmax(np.abs(jump[k]))])
+            # a longer window must show more than its own noise, or it only adds that
+            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / SURE:
+                found = (float(jump[k]), float(limit[k]), k, span)
+    size, _, k, span = found
+    inner = apart[k:k + span + MEAN]
+    base = inner[:MEAN].mean()
+    share = (inner - base) / size if size else inner
+    begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
+    late = np.flatnonzero(share >= 0.9)
+    end = int(late[late >= MEAN // 2][0]) if (late >= MEAN // 2).any() else len(inner) - 1
+    return two.t[k + min(begin, end)], two.t[k + max(begin, end)], size
+
+
+def _which(two, mean, imu, track, latitude, event):
+    """
+    Return which wheel slipped: -1, +1, or 0 where acceleration does not tell.
+
+    A slip of the right wheel by x takes the mean ahead of the Imu by x / 2, one of the left by -x
+    back by as much: the odds of the two come from how far mean and Imu part elsewhere.
+    """
+    begin, end, size = event
+    grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SLIP_STEP)
+    span = max(round((end - begin + 2 * BEFORE) / SLIP_STEP), 4 * PINS)
+    if len(grid) < 3 * span:
+        return 0
+    a = acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
+    excess = excess_way(span, a, np.interp(grid, two.t, mean))
+    turn = np.interp(grid, two.t, two.turn)[PINS:-PINS]
+    straight = np.abs(turn[span:] - turn[:-span]) < QUIET
+    at = int(np.searchsorted(grid, (begin + end) / 2)) - PINS - span // 2
+    if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
+        return 0
+    sigma = np.median(np.abs(excess[straight])) / 0.6745 + 1e-3
+    odds = excess[at] * size / sigma**2
+    return int(np.sign(odds)) if abs(odds) > CHANCE else 0
+
+
+def _slips(events, wheel):
+    begin, end, size = np.array(events).T
+    wheel = np.array(wheel, np.int64)
+    # a left wheel that spins makes right less left negative
+    return WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel)
+
+
+def _slip_reason(slips):
+    n = len(slips.size)
+    worst = int(np.argmax(np.abs(slips.size)))
+    which = ('one of the wheels', 'the right wheel', 'the left wheel')[slips.wheel[worst]]
+    done = 'parts' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
+    other = ' from the other' * (not slips.wheel[worst])
+    return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
+                   f'{100 * abs(slips.size[worst]):.0f} cm against the gyro from '
+                   f't = {slips.begin[worst]:.1f} s for '
+                   f'{max(slips.end[worst] - slips.begin[worst], STEP):.1f} s'
+                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
+                      if n > 1 else '')),)

@@ -1,0 +1,219 @@
+"""Wheels that fail one by one are named, with where; wheels that count are let be."""
+
+from dataclasses import replace
+from functools import cache
+
+from drives import changed, drive, seconds, settings
+import numpy as np
+import pytest
+
+from odocal_ros.align import align
+from odocal_ros.calib.wheels.faults import broken_wheels
+from odocal_ros.calib.wheels.slips import wheel_faults
+from odocal_ros.fix_screen import origin_amid
+from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
+from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.nav.strapdown import attitude
+from odocal_ros.reasons import Code
+from odocal_ros.screen import screen
+
+TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
+COUNT = 0.0213      # m
+
+
+@cache
+def prepared(**options):
+    """Return the inputs of a drive, its track, latitude and rough scale."""
+    made = drive(**options)
+    config = settings(made)
+    inputs, _ = screen(made.leg(), config)
+    origin = origin_amid(inputs.t_fix, inputs.geodetic)
+    fixes_n = origin.to_n(inputs.geodetic)
+    rough = rough_scale(inputs.travel, inputs.t_fix, fixes_n, 1.5)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, rough, 2.0)
+    start, _ = align(inputs, spans, rough, fixes_n, origin, config)
+    t = inputs.t_imu
+    epochs = attitude(t[t >= start.t], inputs.w_b[t >= start.t] - start.gyro_bias, start.q_nb,
+                      earth_rate_n(origin.latitude), 1)
+    return inputs, dead_reckon(*epochs, inputs.travel), origin.latitude, rough
+
+
+def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=prepared, **more):
+    """Return reasons and slips of a drive whose ways of left and right are changed."""
+    inputs, track, latitude, metres = prepare(**options)
+    wheels = [replace(w, s=change(w.s)) for w, change in (
+        (inputs.travel_left, left), (inputs.travel_right, right))]
+    imu = inputs.t_imu, inputs.w_b, inputs.f_b
+    return wheel_faults(*wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
+                        more.pop('rough', 1.0) * metres, **more)
+
+
+def spun(options, at, length, size):
+    """Return a change of a way by a spin, in whole counts, as an encoder would give it."""
+    t = prepared(**options)[0].travel_left.t
+    return lambda s: s + np.floor(np.clip((t - at) / length, 0, 1) * size / COUNT)
+
+
+def said(made, **wheels):
+    """Return what screening says of a leg whose counters are changed."""
+    leg = made.leg()
+    leg = replace(leg, **{slot: changed(getattr(leg, slot), value=change)
+                          for slot, change in wheels.items()})
+    return {r.code: r.text for r in screen(leg, settings(made))[1]}
+
+
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_a_wheel_that_never_counts_is_named(side):
+    slot = 'odometer' if side == 'left' else 'odometer_right'
+    text = said(drive(**TOWN), **{slot: lambda a: a * 0})[Code.WHEEL_DEAD]
+    assert text.startswith(f'the {side} wheel does not count')
+
+
+def test_a_wheel_that_dies_on_the_way_is_named_with_its_time():
+    made = drive(**TOWN)
+    t = seconds(made.leg(), made.odometer)
+    k = np.searchsorted(t, 100.0)
+
+    def dies(a):
+        a[k:] = a[k]
+    moves = np.flatnonzero(np.diff(made.odometer.value[k:]) > 0)[0]     # stands at a light?
+    text = said(made, odometer=dies)[Code.WHEEL_DEAD]
+    assert text.startswith('the left wheel does not count from t = ')
+    at = float(text.split('t = ')[1].split()[0])
+    # rows of 0.05 s, cells of 0.5 s, and the cell in which it dies holds counts still
+    assert abs(at - t[k + moves]) < 1.1
+    assert ' on while the right one goes on' in text
+
+
+def test_a_wheel_that_hangs_for_seconds_is_named_with_time_and_length():
+    made = drive(**TOWN)
+    t = seconds(made.leg(), made.odometer)
+    rate = np.diff(made.odometer.value) > 5
+    a, b = next((i, i + 80) for i in range(2000, 4000) if rate[i:i + 80].all())     # 4 s
+
+    def hangs(value):
+        value[b:] -= value[b] - value[a]
+        value[a:b] = value[a]
+    text = said(made, odometer_right=hangs)[Code.WHEEL_DEAD]
+    assert 'right wheel does not count 1 time, first from t = ' in text
+    begin, length = (float(text.split(x)[1].split()[0]) for x in ('t = ', ' s for '))
+    assert abs(begin - t[a]) < 1.1
+    assert abs(length - 4.0) < 1.1
+
+
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_a_reversed_wheel_is_the_one_against_the_imu(side):
+    slot = 'odometer' if side == 'left' else 'odometer_right'
+    text = said(drive(**TOWN), **{slot: lambda a: -a})[Code.WHEEL_REVERSED]
+    assert text.startswith(f'the {side} wheel counts down')
+
+
+def test_two_reversed_wheels_are_not_for_this_check():
+    found = said(drive(**TOWN), odometer=lambda a: -a, odometer_right=lambda a: -a)
+    assert not {Code.WHEEL_REVERSED, Code.WHEEL_DEAD} & set(found)
+
+
+def robot(right_speed, left_speed, track=0.5, seconds_=200.0):
+    """Return wheels and Imu of a robot whose wheels drive so, one speed a segment of 10 s."""
+    t = np.arange(0.0, seconds_, 0.02)
+    k = (t // 10).astype(int)
+    left, right = (np.cumsum(np.asarray(v)[k % len(v)]) * 0.02 for v in (left_speed, right_speed))
+    turn = (right - left) / track
+    w = np.stack([0 * t, 0 * t, np.gradient(turn, t) + 0.01], -1)
+    f = np.stack([np.gradient(np.gradient((left + right) / 2, t), t), 0 * t, 0 * t + 9.8], -1)
+    return [Travel(t, np.floor(w_ / 0.001), 1.0) for w_ in (left, right)], (t, w, f)
+
+
+def test_a_robot_may_turn_about_one_wheel_and_on_the_spot():
+    wheels, imu = robot(right_speed=[0.5, 0.5, 0.3, 0.6], left_speed=[0.5, 0.0, -0.3, 0.6])
+    assert broken_wheels(*wheels, imu, (0.0, 200.0)) == ()
+    # the same wheels with a gyro that does not turn: dead for a while, and against each other
+    still = (imu[0], imu[1] * 0, imu[2])
+    codes = {r.code for r in broken_wheels(*wheels, still, (0.0, 200.0))}
+    assert codes == {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
+
+
+def test_a_wheel_without_direction_is_named_in_reverse_gear():
+    wheels, imu = robot(right_speed=[0.5, 0.6, -0.3, 0.7, 0.3],
+                        left_speed=[0.5, 0.5, -0.3, 0.7, 0.4])
+    up = replace(wheels[1], s=np.append(0.0, np.cumsum(np.abs(np.diff(wheels[1].s)))))
+    (reason,) = broken_wheels(wheels[0], up, imu, (0.0, 200.0))
+    assert reason.code is Code.WHEEL_REVERSED
+    assert reason.text.startswith('the right wheel counts up in reverse gear too')
+    assert 'first at t = 20.' in reason.text
+
+
+def test_swapped_wheels_are_told_by_the_gyro():
+    for seed in (1, 2, 3):
+        options = TOWN | {'seed': seed}
+        reasons, _ = faults(options, swap=True)
+        assert [r.code for r in reasons] == [Code.WHEELS_SWAPPED]
+        assert 'track width of -1.' in reasons[0].text
+        assert faults(options)[0] == ()
+
+
+def test_a_drive_without_turns_does_not_tell_swapped_wheels():
+    reasons, _ = faults({'scenario': 'straight', 'duration': 300.0, 'two_wheels': True},
+                        swap=True)
+    assert reasons == ()
+
+
+@pytest.mark.parametrize(('scenario', 'seeds'), [('straight', 50), ('town', 10)])
+def test_nothing_is_said_of_clean_drives(scenario, seeds):
+    """No alarm in 50 drives: at a rate of 6 % one run of this test in 20 would see none."""
+    for seed in range(seeds):
+        options = {'scenario': scenario, 'duration': 200.0 if scenario == 'straight' else 300.0,
+                   'two_wheels': True, 'seed': seed, 'odometer': ('counts', 'angle')[seed % 2],
+                   'imu_grade': ('consumer', 'industrial')[seed // 2 % 2]}
+        for swap in (False, True)[:1 + (scenario == 'straight')]:
+            reasons, slips = faults(options, swap=swap, prepare=prepared.__wrapped__)
+            assert reasons == ()
+            assert not len(slips.t)
+
+
+@pytest.mark.parametrize('size', [0.3, 1.0, -0.5])
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_a_slip_of_one_wheel_is_named_with_place_and_size(side, size):
+    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
+    reasons, slips = faults(options, **{side: spun(options, 120.0, 1.5, size)})
+    (reason,) = reasons
+    assert reason.code is Code.WHEEL_SLIP
+    assert reason.text.startswith(f'the {side} wheel {"spins" if size > 0 else "slides"} by')
+    assert slips.wheel.tolist() == [1 if side == 'right' else -1]
+    # the mean over ten rounded rows at each end of each wheel, 5 sigma, and the count lost by
+    # rounding the spin
+    assert abs(slips.size[0] - size) < 5 * COUNT * np.sqrt(4 / 12 / 10) + COUNT
+    assert abs(slips.begin[0] - 120.0) < 0.5
+    assert abs(slips.end[0] - 121.5) < 0.5
+
+
+def test_slips_by_the_dozen_are_counted():
+    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
+    at = np.arange(60.0, 240.0, 30.0)
+    spins = [spun(options, t, 1.0, 0.4) for t in at]
+
+    def all_of_them(s):
+        for spin in spins:
+            s = spin(s)
+        return s
+    (reason,), slips = faults(options, right=all_of_them)
+    assert np.abs(slips.t - at - 0.5).max() < 0.5
+    assert slips.wheel.tolist() == [1] * len(at)
+    assert f'{len(at)} such places' in reason.text
+
+
+def test_a_place_in_doubt_already_is_not_called_a_slip():
+    options = TOWN | {'seed': 2}
+    lost = spun(options, 120.0, 0.01, 5.0)
+    assert len(faults(options, right=lost)[1].t)
+    assert faults(options, right=lost, doubt_t=(120.0,))[0] == ()
+
+
+def test_wheels_of_other_resolution_are_said_with_what_the_mean_then_is():
+    (reason,), _ = faults(TOWN, right=lambda s: 2 * s, rough=2 / 3, track_width=1.6)
+    assert reason.code is Code.WHEEL_COUNTERS_DIFFER
+    # factors 1.004 apart: the right wheel weighs 0.6657, 0.1657 of 1.6 m off the middle
+    assert 'a point 0.27 m right of the middle' in reason.text
+    assert faults(TOWN, right=lambda s: 1.3 * s)[0] == ()
