@@ -113,10 +113,10 @@ def test_the_sigma_of_a_section_holds(memory, white):
     way = np.arange(0.0, 6000.0, 10.0)
     z = np.stack([way, 0 * way, 0 * way], -1)
     pulls = []
+    steps = np.arange(len(way))
+    root = np.linalg.cholesky(memory**np.abs(np.subtract.outer(steps, steps)))
     for _ in range(100):
-        noise = rng.standard_normal((len(way), 2))
-        for i in range(1, len(way)):
-            noise[i] = memory * noise[i - 1] + np.sqrt(1 - memory**2) * noise[i]
+        noise = root @ rng.standard_normal((len(way), 2))
         fixes = z.copy()
         fixes[:, :2] += noise + white * rng.standard_normal(noise.shape)
         found = sections(way, z, fixes, np.full(len(way), 3.0))
