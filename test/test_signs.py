@@ -104,15 +104,20 @@ def test_experiments_9_and_10_compass_and_yaw():
     assert yaw[0] == pytest.approx(0.0, abs=1e-3)
     assert np.ptp(yaw) == pytest.approx(np.pi, abs=0.01)
     assert yaw[-1] > yaw[0]
-    # a topic whose zero is a quarter turn to the left needs that taken off
-    config = settings(made, None, alignment__heading_offset=-np.pi / 2)
+
+
+def test_experiment_10_the_offset_is_added_to_the_topic():
+    # a topic that points a quarter turn to the left of the Imu's x axis needs that taken off
+    made = drive(**STRAIGHT, heading_sigma=1e-4)
     q = made.heading.q_ni
     turned = np.stack([q[:, 0] - q[:, 1], q[:, 0] + q[:, 1], q[:, 2] + q[:, 3],
                        q[:, 3] - q[:, 2]], axis=1) / np.sqrt(2)     # Rz(90 deg) times q
     other = replace(made, heading=replace(made.heading, q_ni=turned))
-    there, plain = two_point(other.leg(), config), two_point(made.leg(), settings(made, None))
-    assert there.estimates['yaw_mounting_angle'].value == pytest.approx(
-        plain.estimates['yaw_mounting_angle'].value, abs=1e-6)
+    config = settings(made, None, alignment__heading_offset=-np.pi / 2)
+    there, plain = (two_point(m.leg(), c).estimates['yaw_mounting_angle'].value
+                    for m, c in ((other, config), (made, settings(made, None))))
+    assert plain == pytest.approx(made.truth.yaw, abs=1e-3)      # as good as the heading
+    assert there == pytest.approx(plain, abs=1e-9)
 
 
 @pytest.mark.parametrize('angle', ['yaw', 'pitch'], ids=['11', '12'])
