@@ -11,6 +11,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live import answers, jobs, outputs
+from odocal_ros.live.filing import Filing
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Refused, Session, State
@@ -44,7 +45,7 @@ class Operation:
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
-        self._saved = ''
+        self._filing = Filing(self._worker, self._log, self.show_status)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def tick(self) -> None:
@@ -84,7 +85,8 @@ class Operation:
             self._distance_m = self._recording.progress.distance_m()
         end_ns = session.stop_ns or self._recording.newest_imu_ns
         self._outlets.show_status(
-            self._recording, session=session, saved=self._saved, distance_m=self._distance_m,
+            self._recording, session=session, saved=self._filing.saved,
+            distance_m=self._distance_m,
             config=session.config if session.busy else self._config(),
             outlook=self._watch.outlook,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
@@ -178,26 +180,12 @@ class Operation:
         self.show_status()
         self._answer(False, text)
 
-    def _save(self, calibration: Calibration) -> Future:
+    def _save(self, calibration: Calibration, asked: bool = False) -> Future:
         """Write the result files in the worker; the future has the answer."""
-        future = Future()
-
-        def then(folder, error):
-            if error is None:
-                self._saved = str(folder)
-                future.set_result((True, f'saved to {folder}'))
-            else:
-                future.set_result((False, f'not saved: {answers.one_line(error)}'))
-            self._log.info(future.result()[1])
-            self.show_status()
-
         inputs = self._recording.inputs.by_slot
         topics = {slot: one.topic for slot, one in inputs.items() if one.reader is not None}
-        self._worker.submit(partial(
-            outputs.save, calibration, self.session.config,
-            [{'bag': '', 'sha256': None, 'topics': topics}], inputs['imu'].frame,
-            self._clock.now().nanoseconds), then)
-        return future
+        return self._filing.save(calibration, self.session.config, topics, inputs['imu'].frame,
+                                 self._clock.now().nanoseconds, asked)
 
     def _promise(self) -> Future:
         """Return a future that the outcome of the computation will be set on."""
@@ -259,6 +247,7 @@ class Operation:
         left = [leg.result for leg in self.session.begin_undo()]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
+        self._filing.withdraw(left)
         self.show_status()
         if not left:
             self._outlets.set_results(None)
@@ -283,7 +272,7 @@ class Operation:
             self.show_status()
         self._outlets.set_results(None)
         self._outlets.show_paths(jobs.leg_paths(None, self._config()))
-        self._saved = ''
+        self._filing.withdraw([])
         self.show_status()
         return True, f'reset: {len(dropped)} leg{"s" * (len(dropped) != 1)} dropped'
 
@@ -292,4 +281,4 @@ class Operation:
         if self.session.calibration is None:
             raise Refused('nothing to save: no leg has been computed yet; call ~/start_leg, '
                           'drive, ~/stop_leg')
-        return self._save(self.session.calibration)
+        return self._save(self.session.calibration, asked=True)

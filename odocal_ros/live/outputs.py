@@ -3,7 +3,6 @@
 from datetime import datetime, UTC
 import os
 from pathlib import Path
-import uuid
 
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Path as PathMessage
@@ -13,6 +12,7 @@ from std_msgs.msg import Header
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import OdocalError
+from odocal_ros.live.shelf import Shelf
 
 MOST_POSES = 2000
 
@@ -49,11 +49,12 @@ def output_root(config: Config) -> Path:
 
 
 def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
-         now_ns: int) -> Path:
+         now_ns: int, shelf: Shelf, force: bool) -> tuple[Path, str]:
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
-    ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty.
+    ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty. Returns the
+    folder, and why ``latest`` stays where it was, empty when it does not; ``force`` moves it.
 
     Raises
     ------
@@ -69,13 +70,16 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     try:
         folder = _free(root, name)
         write_results(calibration, config, folder, inputs, iso(now_ns))
-        link = root / f'.latest-{uuid.uuid4().hex}'
-        link.symlink_to(folder.name)
-        link.replace(root / 'latest')
+        stays = shelf.file(folder, marks(calibration.legs), force)
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                           'output.directory to a folder that can') from None
-    return folder
+    return folder, stays
+
+
+def marks(legs) -> frozenset[int]:
+    """Return the start marks of legs, ns: by them a session knows its legs."""
+    return frozenset(leg.start_ns for leg in legs)
 
 
 def _free(root: Path, name: str) -> Path:

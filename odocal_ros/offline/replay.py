@@ -148,9 +148,15 @@ def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.output.files import as_json, write_results
     from odocal_ros.output.summary import screen
+    from odocal_ros.output.worse import replacing, stored_in
     from odocal_ros.reasons import Verdict
     created = datetime.now(UTC).isoformat(timespec='seconds')
+    old = stored_in(output)
     written = write_results(calibration, config, output, inputs, created, force=args.force)
+    worse = replacing(old, output)
+    if worse and not args.quiet:
+        print(f'odocal: {output}: a better calibration was replaced, as --force asks: {worse}',
+              file=sys.stderr)
     if args.json:
         json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
         print()

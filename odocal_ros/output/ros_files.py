@@ -18,6 +18,8 @@ VELOCITY = 'vehicle_velocity_converter.param.yaml'
 IMU = 'imu_corrector.param.yaml'
 LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_transform.txt')
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS}
+# declared by the node for every drive; of one wheel they stay unknown
+TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
 IMU_FRAME = 'imu_link'      # REP-145, where frames.imu is left empty
 AXES = 'xyz'
 
@@ -48,7 +50,8 @@ def _params(calibration, content) -> str:
              '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
              'points left of forward',
              '/**:', '  ros__parameters:', '    result:']
-    for name, entry in content['result'].items():
+    unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
+    for name, entry in (unknown | content['result']).items():
         if name != 'imu_rotation':
             lines += [f'      {name}: {number(entry["value"])}',
                       f'      {name}_sigma: {number(entry["sigma"])}']

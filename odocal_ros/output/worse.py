@@ -54,9 +54,15 @@ def said(estimate: Estimate) -> str:
     return with_sigma(estimate.value, estimate.sigma) + unit
 
 
-def replacing(old: Path, new: Path) -> str:
-    """Return ``is_worse`` of two result folders; what cannot be read is no loss."""
+def stored_in(folder: Path) -> Stored | None:
+    """Return the calibration in a result folder, None where there is none to lose."""
     try:
-        return is_worse(read_stored(old), read_stored(new))
+        return read_stored(folder)
     except BadUsage:
-        return ''
+        return None
+
+
+def replacing(old: Stored | None, new: Path) -> str:
+    """Return ``is_worse`` of a calibration and a result folder, empty without either."""
+    found = stored_in(new)
+    return is_worse(old, found) if old and found else ''

@@ -30,7 +30,8 @@ KEYS = ['state', 'leg_id', 'leg_start_ns', 'leg_stop_ns', 'leg_event', 'distance
         'scale_factor_sigma', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad',
         'verdict', 'hint']
 ESTIMATES = ['scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle']
-RESULTS = ([f'result.{name}{end}' for name in ESTIMATES for end in ('', '_sigma')]
+OF_TWO_WHEELS = ['scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width']
+RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end in ('', '_sigma')]
            + ['result.legs', 'result.valid', 'result.stamp'])
 
 
@@ -122,9 +123,12 @@ def _undone(seen, client):
     seen.undo = client.call('undo_leg')
     seen.after_undo = client.until(leg_event='undone', legs='1')
     seen.results_after_undo = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
+    client.until(legs='1', saved=seen.saved['saved'])
+    seen.back = (seen.folder / 'latest').resolve()
     seen.save = client.call('save')
+    seen.latest = (seen.folder / 'latest').resolve()
     seen.reset = client.call('reset')
-    seen.after_reset = client.until(legs='0')
+    seen.after_reset = client.until(legs='0', saved='')
     seen.results_after_reset = dict(zip(RESULTS, client.get(*RESULTS), strict=True))
 
 
@@ -321,7 +325,7 @@ def test_cancelled_and_undone_legs_are_marked(session):
     assert session.undo.success
     assert session.after_undo['leg_id'] == '3'
     # the stamp says when it was set; all else is as after the first leg, to the last digit
-    before, after = ({k: v for k, v in r.items() if k != 'result.stamp'}
+    before, after = ({k: repr(v) for k, v in r.items() if k != 'result.stamp'}
                      for r in (session.results, session.results_after_undo))
     assert after == before
 
@@ -331,8 +335,15 @@ def test_save_and_reset(session):
     folders = sorted(p for p in session.folder.iterdir() if not p.is_symlink())
     assert len(folders) >= 2                 # autosave of each good leg, and ~/save
     saved = session.save.message.removeprefix('saved to ')
-    assert (session.folder / 'latest').resolve() == type(session.folder)(saved).resolve()
+    assert session.latest == Path(saved).resolve()
     assert session.reset.message == 'reset: 1 leg dropped'
     assert (session.after_reset['leg_event'], session.after_reset['leg_id']) == ('undone', '1')
     assert session.results_after_reset['result.valid'] is False
     assert math.isnan(session.results_after_reset['result.scale_factor'])
+
+
+def test_dropped_legs_take_the_saved_folder_and_latest_with_them(session):
+    # the folder saved after the first leg stands again when the later ones are undone
+    assert session.back == Path(session.saved['saved']).resolve()
+    assert not (session.folder / 'latest').is_symlink()
+    assert Path(session.save.message.removeprefix('saved to ')).is_dir()     # nothing removed

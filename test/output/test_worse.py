@@ -8,7 +8,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.config import Config
 from odocal_ros.output.files import write_results
 from odocal_ros.output.stored import read_stored
-from odocal_ros.output.worse import is_worse, replacing
+from odocal_ros.output.worse import is_worse, replacing, stored_in
 
 CREATED = '2026-01-02T03:04:05+00:00'
 
@@ -20,8 +20,8 @@ def why(tmp_path):
         for name, one in (('old', old), ('new', new)):
             write_results(one, Config(), tmp_path / name, [], CREATED, force=True)
         assert is_worse(read_stored(tmp_path / 'old'), read_stored(tmp_path / 'new')) \
-            == replacing(tmp_path / 'old', tmp_path / 'new')
-        return replacing(tmp_path / 'old', tmp_path / 'new')
+            == replacing(stored_in(tmp_path / 'old'), tmp_path / 'new')
+        return replacing(stored_in(tmp_path / 'old'), tmp_path / 'new')
     return run
 
 
@@ -72,5 +72,6 @@ def test_another_unit_says_nothing(why, good):
 def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):
     why(good, good)
     (tmp_path / 'old' / 'calibration.json').write_text('{}')
-    assert replacing(tmp_path / 'old', tmp_path / 'new') == ''
-    assert replacing(tmp_path / 'gone', tmp_path / 'new') == ''
+    assert stored_in(tmp_path / 'old') is stored_in(tmp_path / 'gone') is None
+    assert replacing(None, tmp_path / 'new') == ''
+    assert replacing(stored_in(tmp_path / 'new'), tmp_path / 'gone') == ''

@@ -1,0 +1,60 @@
+"""Result files on their way to the disk: written by the worker, answered by a future."""
+
+from collections.abc import Callable
+from functools import partial
+
+from rclpy.task import Future
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config
+from odocal_ros.live import answers, outputs
+from odocal_ros.live.shelf import Shelf
+from odocal_ros.live.worker import Worker
+
+
+class Filing:
+    """Saves results and takes them back; ``saved`` is the newest folder that still stands."""
+
+    def __init__(self, worker: Worker, log, show: Callable[[], None]) -> None:
+        self.saved = ''
+        self._worker, self._log, self._show = worker, log, show
+        self._shelf = Shelf()
+        self._warned: Calibration | None = None    # the operator was told that latest stays
+
+    def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
+             imu_frame: str, now_ns: int, asked: bool) -> Future:
+        """
+        Write the result files in the worker; the future has (success, text).
+
+        asked : by the operator. ``latest`` does not go to a worse result, unless he asks again.
+        """
+        future = Future()
+
+        def then(outcome, error):
+            if error is None:
+                folder, stays = outcome
+                self.saved = str(folder)
+                if stays and asked:
+                    self._warned = calibration
+                future.set_result((True, f'saved to {folder}' + (
+                    f'; latest stays where it was: {stays}; call ~/save'
+                    f'{" again" * asked} to point it here all the same' if stays else '')))
+            else:
+                future.set_result((False, f'not saved: {answers.one_line(error)}'))
+            self._log.info(future.result()[1])
+            self._show()
+
+        self._worker.submit(partial(
+            outputs.save, calibration, config, [{'bag': '', 'sha256': None, 'topics': topics}],
+            imu_frame, now_ns, self._shelf, asked and calibration is self._warned), then)
+        return future
+
+    def withdraw(self, left) -> None:
+        """Let ``latest`` and ``saved`` go back to what holds only the legs left."""
+        def then(folder, error):
+            self.saved = '' if folder is None else str(folder)
+            if error is not None:
+                self._log.warning(f'latest still shows a dropped leg: {answers.one_line(error)}')
+            self._show()
+
+        self._worker.submit(partial(self._shelf.withdraw, outputs.marks(left)), then)

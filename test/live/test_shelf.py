@@ -1,0 +1,87 @@
+"""What ``latest`` points at: the best known, never quietly a worse one."""
+
+from pathlib import Path
+
+import pytest
+
+from odocal_ros.live import shelf as module
+from odocal_ros.live.shelf import Shelf
+
+
+@pytest.fixture
+def make(tmp_path, monkeypatch):
+    """Return a function that makes a result folder; a folder named bad is worse than others."""
+    monkeypatch.setattr(module, 'stored_in',
+                        lambda path: path.resolve().name if path.exists() else None)
+    monkeypatch.setattr(module, 'replacing', lambda old, new: (
+        'it is rejected' if old and 'bad' not in old and 'bad' in new.name else ''))
+
+    def folder(name):
+        (tmp_path / name).mkdir()
+        return tmp_path / name
+    return folder
+
+
+def latest(tmp_path):
+    link = tmp_path / 'latest'
+    return link.readlink() if link.is_symlink() else None
+
+
+def test_latest_goes_with_each_result_but_not_to_a_worse_one(make, tmp_path):
+    shelf = Shelf()
+    assert shelf.file(make('a'), frozenset({1}), False) == ''
+    assert shelf.file(make('b'), frozenset({1, 2}), False) == ''
+    assert latest(tmp_path) == Path('b')
+    bad = make('bad')
+    assert shelf.file(bad, frozenset({1, 2, 3}), False) == 'it is rejected'
+    assert latest(tmp_path) == Path('b')
+    assert shelf.file(bad, frozenset({1, 2, 3}), True) == ''
+    assert latest(tmp_path) == Path('bad')
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['a', 'b', 'bad', 'latest']
+
+
+def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
+    Shelf().file(make('old'), frozenset({1}), False)
+    shelf = Shelf()
+    assert shelf.file(make('bad'), frozenset({2}), False) == 'it is rejected'
+    assert latest(tmp_path) == Path('old')
+
+
+def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
+    Shelf().file(make('old'), frozenset({0}), False)
+    shelf = Shelf()
+    a = make('a')
+    shelf.file(a, frozenset({1}), False)
+    shelf.file(make('b'), frozenset({1, 2}), False)
+    shelf.file(make('c'), frozenset({1, 2}), False)
+    assert shelf.withdraw(frozenset({1})) == a
+    assert latest(tmp_path) == Path('a')
+    assert shelf.withdraw(frozenset()) is None
+    assert latest(tmp_path) == Path('old')
+    assert shelf.withdraw(frozenset()) is None
+
+
+def test_undo_of_the_first_result_of_all_leaves_no_latest(make, tmp_path):
+    shelf = Shelf()
+    shelf.file(make('a'), frozenset({1}), False)
+    shelf.withdraw(frozenset())
+    assert latest(tmp_path) is None
+    assert (tmp_path / 'a').is_dir()
+
+
+def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
+    shelf = Shelf()
+    shelf.file(make('a'), frozenset({1}), False)
+    Shelf().file(make('other'), frozenset({5}), False)
+    shelf.withdraw(frozenset())
+    assert latest(tmp_path) == Path('other')
+
+
+def test_a_target_that_is_gone_is_not_linked_again(make, tmp_path):
+    old = make('old')
+    Shelf().file(old, frozenset({0}), False)
+    shelf = Shelf()
+    shelf.file(make('a'), frozenset({1}), False)
+    old.rmdir()
+    shelf.withdraw(frozenset())
+    assert latest(tmp_path) is None
