@@ -37,13 +37,15 @@ def wheels(leg, config, rows, found) -> Wheels:
         left, doubt_t, doubt = _one(samples, t, leg.form, config, found)
         return Wheels(left, None, None, doubt_t, doubt)
     form_right = leg.form_right or leg.form
-    left, t_left, doubt_left = _one(*rows('odometer'), leg.form, config, found, 'left')
+    samples, t = rows('odometer')
+    left, t_left, doubt_left = _one(samples, t, leg.form, config, found, 'left')
     if _kind(form_right) != _kind(leg.form):
         found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, 'the right wheel sends '
                             f'{_words(form_right)}, the left one {_words(leg.form)}: they have '
                             'no mean, so the left wheel is taken alone'))
         return Wheels(left, None, None, t_left, doubt_left)
-    right, t_right, doubt_right = _one(*rows('odometer_right'), form_right, config, found, 'right')
+    samples, t = rows('odometer_right')
+    right, t_right, doubt_right = _one(samples, t, form_right, config, found, 'right')
     mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
     return Wheels(mean, left, right, np.append(t_left, t_right),
                   np.append(doubt_left, doubt_right) / 2)
