@@ -1,9 +1,9 @@
 """The pages keep their word: commands parse, names exist, tables are those of the code."""
 
-from pathlib import Path
 import re
 import shlex
 
+from pages import commands, PAGES, ROOT
 import pytest
 
 from odocal_ros import settings_page
@@ -11,16 +11,7 @@ from odocal_ros.offline import cli
 from odocal_ros.reasons import Code
 from odocal_ros.reasons_page import MEANINGS
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
-
-
-def commands(page: str) -> list[str]:
-    """Return the lines of code blocks without their comments, and code spans of odocal."""
-    blocks = re.findall(r'^```\n(.*?)^```', page, re.MULTILINE | re.DOTALL)
-    lines = [line.partition('  #')[0].strip() for block in blocks for line in block.splitlines()]
-    return lines + re.findall(r'`(odocal [^`]+)`', page)
 
 
 @pytest.mark.parametrize('path', [*settings_page.pages()], ids=lambda path: path.name)

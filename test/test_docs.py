@@ -1,0 +1,125 @@
+"""Every command in README and docs is run, here or where the table of the others says."""
+
+import json
+import re
+import shlex
+import shutil
+
+from drives import drive
+from pages import all_commands, blocks, PAGES, ROOT, yaml_blocks
+import pytest
+
+from odocal_ros.bagio.encode import counter, fix, imu
+from odocal_ros.bagio.write import write_bag
+from odocal_ros.config_file import read_config_file
+from odocal_ros.offline import cli
+
+# what begins otherwise than with odocal or ros2, and what runs it instead of this file
+ELSEWHERE = {
+    './tools/try-it': 'installs for a minute: run by hand and by the README of a release',
+    './tools/test': '.ci/run runs it',
+    '.ci/run': 'runs these tests',
+    '.venv/bin/ruff': '.ci/run runs it',
+    'export': 'for pip inside rosdep',
+    'rosdep': 'needs its database from the network',
+    'colcon': 'test_package.py builds with colcon and starts what it installed',
+    'source': 'of what colcon installed: test_package.py starts that',
+}
+RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed
+KNOWN = {'odocal', 'ros2', *ELSEWHERE}
+STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk'}
+OPTIONS = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic'}
+DEFAULTS = {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
+
+
+def page_of(name):
+    return (ROOT / name).read_text(encoding='utf-8')
+
+
+def test_each_block_is_of_commands_that_somebody_runs():
+    seen = set()
+    for page in PAGES:
+        for block in blocks(page.read_text(encoding='utf-8')):
+            if block[0].startswith(RESULTS):
+                continue
+            for line in block:
+                word = shlex.split(line)[0]
+                assert word in KNOWN, f'{page.name}: {line}: run it in a test, or say where'
+                seen.add(word)
+    assert seen == KNOWN, 'no longer on any page: take it out of the table'
+
+
+def put_bag(folder, words, named):
+    """Write the bag that a command reads, its topics named as the command names them."""
+    made = drive(**STRAIGHT)
+    names = DEFAULTS | named | {slot: words[words.index(option) + 1]
+                                for slot, option in OPTIONS.items() if option in words}
+    write_bag(folder / words[1], [imu(names['imu'], made.imu), fix(names['fix'], made.fix),
+                                  counter(names['odometer'], made.odometer)])
+
+
+def put_results(folder, names):
+    """Write result folders to compare, of drives that differ by their noise alone."""
+    for k, name in enumerate(names):
+        made = drive(**STRAIGHT, seed=k + 1)
+        write_bag(folder / f'bag_{k}', [imu('/imu/data', made.imu), fix('/fix', made.fix),
+                                        counter('/odometer', made.odometer)])
+        code = cli.main(['replay', str(folder / f'bag_{k}'), '--output', str(folder / name),
+                         '--quiet'])
+        assert code in (0, 1)
+        shutil.rmtree(folder / f'bag_{k}')
+
+
+@pytest.mark.parametrize(('page', 'line'), all_commands('odocal'), ids=lambda text: text[:60])
+def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd):
+    words = shlex.split(line)[1:]
+    if len(words) == 1 or any(word.isupper() or word == '...' for word in words):
+        pytest.skip('a mention, no command line; test/offline runs the command')
+    monkeypatch.chdir(tmp_path)
+    for text in yaml_blocks(page_of(page)):
+        (tmp_path / 'my_vehicle.yaml').write_text(text)
+    if words[0] in ('replay', 'inspect'):
+        put_bag(tmp_path, words, {'odometer': '/ticks'} if page == 'README.md' else {})
+    if words[0] == 'compare':
+        put_results(tmp_path, [w for w in words[1:] if not w.startswith('-')])
+    capfd.readouterr()
+    code = cli.main(words)
+    out, err = capfd.readouterr()
+    assert code == 0, err
+    if words[0] == 'replay':
+        content = json.loads((tmp_path / 'odocal_drive' / 'calibration.json').read_text())
+        scale = content['result']['scale_factor']
+        truth = drive(**STRAIGHT).truth.scale
+        assert abs(scale['value'] - truth) < 4 * scale['sigma']
+        told = page_of('docs/report.md').partition('holds all of it')[2].partition('The other')[0]
+        assert set(re.findall(r'`(\w+)`', told)) <= set(content)
+    elif words[0] == 'simulate':
+        assert {p.name for p in tmp_path.iterdir()} >= {'drive', 'truth.yaml'}
+    elif words[0] == 'plan':
+        assert 'predicted sigma' in out
+    elif words[0] == 'inspect':
+        assert '<- imu' in out
+        assert 'try' in out
+    else:
+        assert out
+
+
+def test_settings_files_on_the_pages_are_taken(tmp_path):
+    texts = [text for page in PAGES for text in yaml_blocks(page.read_text(encoding='utf-8'))
+             if 'ros__parameters' in text]
+    assert texts
+    for text in texts:
+        (tmp_path / 'mine.yaml').write_text(text)
+        assert len(read_config_file(tmp_path / 'mine.yaml')) > 3
+
+
+def test_a_plan_says_what_the_page_quotes(capsys):
+    words = [shlex.split(line)[1:] for page, line in all_commands('odocal')
+             if page == 'docs/first_calibration.md' and ' plan ' in line]
+    sigmas = []
+    for command in words:
+        assert cli.main([*command, '--json']) == 0
+        sigmas.append(json.loads(capsys.readouterr().out))
+    found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma']
+             for plan in sigmas]
+    assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)
