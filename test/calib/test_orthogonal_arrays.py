@@ -130,7 +130,8 @@ def test_the_small_array_is_nearly_balanced_and_says_by_how_much():
 @pytest.mark.parametrize(('levels', 'rows', 'balanced'), [
     ((1, 1, 1), 1, True), ((2, 2, 2), 8, True), ((3, 3, 3), 9, True), ((7, 7, 7), 49, True),
     ((4, 4, 4), 16, True), ((6, 6, 6), 49, False), ((7, 7, 9), 81, False), ((3, 3, 1), 9, True),
-    ((2, 2, 3), 9, False), ((2, 1, 9), 18, True)])
+    ((2, 2, 3), 9, False), ((2, 1, 9), 18, True),
+    ((2, 2, 5), 20, True)])
 def test_the_design_follows_the_levels(levels, rows, balanced):
     design = design_for(levels)
     assert design.rows.shape == (rows, 3)

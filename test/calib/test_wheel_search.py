@@ -160,8 +160,10 @@ def test_course_differs_by_what_the_track_is_turned_by():
     found = score(leg, TRUE + off[:, None] * [0.0, 0.0, 1.0])
     assert_allclose(found.course_mean, off, atol=1e-12)
     assert_allclose(found.course_rms, np.abs(off), atol=1e-12)
+    assert score(leg, TRUE + [0.0, 0.0, 2 * np.pi]).course_rms[0] < 1e-12
     half_turned = score(leg, TRUE + [0.0, 0.0, np.pi - 1e-9])
     assert abs(half_turned.course_mean[0]) == pytest.approx(np.pi)
+    assert half_turned.course_rms[0] == pytest.approx(np.pi)
     still = replace(leg, pieces=course_pieces(np.zeros((50, 2)), np.ones(50)))
     assert score(still, TRUE).row(0)['course_mean_deg'] is None
 
@@ -252,6 +254,17 @@ def test_a_surface_lowers_the_other_criteria_too(criterion):
     assert found.x[2] == pytest.approx(TRUE[2], abs=0.005)
 
 
+@pytest.mark.parametrize('space', [FREE, HELD], ids=['free', 'together'])
+@pytest.mark.parametrize('beyond', [0.051, 0.06, 0.3])
+def test_the_range_is_kept_where_it_may_not_be_widened(space, beyond):
+    def cone(x):       # a ridge between wheels that differ, its tip outside the range
+        return np.abs(x[:, 0] - beyond) + 3 * np.abs(x[:, 1] - beyond) + np.abs(x[:, 2])**0.5
+    found = refine(cone, np.array([0.03, 0.02, 0.01]), RANGES.step, RANGES.half, space,
+                   widen=False)
+    assert (np.abs(found.x) <= RANGES.half * (1 + 1e-12)).all()
+    assert not found.widened
+
+
 # the whole search
 
 
@@ -323,7 +336,9 @@ def test_a_search_without_end_ends_and_says_so():
     assert found.refined.on_edge
     assert_allclose(found.refined.half[:2], 0.9)
     nothing = replace(leg, left_n=0 * leg.left_n, right_n=0 * leg.right_n)
-    assert search(nothing, RANGES).held
+    blind = search(nothing, RANGES)
+    assert blind.held
+    assert json.loads(json.dumps(blind.as_dict(), allow_nan=False))['condition_number'] is None
     assert search(replace(leg, t=leg.t[:3], left_n=leg.left_n[:3], right_n=leg.right_n[:3],
                           fixes_n=leg.fixes_n[:3], sigma=leg.sigma[:3]), RANGES) is None
 
@@ -393,6 +408,18 @@ def test_the_formal_sigma_holds_for_white_fixes():
     # repeats() counts chance likeness of white residuals, so sigmas are wide rather than narrow
     assert (z.var(axis=0) < 1 + 4 * (2 / runs)**0.5).all()
     assert (z.var(axis=0) > 0.6).all()
+
+
+def test_the_mean_of_both_wheels_is_known_where_their_difference_is_not():
+    _, leg = simulated(**DRIVES['straight'])
+    free, held = (least_squares(leg, np.zeros(3), space) for space in (FREE, HELD))
+    mean = np.array([0.5, 0.5, 0.0])
+    assert held.sigma[0] == held.sigma[1]
+    assert held.correlation[0, 1] == pytest.approx(1.0)
+    # the same straight line, fitted with and without a third parameter that it does not see
+    assert held.sigma[0] < 0.01 * free.sigma[0]
+    assert held.sigma[0] <= np.sqrt(mean @ free.covariance @ mean) * 1.01
+    assert held.condition < 10 < free.condition
 
 
 def test_residuals_alike_in_a_row_count_as_fewer():

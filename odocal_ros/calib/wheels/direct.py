@@ -27,8 +27,9 @@ class LeastSquares:
     What least squares say; x as in ``space``.
 
     covariance : (3, 3) of x by the scatter of the residuals, those alike in a row counted as
-        fewer; of left, right and heading free, also where the difference was held.
-    condition : of the Jacobian by relative left, right scale and heading in rad.
+        fewer; where the difference was held, left and right err alike. Errors of start, gyro and
+        lever arm are not in it.
+    condition : of the Jacobian by relative left, right scale (or both) and heading in rad.
     sigma_difference : of right less left, relative; besides the scatter it allows for a track
         bent by BENT of the way, which the difference of the wheels would explain as well.
     """
@@ -88,7 +89,7 @@ def least_squares(leg: PlanarLeg, x, space: Space, robust: bool = False) -> Leas
         settled = bool(np.abs(step).max() < SETTLED) or \
             bool(np.abs(step).max() < 1e3 * SETTLED and lower == value)
         q, r, J, value = q + step, new, J_new, lower
-    covariance, condition = _spread(leg, r, J, robust)
+    covariance, condition = _spread(leg, r, J, space, robust)
     return LeastSquares(space.T @ q, value, iterations, settled, covariance, condition,
                         _sigma_difference(J, covariance))
 
@@ -120,17 +121,18 @@ def _solve(A, b):
     return np.linalg.lstsq(A / size, b, rcond=1e-14)[0] / size
 
 
-def _spread(leg, r, J, robust):
+def _spread(leg, r, J, space, robust):
     """Return covariance of x and condition number."""
     w = np.tile(weights(_d2(r), leg.sigma, robust), 2)
-    s = np.linalg.svd(J, compute_uv=False)
+    s = np.linalg.svd(J @ space.T if space.held else J, compute_uv=False)
     condition = float(s[0] / s[-1]) if s[-1] > 1e-15 * s[0] else np.inf
     root = np.sqrt(w)
-    _, s, vt = np.linalg.svd(root[:, None] * J, full_matrices=False)
+    _, s, vt = np.linalg.svd(root[:, None] * (J @ space.T), full_matrices=False)
     s = np.maximum(s, 1e-15 * max(s[0], 1e-300))     # what is not seen at all: a huge sigma
-    freedom = max(len(r) - 3, 1)
+    freedom = max(len(r) - len(s), 1)
+    to_x = space.T @ (vt.T / s)
     rows = (root * r).reshape(2, -1)
-    return (vt.T / s**2) @ vt * ((rows**2).sum() / freedom * repeats(rows)), condition
+    return to_x @ to_x.T * ((rows**2).sum() / freedom * repeats(rows)), condition
 
 
 def _sigma_difference(J, covariance):

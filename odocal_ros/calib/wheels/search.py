@@ -33,14 +33,16 @@ class SearchResult:
     """
     What the search found; parameter sets are left and right scale (m per unit), heading (rad).
 
-    sets, scores : of the array's rows.   best : the row with the least mean distance.
-    meets : whether its maximum and mean are within the asked accuracy, None where none is asked.
+    start : scales before, m per unit.   sets, scores : of the array's rows.
+    best : the row with the least mean distance (robust: loss), ties by the largest.
+    meets : its maximum and mean are within the asked accuracy, None where none is asked.
     refined : by response surfaces.   direct : by least squares.   free : least squares with left
     and right free; the same unless held.   held : the fixes do not tell left from right, and
     their ratio was kept at the start values.   before, after : criteria of the start values and
     of the refined ones, one row each.
     """
 
+    start: tuple[float, float]
     ranges: Ranges
     design: Design
     sets: NDArray[np.float64]
@@ -80,7 +82,8 @@ class SearchResult:
                 f'{name}_{place}': getattr(surface, name) for name in ('r_squared', 'lack_of_fit')
                 for place, surface in (('first', r.first), ('last', r.last))},
             'least_squares': _set(self.direct_set) | {
-                'iterations': d.iterations, 'settled': d.settled},
+                'iterations': d.iterations, 'settled': d.settled,
+                'formal_sigma': _set(d.sigma * [*self.start, 1.0])},
             'condition_number': _finite(self.free.condition),
             'correlation': [[float(c) for c in row] for row in self.free.correlation],
             'sigma_right_less_left': _finite(self.free.sigma_difference),
@@ -142,9 +145,9 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     refined = _refined(leg, x[best], ranges, space, robust)
     refined_set, direct_set = (_wrapped(sets_of(leg, found.x)[0]) for found in (refined, direct))
     return SearchResult(
-        ranges, design, sets, scores, best, meets, held, refined, direct, free, refined_set,
-        direct_set, score(leg, leg.start, robust), score(leg, refined_set, robust),
-        _reasons(ranges, refined, direct, free, held))
+        (leg.scale_left, leg.scale_right), ranges, design, sets, scores, best, meets, held,
+        refined, direct, free, refined_set, direct_set, score(leg, leg.start, robust),
+        score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
 
 
 def _refined(leg, x, ranges, space, robust) -> Refined:
