@@ -13,6 +13,7 @@ from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
 from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
@@ -26,6 +27,7 @@ EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 FEWEST_FIXES = 3        # for a check of the track
 FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
+BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 TRACK_ROWS = 5000       # of a track kept in a result
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
@@ -183,10 +185,23 @@ class LegRun:
             self.reasons += why
         self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
         self.track = self.reckon(inputs.travel)
+        self.wheel_slips = self._faults()
         self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
         self.reasons += found
         if self.holdout:
             self.t_fit = self._four_fifths()
+
+    def _faults(self):
+        """Say what is wrong with two wheels beside each other; return where one slipped."""
+        inputs, odometer = self.inputs, self.config.odometer
+        if inputs.travel_right is None or BROKEN & {r.code for r in self.reasons}:
+            return NO_SLIPS
+        found, slips = wheel_faults(
+            inputs.travel_left, inputs.travel_right, (inputs.t_imu, inputs.w_b, inputs.f_b),
+            (0.0, inputs.t_stop), self.track, self.origin.latitude, self.rough,
+            odometer.track_width, inputs.doubt_t, odometer.max_scale_deviation)
+        self.reasons += found
+        return slips
 
     def reckon(self, travel):
         """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""

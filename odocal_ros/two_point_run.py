@@ -16,7 +16,7 @@ from odocal_ros.calib.check import (
     track_check,
 )
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.slip import find_slips, slip_reason
+from odocal_ros.calib.slip import find_slips, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.nav.rotations import matrix_from_quat
@@ -59,17 +59,24 @@ class TwoPointRun:
         factor = np.ones(3)
         if between.sum() >= 3:
             chord, factor = self._judged(chord, f, between)
-        slips = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track, solve(
-            chord, factor[2])[0], self.run.origin.latitude, self.inputs.travel.quantum)
-        held = (slips[0] >= chord.start.t) & (slips[0] <= chord.end.t)
-        chord = replace(chord, slips=tuple(x[held] for x in slips))
-        self.run.reasons += slip_reason(*chord.slips)
+        chord = replace(chord, slips=self._slips(chord, solve(chord, factor[2])[0]))
         method = fit(chord, self.run.nominal, self.inputs.scale_unit, self.inputs.travel.quantum,
                      factor, self.config)
         self._reversed(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
             method.estimates, self.run.nominal, self.config)))
         return method, self.run.path(method.details['f'])
+
+    def _slips(self, chord, f):
+        """Return slips of the mean between the marks, s and m; name those not named already."""
+        t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track, f,
+                             self.run.origin.latitude, self.inputs.travel.quantum)
+        one = self.run.wheel_slips      # of one wheel: half of it goes into the mean
+        known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
+        held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
+        self.run.reasons += slip_reason(t[held], size[held])
+        inside = (one.t >= chord.start.t) & (one.t <= chord.end.t)
+        return np.append(t[held], one.t[inside]), np.append(size[held], one.size[inside] / 2)
 
     def _chord(self):
         """Return the chord between the marks, or None and say why."""
