@@ -26,7 +26,7 @@ def is_worse(old: Stored, new: Stored) -> str:
     if not new.usable:
         codes = ', '.join(dict.fromkeys(new.reasons[:3]))
         return f'the new one is rejected ({codes}), the old one is {old.verdict.value}'
-    if old.legs and old.legs <= new.legs:
+    if old.legs and old.legs < new.legs:
         return ''
     for name in JUDGED:
         why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))

@@ -79,7 +79,10 @@ def test_fixes_without_a_height_have_two_coordinates(driven):
 
 
 def test_a_line_over_the_180th_meridian_is_cut_there(driven):
-    leg = replace(driven.legs[0], origin=tuple(np.deg2rad([-17.0, 179.995])) + (0.0,))
+    track = driven.legs[0].track_n + [0.0, 0.0, 5.0]
+    track[:, 1] = track[:, 0]           # to the north-east
+    leg = replace(driven.legs[0], origin=tuple(np.deg2rad([-17.0, 179.9952])) + (0.0,),
+                  track_n=track)
     line = of_kind(replace(driven, legs=(leg,)), 'corrected')[0]['geometry']
     assert line['type'] == 'MultiLineString'
     west, east = (np.array(piece) for piece in line['coordinates'])
@@ -89,8 +92,11 @@ def test_a_line_over_the_180th_meridian_is_cut_there(driven):
     assert (west[:, 0] > 179).all()
     assert (east[:, 0] < -179).all()
     assert len(west) + len(east) == 21 + 2
-    step = np.diff(west[:, 0])
-    assert 0 < step[-1] <= step[0] * 1.001
+    # the cut lies on the line: as far north as the way to the east asks, to the digits kept
+    share = (180.0 - west[-2, 0]) / (east[1, 0] + 360.0 - west[-2, 0])
+    assert 0.1 < share < 0.9
+    assert west[-1, 1] == pytest.approx(west[-2, 1] + share * (east[1, 1] - west[-2, 1]),
+                                        abs=2e-8)
 
 
 def test_a_long_leg_is_thinned_and_says_so(driven):

@@ -63,6 +63,7 @@ def test_more_legs_know_better_even_with_a_larger_sigma(why, good):
     both = replace(wider, legs=(*good.legs, *wider.legs))
     assert why(good, both) == ''
     assert why(good, wider) != ''
+    assert why(good, replace(wider, legs=good.legs)) != ''      # the same legs, other settings
 
 
 def test_another_unit_says_nothing(why, good):

@@ -1,0 +1,66 @@
+"""The answer of ~/save, and what it takes to put a worse result in the place of a good one."""
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
+
+from bench import wait_for
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config, with_settings
+from odocal_ros.live.filing import Filing
+from odocal_ros.live.worker import Worker
+from odocal_ros.reasons import Code, Reason
+
+NOW_NS = 10**18
+GOOD = Calibration((), {}, {}, ())
+BAD = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Return a function that saves a calibration and returns the answer and where latest is."""
+    worker = Worker()
+    log = SimpleNamespace(info=lambda text: None, warning=lambda text: None)
+    filing = Filing(worker, log, lambda: None)
+    config = with_settings(Config(), {'output.directory': str(tmp_path)})
+
+    def run(calibration, asked=True):
+        future = filing.save(calibration, config, {}, 'imu_link', NOW_NS, asked)
+
+        def done():
+            worker.poll()
+            return future.done()
+        wait_for(done, 'the answer of save')
+        success, text = future.result()
+        assert success
+        assert filing.saved in text
+        return text, (tmp_path / 'latest').resolve().name == filing.saved.rpartition('/')[2]
+    yield run
+    worker.close()
+
+
+def test_a_worse_result_needs_the_second_save(save):
+    assert save(GOOD)[1]
+    text, latest = save(BAD)
+    assert not latest
+    assert 'latest stays where it was: the new one is rejected (NO_FIX)' in text
+    assert 'call ~/save again' in text
+    assert save(BAD)[1]
+
+
+def test_the_saves_of_the_node_itself_do_not_count(save):
+    assert save(GOOD, asked=False)[1]
+    for _ in range(2):
+        assert not save(BAD, asked=False)[1]
+    assert not save(BAD)[1]
+    assert save(BAD)[1]
+
+
+def test_a_warning_holds_for_its_own_result_only(save):
+    save(GOOD)
+    save(BAD)
+    other = Calibration(BAD.reasons, {}, {}, ())
+    assert not save(other)[1]
