@@ -2,6 +2,7 @@
 What the node costs while it records: beside a bare typed subscriber of the same topics.
 
     python benchmarks/live_load.py [--seconds 20] [--imu 1000] [--odometer 250] [--fix 25]
+                                    [--no-journal]
 
 A publisher process sends Imu, pulses and fixes; the calibrator and a bare rclpy node that
 subscribes to the same topics, typed, with an empty callback, run beside it, all at once. Printed:
@@ -102,7 +103,8 @@ def measure(args) -> None:
     rates = (args.imu, args.odometer, args.fix)
     me = [sys.executable, __file__]
     folder = tempfile.mkdtemp()
-    node = NodeProcess('-p', f'output.directory:={folder}')
+    node = NodeProcess('-p', f'output.directory:={folder}',
+                       *(('-p', 'journal.max_bytes:=0') if args.no_journal else ()))
     bare = subprocess.Popen([*me, '--role', 'listen'])
     client = Client()
     client.until(state='waiting')
@@ -166,6 +168,7 @@ def main() -> None:
     parser.add_argument('--imu', type=float, default=1000.0)
     parser.add_argument('--odometer', type=float, default=250.0)
     parser.add_argument('--fix', type=float, default=25.0)
+    parser.add_argument('--no-journal', action='store_true')
     parser.add_argument('--role', choices=('publish', 'listen'), help=argparse.SUPPRESS)
     parser.add_argument('--rates', nargs=3, type=float, help=argparse.SUPPRESS)
     args = parser.parse_args()

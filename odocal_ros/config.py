@@ -191,6 +191,13 @@ class OutputConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JournalConfig:
+    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk for the journals of legs '
+                             '(journal/ under output.directory); the oldest go first. 0: no '
+                             'journal.')
+
+
+@dataclass(frozen=True, kw_only=True)
 class PublishConfig:
     rate: float = setting(2.0, 'Hz', 0.1, 20.0, ro=True, about='Rate of the status message.')
 
@@ -224,6 +231,7 @@ class Config:
     projection: ProjectionConfig = ProjectionConfig()
     verdict: VerdictConfig = VerdictConfig()
     output: OutputConfig = OutputConfig()
+    journal: JournalConfig = JournalConfig()
     publish: PublishConfig = PublishConfig()
     frames: FramesConfig = FramesConfig()
     diagnostic_updater: UpdaterConfig = UpdaterConfig()

@@ -7,6 +7,7 @@ import re
 import shutil
 import sqlite3
 
+from odocal_ros.bagio.numbered import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
@@ -75,6 +76,8 @@ def _folder(path: Path) -> Source:
                      f'missing ({", ".join(lost)}); the others are read')
     if not files:
         files = sorted((f for f in path.iterdir() if f.name.endswith(ENDINGS)), key=_by_number)
+        if (path / JOURNAL).exists():
+            files = without_joined(files)
         if not files:
             raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint(path)}')
         what = 'names no file that is here' if known else 'is missing'

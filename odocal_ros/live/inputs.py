@@ -257,6 +257,11 @@ class Inputs:
         return [one.why() for one in self.required(config) if not one.flowing()]
 
     @property
+    def topics(self) -> dict[str, str]:
+        """Return slot -> topic of those that are listened to."""
+        return {slot: one.topic for slot, one in self.by_slot.items() if one.reader is not None}
+
+    @property
     def form(self):
         """Return the form of the odometer's values, None until its type is known."""
         reader = self.by_slot['odometer'].reader

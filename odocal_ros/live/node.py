@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.answers import one_line
+from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.recording import Recording
@@ -55,8 +56,10 @@ class Calibrator(Node):
         self.config = params.declare(self)
         params.declare_results(self)
         self.outlets = Outlets(self)
-        self.recording = Recording(self, self.config, self._remember)
-        self.operation = Operation(self, self.recording, self.outlets, lambda: self.config)
+        self.journal = Journal(self, self.outlets.status_topic)
+        self.recording = Recording(self, self.config, self.journal.remember)
+        self.operation = Operation(self, self.recording, self.outlets, self.journal,
+                                   lambda: self.config)
         self._lock = threading.RLock()  # for executors with several threads
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._due_ns = dict.fromkeys(('look', 'diagnostics', 'status'), 0)
@@ -71,8 +74,8 @@ class Calibrator(Node):
         self.create_timer(TICK_S, self._tick, clock=self._steady)
 
     def destroy_node(self) -> None:
-        """End worker and clock callbacks with the node."""
-        for part in ('operation', 'recording'):
+        """End worker, journal and clock callbacks with the node."""
+        for part in ('operation', 'journal', 'recording'):
             if hasattr(self, part):
                 getattr(self, part).close()
         super().destroy_node()
@@ -125,9 +128,6 @@ class Calibrator(Node):
         on_time = self._due_ns[task] + period_ns
         self._due_ns[task] = on_time if on_time > now_ns else now_ns + period_ns
         return True
-
-    def _remember(self, source, raws: list[bytes], sent_ns: list[int]) -> None:
-        """Take every raw message in order of arrival: the journal's place."""
 
     async def _serve(self, act, _request, response):
         """Answer a Trigger with what ``act`` returns, or the future it returns brings."""

@@ -12,6 +12,7 @@ from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live import answers, jobs, outputs
 from odocal_ros.live.filing import Filing
+from odocal_ros.live.journal import Journal
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Refused, Session, State
@@ -32,10 +33,11 @@ class Operation:
     raised. Nothing blocks: the heavy work runs in the worker thread.
     """
 
-    def __init__(self, node, recording: Recording, outlets: Outlets,
+    def __init__(self, node, recording: Recording, outlets: Outlets, journal: Journal,
                  config: Callable[[], Config]) -> None:
         self.session = Session()
         self._recording, self._outlets, self._config = recording, outlets, config
+        self._journal = journal
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._worker = Worker()
         self._watch = Watch(self._worker, self._log)
@@ -58,6 +60,7 @@ class Operation:
         self._close_when_complete()
         if self.session.state is State.RECORDING:
             self._watch.look(self._recording.newest_imu_ns)
+        self._journal.tick(self._config(), self.session.busy)
 
     def pump(self) -> None:
         """Decode what has arrived."""
@@ -77,6 +80,7 @@ class Operation:
         else:
             self._log.warning('time jumped: the samples so far are dropped')
         self._recording.start_anew()
+        self._journal.start_anew()
 
     def show_status(self) -> None:
         """Publish the status as it is now."""
@@ -84,12 +88,14 @@ class Operation:
         if session.state is State.RECORDING:
             self._distance_m = self._recording.progress.distance_m()
         end_ns = session.stop_ns or self._recording.newest_imu_ns
-        self._outlets.show_status(
+        array = self._outlets.show_status(
             self._recording, session=session, saved=self._filing.saved,
             distance_m=self._distance_m,
             config=session.config if session.busy else self._config(),
             outlook=self._watch.outlook,
+            journal=self._journal.folder, journal_trouble=self._journal.trouble,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
+        self._journal.hear(session, array)
 
     # a leg's way
 
@@ -124,6 +130,7 @@ class Operation:
         late = self._steady.now().nanoseconds > self._close_by_ns
         if late or self._recording.passed(self.session.stop_ns):
             self._close_by_ns = None
+            self._journal.end()
             self._snapshot = self._recording.snapshot()
             self._compute(self._snapshot)
 
@@ -178,14 +185,15 @@ class Operation:
         self._watch.end()
         self._job = self._close_by_ns = self._snapshot = None
         self.show_status()
+        self._journal.end()
         self._answer(False, text)
 
     def _save(self, calibration: Calibration, asked: bool = False) -> Future:
         """Write the result files in the worker; the future has the answer."""
-        inputs = self._recording.inputs.by_slot
-        topics = {slot: one.topic for slot, one in inputs.items() if one.reader is not None}
-        return self._filing.save(calibration, self.session.config, topics, inputs['imu'].frame,
-                                 self._clock.now().nanoseconds, asked)
+        inputs = self._recording.inputs
+        return self._filing.save(calibration, self.session.config, inputs.topics,
+                                 inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
+                                 asked)
 
     def _promise(self) -> Future:
         """Return a future that the outcome of the computation will be set on."""
@@ -212,6 +220,7 @@ class Operation:
         if clocks:
             raise Refused('no leg can be started: ' + clocks_differ(clocks))
         session.start(mark_ns, self._config())
+        self._journal.begin(session, self._recording.inputs.topics)
         self._recording.progress.begin_leg()
         self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
         self.show_status()

@@ -60,15 +60,22 @@ class Outlets:
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)
 
-    def show_status(self, recording: Recording, **known) -> None:
-        """Publish ``~/status``; ``known`` are further fields of ``Situation``."""
+    @property
+    def status_topic(self) -> str:
+        """Return the resolved name of ``~/status``."""
+        return self._status.topic_name
+
+    def show_status(self, recording: Recording, **known) -> DiagnosticArray:
+        """Publish ``~/status`` and return it; ``known`` are further fields of ``Situation``."""
         config, progress = known['config'], recording.progress
         situation = Situation(
             missing=recording.inputs.missing(config), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
             max_speed=progress.max_speed, still_s=progress.still_s(),
             heard=recording.heard(), **known)
-        self._status.publish(self._array([calibration_status(situation)]))
+        array = self._array([calibration_status(situation)])
+        self._status.publish(array)
+        return array
 
     def show_diagnostics(self, recording: Recording, use_fqn: bool) -> None:
         """Publish the health of each input."""

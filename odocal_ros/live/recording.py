@@ -22,7 +22,7 @@ class Recording:
     Samples so far, as they came.
 
     ``remember(input, raws, sent_ns)`` is called with every batch of raw messages, in order of
-    arrival: the journal's door.
+    arrival, once it is decoded: the journal's door.
     """
 
     def __init__(self, node: Node, config: Config,
@@ -44,13 +44,13 @@ class Recording:
             raws, sent_ns = source.take()
             if not raws:
                 continue
-            self._remember(source, raws, sent_ns)
             max_gap_s = config.leg.max_gap if source.slot == 'imu' else None
             for slot, block in source.decode(raws, sent_ns, max_gap_s):
                 self.recorder.feed(slot, block)
                 self.progress.feed(slot, block, config, self.inputs.form, found_scale)
                 if self.tap is not None:
                     self.tap(slot, block)
+            self._remember(source, raws, sent_ns)
 
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""

@@ -31,6 +31,8 @@ class Situation:
     still_s: float = 0.0
     outlook: Outlook | None = None               # of the leg that is recorded
     saved: str = ''
+    journal: str = ''                            # folder of the newest leg's journal
+    journal_trouble: str = ''                    # why it cannot be written
     heard: bool = True                           # any message on any topic so far
 
 
@@ -55,6 +57,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'leg_ids': ','.join(str(leg.leg_id) for leg in session.legs),
         'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
+        'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | as_keys(now.outlook)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text), hardware_id='odocal',
@@ -76,7 +79,8 @@ def level(now: Situation) -> bytes:
     if state is State.IDLE and not now.heard:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
-    return DiagnosticStatus.WARN if now.missing or now.clocks or doubtful else DiagnosticStatus.OK
+    doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble)
+    return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
 def sentence(now: Situation, text: str) -> str:
@@ -93,7 +97,8 @@ def sentence(now: Situation, text: str) -> str:
         'rejected': 'Rejected',
         'failed': f'Failed: {session.trouble}',
     }[state_name(now)]
-    return f'{seen}; {text}' if text else seen
+    journal = f'the leg is not journalled: {now.journal_trouble}' if now.journal_trouble else ''
+    return '; '.join(filter(None, (seen, text, journal)))
 
 
 def hint(now: Situation) -> str:

@@ -6,7 +6,7 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screen import screen
@@ -15,6 +15,9 @@ EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below sinc
 EACH_STOP = 'each-stop'
 OPENING = 0.2                 # of the distance: a first stop later than this splits no leg
 STATUS_NAME = 'calibrator: calibration'
+DROPPED = ('cancelled', 'undone')
+OPEN_LEG = ('the leg has no stop mark, recording ended while it was driven: it is taken to end at '
+            'the last sample that all topics have')
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 
 
@@ -68,7 +71,26 @@ def _edge(text, whole):
 
 
 def marked_legs(bag) -> list[tuple[int, int]]:
-    """Return the legs that a node marked in the bag by its status; cancelled ones are left out."""
+    """
+    Return the legs that a node marked in the bag by its status; cancelled ones are left out.
+
+    The stop is 0 where the bag ends before it.
+    """
+    legs = []
+    for values in _last_marks(bag):
+        start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
+        if values.get('leg_event') not in DROPPED and start > 0:
+            legs.append((start, stop))
+    return sorted(legs)
+
+
+def dropped_legs(bag) -> bool:
+    """Return whether the operator cancelled or undid a leg that is marked in the bag."""
+    return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
+
+
+def _last_marks(bag) -> list[dict]:
+    """Return the last that was said of each leg."""
     last: dict[tuple, dict] = {}
     for topic in bag.topics.values():
         if topic.msgtype != STATUS_TYPE:
@@ -78,12 +100,7 @@ def marked_legs(bag) -> list[tuple[int, int]]:
                 if status.name.endswith(STATUS_NAME):
                     values = {kv.key: kv.value for kv in status.values}
                     _remember(last, values)
-    legs = []
-    for values in last.values():
-        start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
-        if values.get('leg_event') not in ('cancelled', 'undone') and start > 0:
-            legs.append((start, stop))
-    return sorted(legs)
+    return list(last.values())
 
 
 def _remember(last, values):
@@ -96,7 +113,7 @@ def _remember(last, values):
     if leg_id[0] in ('', '0'):
         return
     before = last.get(leg_id, {})
-    if before.get('leg_event') in ('cancelled', 'undone'):
+    if before.get('leg_event') in DROPPED:
         return
     event = values.get('leg_event') or before.get('leg_event', '')
     last[leg_id] = values | {'leg_event': event}
@@ -132,8 +149,17 @@ def find_legs(recorder, bag, asked, marks, config) -> list[tuple[int, int]]:
     if legs:
         return legs
     if marks:
-        return [(a, b or last) for a, b in marks]
+        return _marked(marks, last, bag)
     return [_by_standstill(recorder, first, last, config)]
+
+
+def _marked(marks, last, bag):
+    """Return marked legs, each with an end."""
+    legs = [(a, b or last) for a, b in marks if (b or last) > a]
+    if not legs:
+        raise BadData(f'{bag.name}: the recording ended at its start mark, the leg holds nothing; '
+                      'give --leg to calibrate another part of it')
+    return legs
 
 
 def _common(recorder):
@@ -152,7 +178,9 @@ def _common(recorder):
 def _placed(span, bag, first, last):
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
-    if stop <= start or stop < bag.start_ns - 10**10 or start > bag.end_ns + 10**10:
+    # stamps may be of another clock than the bag's times, as of a drive that was played again
+    begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
+    if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
         raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} holds nothing; the '
                        f'bag runs from 0 to {length:.1f} s')

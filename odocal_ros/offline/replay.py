@@ -11,6 +11,10 @@ HELP = 'calibrate from recorded bags'
 LATER = ('wheels', 'smoother')
 
 
+class LegDropped(BadUsage):
+    """A journal holds a leg that the operator dropped."""
+
+
 def add_arguments(parser) -> None:
     """Declare the options of design.md section 1."""
     add = parser.add_argument
@@ -46,23 +50,40 @@ def run(args) -> int:
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
     from odocal_ros.config import with_settings
+    from odocal_ros.offline.journal import journal_notes
     from odocal_ros.pipeline import combine
-    legs, inputs = [], []
-    for path in args.bags:
-        new, described, frame = _legs_of(Path(path), args, asked, config)
+    legs, inputs, dropped, imu_frame = [], [], None, ''
+    for path in map(Path, args.bags):
+        journal = journal_notes(path)
+        config = _config(args, journal)
+        try:
+            new, described, frame = _legs_of(path, args, asked, config, journal)
+        except LegDropped as error:
+            dropped = error
+            if len(args.bags) > 1:
+                _tell(args, str(error))
+            continue
         legs += new
         inputs.append(described)
-        if not config.frames.imu and frame:
-            config = with_settings(config, {'frames.imu': frame})
+        imu_frame = imu_frame or frame
+    if dropped and not legs:
+        raise dropped
+    if not config.frames.imu and imu_frame:
+        config = with_settings(config, {'frames.imu': imu_frame})
     calibration = combine(legs, config)
     return _report(calibration, config, inputs, output, args)
 
 
-def _config(args):
-    """Return defaults < --config < --set, each checked."""
+def _tell(args, note: str) -> None:
+    if not args.quiet:
+        print(f'odocal: {note}', file=sys.stderr)
+
+
+def _config(args, journal=None):
+    """Return defaults < a journal's settings < --config < --set, each checked."""
     from odocal_ros.config import Config, with_settings
     from odocal_ros.config_file import parse_set, read_config_file
-    config = Config()
+    config = with_settings(Config(), journal.settings if journal else {})
     if args.config:
         config = with_settings(config, read_config_file(Path(args.config)))
     config = with_settings(config, dict(parse_set(text) for text in args.settings))
@@ -71,20 +92,24 @@ def _config(args):
     return with_settings(config, {'method': args.method}) if args.method else config
 
 
-def _legs_of(path, args, asked, config):
+def _legs_of(path, args, asked, config, journal):
     """Return the results of a bag's legs, its entry for calibration.json, the Imu's frame."""
     from concurrent.futures import ThreadPoolExecutor
 
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.leg import LegRecorder
     from odocal_ros.messages import make_reader
-    from odocal_ros.offline.legs import find_legs, marked_legs
+    from odocal_ros.offline.legs import dropped_legs, find_legs, marked_legs, OPEN_LEG
     from odocal_ros.offline.topics import choose_topics
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
             'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
         overrides = {slot: topic for slot, topic in overrides.items() if topic}
+        if journal:
+            _tell(args, f'{bag.name} is a journal: settings and topics from {journal.path}; '
+                  'options go before them')
+            overrides = journal.topics_in(bag.topics) | overrides
         topics = choose_topics(bag.topics, config, overrides)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
                    for slot, topic in topics.items()}
@@ -96,11 +121,16 @@ def _legs_of(path, args, asked, config):
         if 'odometer_right' in topics:
             recorder.form_right = readers[topics['odometer_right']].form
         marks = [] if asked else marked_legs(bag)
+        if journal and not (marks or asked) and dropped_legs(bag):
+            raise LegDropped(f'{bag.name}: its leg was cancelled or undone, so it is not '
+                             'replayed; give --leg : to replay it all the same')
+        if any(not stop for _, stop in marks):
+            _tell(args, f'{bag.name}: {OPEN_LEG}')
         spans = find_legs(recorder, bag, asked, marks, config)
         notes = tuple(n for n in bag.notes if not isinstance(n, str))
         for note in bag.notes:
-            if isinstance(note, str) and not args.quiet:
-                print(f'odocal: {note}', file=sys.stderr)
+            if isinstance(note, str):
+                _tell(args, note)
         results = _calibrated(recorder, spans, config, notes, bag.name, args)
         described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')

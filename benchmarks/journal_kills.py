@@ -1,0 +1,48 @@
+"""
+What kill -9 costs: the node is killed at random moments of a leg and its journal replayed.
+
+    python benchmarks/journal_kills.py [--kills 50] [--seed 20260601] [--longest 9]
+
+Every kill is a new node process that hears a simulated drive over DDS at ten times real time.
+Lost is the wall time from the newest Imu message in the journal to the kill; the replay must find
+the leg by its start mark.
+"""
+
+import argparse
+from pathlib import Path
+import sys
+import tempfile
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
+
+
+def main() -> None:
+    """Kill and count."""
+    from kills import drive, killed
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--kills', type=int, default=50)
+    parser.add_argument('--seed', type=int, default=20260601)
+    parser.add_argument('--longest', type=float, default=9.0, help='s of leg at most')
+    args = parser.parse_args()
+    driven, lost, found, short = drive(), [], 0, 0
+    for moment_s in np.random.default_rng(args.seed).uniform(0.0, args.longest, args.kills):
+        with tempfile.TemporaryDirectory() as folder:
+            left = killed(driven, float(moment_s), Path(folder))
+        good = left.marks == [(left.start_ns, 0)] and left.code in (0, 1) and len(left.legs) == 1
+        # killed before anything after the mark was written: replay says so
+        short += not good and left.moment_s <= left.lost_s and left.code == 2
+        lost.append(left.lost_s)
+        found += good
+        print(f'{len(lost):3} killed {left.moment_s:5.2f} s into the leg: {left.lost_s:5.3f} s '
+              f'lost, {left.files} files, replay exit {left.code}'
+              + ('' if good else f', NO LEG: {left.text.strip().splitlines()[-1:]}'), flush=True)
+    print(f'{len(lost)} kills: lost {max(lost):.3f} s at most, {np.mean(lost):.3f} s on average; '
+          f'{found} legs found by their mark and replayed, {short} killed within what is lost')
+
+
+if __name__ == '__main__':
+    main()

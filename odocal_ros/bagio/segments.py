@@ -1,0 +1,179 @@
+"""
+A bag that grows by closed files, so that a kill at any moment leaves all but the newest second.
+
+While it grows it is a folder of numbered files without metadata.yaml; sixty of them are joined
+into one now and then, all of them at the end. A file that joins others is complete before they
+go, and its name tells which they are: a reader that finds both takes the joined one.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import os
+from pathlib import Path
+
+from odocal_ros.bagio.chunks import Chunk, PART, read_chunks, sync_folder, write_file
+from odocal_ros.bagio.numbered import part_name, whole_name
+from odocal_ros.bagio.recover import Channel
+
+TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A file of the bag: the numbers it covers, its size and what it holds."""
+
+    path: Path
+    first: int
+    last: int
+    size: int
+    start_ns: int
+    end_ns: int
+    counts: Counter      # messages by channel
+
+
+class SegmentedBag:
+    """
+    Writes a bag into a folder of its own, segment by segment.
+
+    Every method that writes may raise OSError; what was written before stays whole.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.channels: dict[int, Channel] = {}   # by number, as chunks name them
+        self.segments: list[Segment] = []
+        self.extra: list[Segment] = []           # added to the finished bag
+
+    @property
+    def size(self) -> int:
+        """Return the bytes that its files take."""
+        return sum(segment.size for segment in (*self.segments, *self.extra))
+
+    @property
+    def loose_size(self) -> int:
+        """Return the bytes of the files that are joined next."""
+        return sum(segment.size for segment in self._loose())
+
+    def _loose(self) -> list[Segment]:
+        # the first is as large as the pre-roll: it is copied once only
+        return [s for s in self.segments[1:] if s.first == s.last]
+
+    def append(self, chunks: Sequence[Chunk]) -> None:
+        """Write chunks as the next segment."""
+        number = self.segments[-1].last + 1 if self.segments else 0
+        self.segments.append(self._write(part_name(number, number), number, number, chunks))
+
+    def join_some(self) -> None:
+        """Join the newest segments where there are enough of them."""
+        single = self._loose()
+        if len(single) >= TOGETHER:
+            self._join(single)
+
+    def finish(self, room: int | None = None) -> Path:
+        """
+        Join all segments into one file and write metadata.yaml; return the file.
+
+        Where ``room``, in bytes, or the disk does not allow the copy, the segments stay as the
+        files of the bag.
+        """
+        if room is None or self.size <= room:
+            try:
+                self._write_whole()
+            except OSError:
+                self._write_metadata()
+                return self.segments[0].path
+        self._write_metadata()
+        for path in self.folder.glob('part_*.mcap'):
+            if path not in {segment.path for segment in self.segments}:
+                path.unlink()
+        return self.segments[0].path
+
+    def add(self, chunks: Sequence[Chunk]) -> None:
+        """Add messages to the finished bag, as a file of its own."""
+        number = len(self.extra) + 1
+        self.extra.append(self._write(whole_name(self.folder, number), 0, 0, chunks))
+        self._write_metadata()
+
+    def _write_whole(self) -> None:
+        segments = self.segments
+        whole = self._write(whole_name(self.folder), 0, segments[-1].last, _chunks_of(segments))
+        self.segments = [whole]
+
+    def _join(self, segments: list[Segment]) -> None:
+        """Put one file in the place of several."""
+        first, last = segments[0].first, segments[-1].last
+        joined = self._write(part_name(first, last), first, last, _chunks_of(segments))
+        at = self.segments.index(segments[0])
+        self.segments[at:at + len(segments)] = [joined]
+        for segment in segments:
+            segment.path.unlink()
+
+    def _write(self, name: str, first: int, last: int, chunks: Iterable[Chunk]) -> Segment:
+        tally = _Tally()
+        path = self.folder / name
+        size = write_file(path, self.channels, tally.over(chunks))
+        return Segment(path, first, last, size, tally.start_ns, tally.end_ns, tally.counts)
+
+    def _write_metadata(self) -> None:
+        path = self.folder / 'metadata.yaml'
+        write_text(path, _metadata([*self.segments, *self.extra], self.channels))
+
+
+class _Tally:
+    """Counts chunks as they pass."""
+
+    def __init__(self) -> None:
+        self.start_ns, self.end_ns = 2**63 - 1, 0
+        self.counts: Counter = Counter()
+
+    def over(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
+        for chunk in chunks:
+            self.start_ns = min(self.start_ns, chunk.start_ns)
+            self.end_ns = max(self.end_ns, chunk.end_ns)
+            self.counts[chunk.channel] += chunk.count
+            yield chunk
+
+
+def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
+    for segment in segments:
+        yield from read_chunks(segment.path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, safe on the disk when this returns."""
+    part = path.with_name(f'.{path.name}{PART}')
+    try:
+        with part.open('w', encoding='utf-8') as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.rename(path)
+        sync_folder(path.parent)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
+    """Return the text of metadata.yaml, version 9, as rosbag2 of Jazzy writes it."""
+    import yaml
+    start_ns, end_ns = min(f.start_ns for f in files), max(f.end_ns for f in files)
+    counts: Counter = sum((f.counts for f in files), Counter())
+    return yaml.safe_dump({'rosbag2_bagfile_information': {
+        'version': 9, 'storage_identifier': 'mcap',
+        **_span(start_ns, end_ns, counts.total()),
+        'topics_with_message_count': [
+            {'topic_metadata': {'name': c.topic, 'type': c.msgtype, 'serialization_format': 'cdr',
+                                'offered_qos_profiles': [], 'type_description_hash': ''},
+             'message_count': counts[key]} for key, c in channels.items()],
+        'compression_format': '', 'compression_mode': '',
+        'relative_file_paths': [f.path.name for f in files],
+        'files': [{'path': f.path.name, **_span(f.start_ns, f.end_ns, f.counts.total())}
+                  for f in files],
+        'custom_data': None, 'ros_distro': 'jazzy'}}, sort_keys=False)
+
+
+def _span(start_ns: int, end_ns: int, count: int) -> dict:
+    return {'starting_time': {'nanoseconds_since_epoch': start_ns},
+            'duration': {'nanoseconds': end_ns - start_ns}, 'message_count': count}

@@ -1,0 +1,47 @@
+"""Message definitions out of the message classes, so that a journal can be read anywhere."""
+
+import importlib
+import re
+
+NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
+KIND = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
+
+
+def definition_of(kind: type) -> str:
+    """
+    Return the definition of a message class as a bag holds it: its .msg text and those it uses.
+
+    Constants and defaults, of which the classes do not tell, are not in it; the bytes of a message
+    do not depend on them.
+    """
+    texts: dict[str, str] = {}
+    _collect(kind, '', texts)
+    first, *others = texts.items()
+    return first[1] + ''.join(f'{"=" * 80}\nMSG: {name}\n{text}' for name, text in others)
+
+
+def _collect(kind, name: str, texts: dict[str, str]) -> None:
+    """Add the text of a class and of all that it uses."""
+    lines, used = [], []
+    for field, about in kind.get_fields_and_field_types().items():
+        base, whole = _in_msg(about)
+        lines.append(f'{whole} {field}\n')
+        used += [base] if '/' in base else []
+    texts[name] = ''.join(lines)
+    for base in used:
+        if base not in texts:
+            package, _, leaf = base.rpartition('/')
+            _collect(getattr(importlib.import_module(f'{package}.msg'), leaf), base, texts)
+
+
+def _in_msg(about: str) -> tuple[str, str]:
+    """Return the base type, and the field's type, as a .msg file has them."""
+    match = KIND.fullmatch(about)
+    if match is None:
+        raise ValueError(f'a field of type {about}')
+    sequence, base, bound, most, _, array = match.groups()
+    base = NAMES.get(base, base)
+    text = base + (f'<={bound[1:-1]}' if bound else '')
+    if sequence:
+        return base, f'{text}[<={most}]' if most else f'{text}[]'
+    return base, text + (array or '')

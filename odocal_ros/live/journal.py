@@ -1,0 +1,156 @@
+"""
+The journal: each leg as a bag on the disk while it is driven, so that nothing of it is lost.
+
+This side runs with the callbacks and only collects; ``JournalWriter`` has a thread of its own.
+"""
+
+from datetime import datetime, UTC
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.serialization import serialize_message
+
+from odocal_ros.config import Config
+from odocal_ros.live.inputs import Input, message_class
+from odocal_ros.live.journal_leg import Plan
+from odocal_ros.live.journal_text import journal_text
+from odocal_ros.live.journal_writer import Heard, JournalWriter
+from odocal_ros.live.outputs import output_root
+from odocal_ros.live.session import Session
+
+EVERY_NS = 800_000_000    # with the time that writing takes, a kill then costs about a second
+MARGIN_S = 2.0            # kept beyond the pre-roll: the recorder's own margin, and a batch
+GRACE_S = 2.0
+STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+DROPPED = ('cancelled', 'undone')
+
+
+class Journal:
+    """
+    Collects raw messages and marks, and hands them to the thread about once a second.
+
+    ``topic`` is the resolved name of ``~/status``. A leg's journal holds what the recorder got,
+    no message more or less, so that a replay of it gives the same result.
+    """
+
+    def __init__(self, node, topic: str) -> None:
+        self._log, self._clock, self._topic = node.get_logger(), node.get_clock(), topic
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._writer = JournalWriter()
+        self._batch: dict[str, Heard] = {}
+        self._marks: Heard | None = None
+        self._due_ns = 0
+        self._limit, self._reach_ns = 0, 0
+        self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
+        self._ended = False              # its samples are complete
+        self._last_event = ''
+        self._dropped: set[int] = set()  # legs that the journal knows to be dropped
+        self._told = ''
+
+    @property
+    def trouble(self) -> str:
+        """Return why the leg cannot be written, empty if it can."""
+        return self._writer.trouble if self._limit else ''
+
+    @property
+    def folder(self) -> str:
+        """Return where the newest leg is written."""
+        return self._writer.folder if self._limit else ''
+
+    def remember(self, source: Input, raws: list[bytes], sent_ns: list[int]) -> None:
+        """Take messages of a topic as the recorder got them."""
+        if not self._limit:
+            return
+        heard = self._batch.get(source.slot)
+        if heard is None:
+            heard = self._batch[source.slot] = Heard(
+                source.topic, source.msgtype, message_class(source.msgtype))
+        heard.raws += raws
+        heard.sent_ns += sent_ns
+        heard.newest_ns = source.health.newest_ns
+
+    def tick(self, config: Config, busy: bool) -> None:
+        """Hand over what has come if it is time to; join a leg's files once nobody waits."""
+        now_ns = self._steady.now().nanoseconds
+        if not self._limit_from(config):
+            return
+        if now_ns >= self._due_ns:
+            self._hand_over()
+        if self._ended and not busy:
+            self._leg_id, self._ended = 0, False
+            self._writer.submit(self._writer.finish)
+        if self.trouble != self._told:
+            self._told = self.trouble
+            if self._told:
+                self._log.warning(f'the leg is not journalled: {self._told}')
+
+    def _limit_from(self, config: Config) -> int:
+        """Take over what the settings say; return the limit, 0 for no journal."""
+        if self._limit and not config.journal.max_bytes:
+            self.start_anew()
+        self._limit = config.journal.max_bytes
+        self._reach_ns = round((config.leg.preroll + MARGIN_S) * 1e9)
+        return self._limit
+
+    def _hand_over(self) -> None:
+        self._due_ns = self._steady.now().nanoseconds + EVERY_NS
+        batch, self._batch = self._batch, {}
+        marks, self._marks = self._marks, None
+        if batch or marks:
+            self._writer.submit(self._writer.take, batch, self._reach_ns, marks)
+
+    def begin(self, session: Session, topics: dict[str, str]) -> None:
+        """Open the journal of the leg that the session has just started."""
+        config = session.config
+        if not self._limit_from(config):
+            return
+        self._hand_over()       # what came before is pre-roll
+        now_ns = self._clock.now().nanoseconds
+        self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
+        self._writer.submit(self._writer.begin, Plan(
+            session.leg_id, output_root(config) / 'journal',
+            f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
+            f'_leg_{session.leg_id}',
+            journal_text(config, session.leg_id, session.start_ns, topics),
+            config.journal.max_bytes))
+
+    def hear(self, session: Session, array: DiagnosticArray) -> None:
+        """Take a status as it was published: the marks of a leg are in it."""
+        leg_id, event = session.leg_id, session.event
+        dropped = event in DROPPED and leg_id not in self._dropped
+        if event in DROPPED:
+            self._dropped.add(leg_id)
+        if leg_id == self._leg_id:
+            self._marks = self._marks or self._no_marks()
+            self._marks.raws.append(serialize_message(array))
+            self._marks.sent_ns.append(self._clock.now().nanoseconds)
+            if event != self._last_event:
+                self._last_event = event
+                self._hand_over()
+        elif dropped:
+            late = self._no_marks()
+            late.raws.append(serialize_message(array))
+            late.sent_ns.append(self._clock.now().nanoseconds)
+            self._writer.submit(self._writer.add, leg_id, late)
+
+    def _no_marks(self) -> Heard:
+        return Heard(self._topic, STATUS_TYPE, DiagnosticArray)
+
+    def end(self) -> None:
+        """Take note that the leg's samples are complete: what comes now belongs to no leg."""
+        if self._leg_id and not self._ended:
+            self._hand_over()
+            self._ended = True
+            self._writer.submit(self._writer.end)
+
+    def start_anew(self) -> None:
+        """Forget the samples so far, as after a jump of time."""
+        self._batch = {}
+        self._writer.submit(self._writer.start_anew)
+
+    def close(self) -> None:
+        """Write what is left; a long leg's files may stay apart."""
+        self._hand_over()
+        self._writer.submit(self._writer.finish)
+        self._writer.close(GRACE_S)

@@ -1,0 +1,146 @@
+"""The journal of one leg, as the journal's thread writes it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from odocal_ros.bagio.chunks import Chunk
+from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.bagio.recover import Channel
+from odocal_ros.bagio.segments import SegmentedBag, write_text
+from odocal_ros.live.journal_space import claim, make_room
+
+MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
+MARGIN = 2**20                # for metadata and file heads
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where a leg's journal goes and what it may take."""
+
+    leg_id: int
+    root: Path
+    name: str
+    settings: str      # the text of journal.yaml
+    limit: int         # bytes, all journals of the folder together
+
+
+class LegJournal:
+    """
+    Writes the journal of one leg; ``trouble`` says why it cannot, empty while it can.
+
+    What the disk does not take waits in memory and is tried again with the next second, until
+    there is too much of it: then the journal ends with what it has, and the trouble stays.
+    """
+
+    def __init__(self, plan: Plan, channels: dict[int, Channel], chunks: list[Chunk]) -> None:
+        self.plan = plan
+        self.leg_id = plan.leg_id
+        self.trouble = ''
+        self._channels = channels
+        self._waiting = chunks        # the pre-roll goes out with the start mark, never before it
+        self._bag: SegmentedBag | None = None
+        self._claim: TextIO | None = None
+        self._others = 0              # bytes of the other journals
+        self._over = False            # given up, or finished
+
+    @property
+    def folder(self) -> str:
+        """Return where it is written, empty before it is."""
+        return str(self._bag.folder) if self._bag else ''
+
+    def put(self, chunks: list[Chunk]) -> None:
+        """Write chunks, and those that wait."""
+        if self._over:
+            return
+        self._waiting += chunks
+        if self._waiting:
+            self._try(self._write)
+        if self.trouble and not self._over and sum(
+                chunk.size for chunk in self._waiting) > MOST_WAITING:
+            self._give_up(f'{self.trouble}; it is not tried again in this leg')
+
+    def finish(self) -> None:
+        """Make one whole bag of it."""
+        if not self._over:
+            self.put([])
+            if self._bag is not None and not self._waiting:
+                self._try(self._finish)
+        self._over, self._waiting = True, []
+        if self._claim is not None:
+            self._claim.close()
+
+    def add(self, chunks: list[Chunk]) -> None:
+        """Add a mark to the finished journal."""
+        bag = self._bag
+        if bag is not None and bag.segments and bag.folder.exists():
+            self._try(lambda: bag.add(chunks))
+
+    def _write(self) -> None:
+        if self._bag is None:
+            self._bag = self._open()
+        # joining some files takes their size once more for a moment
+        size = sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + MARGIN
+        if self._others + self._bag.size + size > self.plan.limit:
+            taken = make_room(self.plan.root, self.plan.limit, size)
+            self._others = taken - self._bag.size
+            if taken + size > self.plan.limit:
+                self._give_up(f'{self.plan.root}: journal.max_bytes is used up; raise it')
+                return
+        self._bag.append(self._waiting)
+        self._waiting = []
+        self._bag.join_some()
+
+    def _open(self) -> SegmentedBag:
+        """Make the folder, with the settings in it."""
+        root = self.plan.root
+        root.mkdir(parents=True, exist_ok=True)
+        self._others = make_room(root, self.plan.limit)
+        folder = _free(root, self.plan.name)
+        try:
+            write_text(folder / JOURNAL, self.plan.settings)
+        except OSError:
+            folder.rmdir()
+            raise
+        self._claim = claim(folder)
+        bag = SegmentedBag(folder)
+        bag.channels = self._channels
+        return bag
+
+    def _finish(self) -> None:
+        assert self._bag is not None
+        taken = make_room(self.plan.root, self.plan.limit, self._bag.size)
+        self._bag.finish(room=self.plan.limit - taken)
+
+    def _give_up(self, trouble: str) -> None:
+        self.trouble, self._over, self._waiting = trouble, True, []
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except OSError as error:
+            where = error.filename or self.plan.root
+            self.trouble = (f'{where}: {error.strerror or error}; free disk space or set '
+                            'output.directory to a folder that can be written')
+        else:
+            if not self._over:
+                self.trouble = ''
+
+
+def _free(root: Path, name: str) -> Path:
+    """Create a folder that is not there yet."""
+    for count in range(1, 1000):
+        folder = root / (name if count == 1 else f'{name}-{count}')
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise OSError(f'{root} holds 1000 journals of {name}')
+
+
+def in_order(held: Mapping[str, list[Chunk]]) -> list[Chunk]:
+    """Return the chunks of all topics in the order of their times."""
+    return sorted((chunk for chunks in held.values() for chunk in chunks),
+                  key=lambda chunk: chunk.start_ns)

@@ -1,0 +1,65 @@
+"""How much disk the journals of a folder take, and which go when it is too much."""
+
+from contextlib import suppress
+import fcntl
+from pathlib import Path
+import shutil
+from typing import TextIO
+
+from odocal_ros.bagio.numbered import JOURNAL
+
+
+def journals(root: Path) -> list[Path]:
+    """Return the journals in a folder, the oldest first."""
+    found = []
+    with suppress(FileNotFoundError):
+        for folder in root.iterdir():
+            with suppress(OSError):
+                if not folder.is_symlink():
+                    found.append(((folder / JOURNAL).stat().st_mtime_ns, folder))
+    return [folder for _, folder in sorted(found)]
+
+
+def size_of(folder: Path) -> int:
+    """Return the bytes that a journal takes."""
+    total = 0
+    with suppress(FileNotFoundError):
+        for path in folder.iterdir():
+            with suppress(FileNotFoundError):
+                total += path.stat().st_size
+    return total
+
+
+def make_room(root: Path, limit: int, needed: int = 0) -> int:
+    """
+    Delete the oldest journals until all of them and ``needed`` more bytes stay within the limit.
+
+    One that a node is writing to stays. Returns the bytes taken then.
+    """
+    sizes = {folder: size_of(folder) for folder in journals(root)}
+    for folder in list(sizes):
+        if sum(sizes.values()) + needed <= limit:
+            break
+        if not _in_use(folder):
+            shutil.rmtree(folder, ignore_errors=True)
+            sizes[folder] = size_of(folder)
+    return sum(sizes.values())
+
+
+def claim(folder: Path) -> TextIO:
+    """Mark a journal as written to, until the file returned is closed or its process ends."""
+    file = (folder / JOURNAL).open(encoding='utf-8')
+    with suppress(OSError):      # a file system without locks: then nobody can tell
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return file
+
+
+def _in_use(folder: Path) -> bool:
+    try:
+        with (folder / JOURNAL).open(encoding='utf-8') as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False

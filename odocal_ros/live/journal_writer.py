@@ -1,0 +1,151 @@
+"""The journal's thread: packs what was heard, remembers the pre-roll, writes legs."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+import queue
+import threading
+
+from odocal_ros.bagio.chunks import Chunk, pack
+from odocal_ros.bagio.recover import Channel
+from odocal_ros.live.definitions import definition_of
+from odocal_ros.live.journal_leg import in_order, LegJournal, Plan
+
+MOST_HELD = 256 * 2**20        # bytes of pre-roll; 1 kHz for 600 s are 55 MB
+
+
+@dataclass
+class Heard:
+    """Raw messages of one topic since the last batch."""
+
+    topic: str
+    msgtype: str
+    kind: type                                          # the message class
+    raws: list[bytes] = field(default_factory=list)
+    sent_ns: list[int] = field(default_factory=list)    # bag times: when they were sent
+    newest_ns: int = 0                                  # stamp of the last one
+
+
+class PreRoll:
+    """The newest chunks of each topic, as far back as a leg may reach, bounded in bytes."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, deque[tuple[int, Chunk]]] = {}
+        self.size = 0
+
+    def feed(self, slot: str, newest_ns: int, chunk: Chunk, reach_ns: int) -> None:
+        """Keep a chunk whose last row has a stamp; forget what lies ``reach_ns`` before it."""
+        held = self._held.setdefault(slot, deque())
+        held.append((newest_ns, chunk))
+        self.size += chunk.size
+        # by each topic's own stamps: one on a foreign clock must not grow without bound
+        while held[0][0] < newest_ns - reach_ns:
+            self._drop(held)
+        while self.size > MOST_HELD:
+            self._drop(max(self._held.values(), key=lambda h: sum(c.size for _, c in h)))
+
+    def _drop(self, held: deque) -> None:
+        self.size -= held.popleft()[1].size
+
+    def chunks(self) -> list[Chunk]:
+        """Return all chunks in order of time."""
+        return in_order({slot: [chunk for _, chunk in held] for slot, held in self._held.items()})
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._held, self.size = {}, 0
+
+
+class JournalWriter:
+    """
+    What the thread does; no other thread calls anything but ``submit`` and ``close``.
+
+    ``trouble`` and ``folder`` may be read by anyone.
+    """
+
+    def __init__(self) -> None:
+        self.trouble = self.folder = ''
+        self._channels: dict[int, Channel] = {}
+        self._numbers: dict[str, int] = {}            # topic -> channel
+        self._counts: dict[str, int] = {}             # topic -> messages packed
+        self._preroll = PreRoll()
+        self._leg: LegJournal | None = None
+        self._listening = False                       # the samples of that leg go on
+        self._closed: dict[int, LegJournal] = {}
+        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name='odocal_journal', daemon=True)
+        self._thread.start()
+
+    def submit(self, job: Callable[..., None], *values) -> None:
+        """Have the thread call one of the methods below."""
+        self._jobs.put((job, values))
+
+    def close(self, grace_s: float) -> None:
+        """Let the thread end after the jobs it was given, waiting a moment for them."""
+        self._jobs.put(None)
+        self._thread.join(grace_s)
+
+    def _run(self) -> None:
+        while (entry := self._jobs.get()) is not None:
+            job, values = entry
+            try:
+                job(*values)
+            except Exception as error:  # the journal must never cost a calibration
+                self._leg = None
+                self.trouble = ('internal error, please report it: '
+                                f'{type(error).__name__}: {error}')
+            else:
+                self._show()
+
+    def _show(self) -> None:
+        if self._leg is not None:
+            self.trouble, self.folder = self._leg.trouble, self._leg.folder
+
+    # jobs
+
+    def take(self, batch: dict[str, Heard], reach_ns: int, marks: Heard | None) -> None:
+        """Pack a batch, keep it for the pre-roll of legs to come, and write it if one is open."""
+        chunks = []
+        for slot, heard in batch.items():
+            chunk = self._packed(heard)
+            chunks.append(chunk)
+            self._preroll.feed(slot, heard.newest_ns or heard.sent_ns[-1], chunk, reach_ns)
+        if self._leg is not None:
+            self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
+
+    def start_anew(self) -> None:
+        """Forget the pre-roll, as after a jump of time."""
+        self._preroll.clear()
+
+    def begin(self, plan: Plan) -> None:
+        """Open the journal of a leg; its pre-roll goes out with the first mark."""
+        self.finish()
+        self._leg, self._listening = LegJournal(plan, self._channels, self._preroll.chunks()), True
+
+    def end(self) -> None:
+        """Write no more samples to the open leg: what may come are marks."""
+        self._listening = False
+
+    def add(self, leg_id: int, marks: Heard) -> None:
+        """Add a mark to the journal of a leg that is closed."""
+        if leg_id in self._closed:
+            self._closed[leg_id].add([self._packed(marks)])
+
+    def finish(self) -> None:
+        """Close the journal of the open leg and join its files."""
+        leg = self._leg
+        if leg is not None:
+            leg.finish()
+            self._show()
+            self._closed[leg.leg_id] = leg
+            self._leg = None
+
+    def _packed(self, heard: Heard) -> Chunk:
+        number = self._numbers.get(heard.topic)
+        if number is None:
+            number = self._numbers[heard.topic] = len(self._numbers) + 1
+            self._channels[number] = Channel(
+                heard.topic, heard.msgtype, definition=('msg', definition_of(heard.kind)))
+        first = self._counts.get(heard.topic, 0)
+        self._counts[heard.topic] = first + len(heard.raws)
+        return pack(number, heard.sent_ns, heard.raws, first)

@@ -1,0 +1,46 @@
+"""What a journal of the node says beside its messages: settings and topics of its leg."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from odocal_ros.bagio.numbered import JOURNAL
+
+BLOCK = 'odocal_journal'
+
+
+@dataclass(frozen=True)
+class JournalNotes:
+    """Settings by dotted name, slot -> topic, and where they were found."""
+
+    path: Path
+    settings: dict[str, object] = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)
+
+    def topics_in(self, bag_topics) -> dict[str, str]:
+        """Return slot -> topic of those that have messages in the bag."""
+        return {slot: topic for slot, topic in self.topics.items()
+                if topic in bag_topics and bag_topics[topic].count}
+
+
+def journal_notes(bag: Path) -> JournalNotes | None:
+    """
+    Return what a journal says, given its folder or a file of it; None for any other bag.
+
+    Raises
+    ------
+    BadUsage, BadConfig
+        Its settings cannot be read, or are not those of this version.
+
+    """
+    path = (bag if bag.is_dir() else bag.parent) / JOURNAL
+    if not path.exists():
+        return None
+    import yaml
+
+    from odocal_ros.config_file import read_config_file
+    settings = read_config_file(path)
+    whole = yaml.safe_load(path.read_text(encoding='utf-8'))
+    about = ((whole.get(BLOCK) or {}).get('ros__parameters')) or {}
+    topics = {key.removeprefix('topics.'): str(value) for key, value in about.items()
+              if str(key).startswith('topics.')}
+    return JournalNotes(path, settings, topics)

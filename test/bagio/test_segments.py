@@ -1,0 +1,218 @@
+"""A bag that grows by closed files: what readers find of it whenever its writer stops."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+import ros_bags
+import ros_messages as make
+from rosbags import rosbag2
+
+from odocal_ros.bagio import chunks, segments
+from odocal_ros.bagio.chunks import pack, read_chunks, write_file
+from odocal_ros.bagio.numbered import JOURNAL, part_name, whole_name
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.recover import Channel
+from odocal_ros.bagio.segments import SegmentedBag
+from odocal_ros.errors import BadBag
+
+T0 = ros_bags.T0
+CHANNELS = {
+    1: Channel('/imu/data', 'sensor_msgs/msg/Imu'), 2: Channel('/odometer', 'std_msgs/msg/Int64')}
+
+
+def second(k, rate=20):
+    """Return the chunks of second k and their messages; two of each three times are equal."""
+    times = [T0 + k * 10**9 + i // 3 * 3 * 10**9 // rate for i in range(rate)]
+    imu = [make.cdr(make.imu(t, w=(k, i, 0))) for i, t in enumerate(times)]
+    counts = [make.cdr(make.whole(k * rate + i)) for i in range(rate)]
+    messages = {'/imu/data': list(zip(times, imu, strict=True)),
+                '/odometer': list(zip(times, counts, strict=True))}
+    return [pack(1, times, imu), pack(2, times, counts)], messages
+
+
+def grown(folder, count):
+    """Return a bag of so many segments, not finished, and its messages by topic."""
+    folder.mkdir()
+    (folder / JOURNAL).touch()
+    bag, messages = SegmentedBag(folder), {'/imu/data': [], '/odometer': []}
+    bag.channels = CHANNELS
+    for k in range(count):
+        packed, new = second(k)
+        bag.append(packed)
+        for topic, some in new.items():
+            messages[topic] += some
+        bag.join_some()
+    return bag, messages
+
+
+def read(path):
+    """Return bag time and bytes of the messages by topic, in the order that replay has them."""
+    found = {'/imu/data': [], '/odometer': []}
+    with open_bag(path) as bag:
+        for batch in bag._batches({t for t in found if t in bag.topics}):
+            for topic, (times, raws) in batch.items():
+                found[topic] += zip(times, raws, strict=True)
+    return found
+
+
+@pytest.mark.parametrize('zstd', [True, False])
+def test_other_readers_read_a_segment(tmp_path, monkeypatch, zstd):
+    if not zstd:
+        monkeypatch.setattr(chunks, '_zstd', lambda: None)
+    packed, messages = second(0)
+    size = write_file(tmp_path / 'part.mcap', CHANNELS, packed)
+    assert size == (tmp_path / 'part.mcap').stat().st_size
+    with rosbag2.Reader(tmp_path / 'part.mcap') as reader:
+        assert {c.topic: (c.msgtype, c.msgcount) for c in reader.connections} == {
+            '/imu/data': ('sensor_msgs/msg/Imu', 20), '/odometer': ('std_msgs/msg/Int64', 20)}
+        assert (reader.start_time, reader.end_time) == (T0, T0 + 900_000_000 + 1)
+        for topic, sent in messages.items():
+            mine = [c for c in reader.connections if c.topic == topic]
+            assert [(t, bytes(raw)) for _, t, raw in reader.messages(mine)] == sent
+
+
+def test_what_cannot_be_read_by_its_index_is_read_by_its_records(tmp_path):
+    packed, messages = second(0)
+    write_file(tmp_path / 'cut.mcap', CHANNELS, packed)
+    whole = (tmp_path / 'cut.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:-40])
+    assert read(tmp_path / 'cut.mcap') == messages
+
+
+def test_chunks_come_back_as_they_were_packed(tmp_path):
+    packed, _ = second(3)
+    write_file(tmp_path / 'part.mcap', CHANNELS, packed)
+    assert [vars(chunk) for chunk in read_chunks(tmp_path / 'part.mcap')] == [
+        vars(chunk) for chunk in packed]
+
+
+def test_a_growing_bag_is_read_at_any_moment(tmp_path):
+    bag, messages = grown(tmp_path / 'leg', 4)
+    (bag.folder / f'.{part_name(4, 4)}{chunks.PART}').write_bytes(b'being written')
+    assert read(bag.folder) == messages
+    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
+        part_name(k, k) for k in range(4)]
+
+
+def test_a_finished_bag_is_one_file_with_metadata(tmp_path):
+    bag, messages = grown(tmp_path / 'leg', 4)
+    assert bag.finish() == bag.folder / 'leg_0.mcap'
+    assert sorted(p.name for p in bag.folder.iterdir()) == [
+        JOURNAL, 'leg_0.mcap', 'metadata.yaml']
+    assert read(bag.folder) == messages
+    with rosbag2.Reader(bag.folder) as reader:
+        assert (reader.message_count, reader.ros_distro) == (160, 'jazzy')
+        assert {c.topic: c.msgcount for c in reader.connections} == {
+            '/imu/data': 80, '/odometer': 80}
+
+
+def test_sixty_segments_are_joined_while_it_grows(tmp_path, monkeypatch):
+    monkeypatch.setattr(segments, 'TOGETHER', 3)
+    bag, messages = grown(tmp_path / 'leg', 9)
+    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
+        part_name(0, 0), part_name(1, 3), part_name(4, 6), part_name(7, 7), part_name(8, 8)]
+    assert bag.size == sum(p.stat().st_size for p in bag.folder.glob('*.mcap'))
+    assert bag.loose_size == sum(
+        (bag.folder / part_name(k, k)).stat().st_size for k in (7, 8))
+    assert read(bag.folder) == messages
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def steps(monkeypatch):
+    """Return a function that lets so many changes of the folder happen, then kills."""
+    def allow(count):
+        left = [count]
+
+        def counted(change):
+            def act(*args, **kwargs):
+                if not left[0]:
+                    raise Killed
+                left[0] -= 1
+                return change(*args, **kwargs)
+            return act
+        for name in ('rename', 'unlink'):
+            monkeypatch.setattr(Path, name, counted(getattr(Path, name)))
+    return allow
+
+
+@pytest.mark.parametrize('joining', ['some', 'all'])
+def test_a_kill_at_any_step_of_joining_loses_and_doubles_nothing(tmp_path, joining):
+    seen = set()
+    for count in range(20):
+        folder = tmp_path / f'leg{count}'
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(segments, 'TOGETHER', 99)
+            bag, messages = grown(folder, 5)
+            patch.setattr(segments, 'TOGETHER', 4)
+            steps(patch)(count)
+            try:
+                bag.join_some() if joining == 'some' else bag.finish()
+            except Killed:
+                done = False
+            else:
+                done = True
+        assert read(folder) == messages, count
+        seen.add(tuple(sorted(p.name.replace(f'leg{count}', 'leg') for p in folder.iterdir())))
+        if done:
+            break
+    assert done
+    assert len(seen) > 5      # states that differ were met
+
+
+def test_a_full_disk_leaves_what_was_written(tmp_path, monkeypatch):
+    bag, messages = grown(tmp_path / 'leg', 3)
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(chunks.os, 'fsync', full)
+    with pytest.raises(OSError, match='No space left'):
+        bag.append(second(3)[0])
+    with pytest.raises(OSError, match='No space left'):
+        bag.finish()
+    assert read(bag.folder) == messages
+    assert not list(bag.folder.glob(f'.*{chunks.PART}'))
+    monkeypatch.undo()
+    bag.append(second(3)[0])
+    bag.finish()
+    assert len(read(bag.folder)['/odometer']) == 80
+
+
+def test_without_room_for_the_copy_the_segments_are_the_bag(tmp_path):
+    bag, messages = grown(tmp_path / 'leg', 3)
+    bag.finish(room=bag.size - 1)
+    assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
+        part_name(k, k) for k in range(3)]
+    assert read(bag.folder) == messages
+    with rosbag2.Reader(bag.folder) as reader:
+        assert reader.message_count == 120
+
+
+@pytest.mark.parametrize('room', [None, 0])
+@pytest.mark.parametrize('metadata', [True, False])
+def test_a_mark_is_added_to_a_finished_bag(tmp_path, room, metadata):
+    bag, messages = grown(tmp_path / 'leg', 3)
+    bag.finish(room)
+    late, more = second(7)
+    bag.add(late)
+    assert (bag.folder / whole_name(bag.folder, 1)).exists()
+    if not metadata:
+        (bag.folder / 'metadata.yaml').unlink()
+    assert read(bag.folder) == {topic: messages[topic] + more[topic] for topic in messages}
+
+
+def test_names_are_looked_at_in_journals_only(tmp_path):
+    bag, _ = grown(tmp_path / 'leg', 2)
+    (bag.folder / part_name(0, 0)).rename(bag.folder / part_name(0, 5))
+    (bag.folder / JOURNAL).unlink()
+    assert len(read(bag.folder)['/odometer']) == 40
+
+
+def test_an_empty_folder_of_a_journal_is_said(tmp_path):
+    (tmp_path / JOURNAL).touch()
+    with pytest.raises(BadBag, match='holds no .mcap'), open_bag(tmp_path):
+        pass

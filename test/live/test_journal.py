@@ -1,0 +1,244 @@
+"""The journal of a real node: replayed to the last bit, killed, undone, without a disk."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import resource
+import time
+from types import SimpleNamespace
+
+from bench import answer_of, Client, NodeProcess, wait_for
+from kills import drive, killed, remains, replayed
+from player import messages_of, part, Player, sent_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+NAMES = {'imu': '/front/imu', 'fix': '/gps/fix'}
+
+
+def same(live, offline, journal):
+    """Assert that a result written live is the one of its journal, in every digit."""
+    for key in ('result', 'verdict', 'reasons', 'methods', 'check', 'config'):
+        assert live[key] == offline[key], key
+    for here, there in zip(live['legs'], offline['legs'], strict=True):
+        assert here | {'bag': Path(journal).name} == there
+
+
+@pytest.fixture(scope='module')
+def session(domain, tmp_path_factory):
+    """Drive three legs through one node: kept, cancelled, undone."""
+    simulated = simulate(SimOptions(
+        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
+        fix_noise='rtk', imu_grade='tactical', heading=0.7))
+    types, sent = messages_of(simulated)
+    folder = tmp_path_factory.mktemp('journal')
+    remaps = [x for slot, name in NAMES.items() for x in ('-r', f'{slot_name(slot)}:={name}')]
+    node = NodeProcess('-p', f'output.directory:={folder}',
+                       '-p', 'alignment.heading_source:=fixed',
+                       '-p', f'alignment.heading:={simulated.truth.heading!r}',
+                       '-p', 'leg.preroll:=20.0', *remaps)
+    client = Client()
+    seen = SimpleNamespace(folder=folder)
+    try:
+        player = Player(client.node, types, NAMES)
+        wait_for(player.matched, 'subscriptions')
+        player.play(part(sent, 30, 60), SPEED)
+        client.until(state='idle')
+        client.call('start_leg')
+        player.play(part(sent, 60, 115), SPEED)
+        stopping = client.ask('stop_leg')
+        client.until(state='computing')
+        player.play(part(sent, 115, 117), SPEED)
+        seen.stop = answer_of(stopping)
+        seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
+        seen.kept = Path(seen.status['journal'])
+        seen.joined = wait_for((seen.kept / 'metadata.yaml').exists, 'the joined journal')
+        seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
+        # a leg that is cancelled, and one that is undone after it was joined
+        player.play(part(sent, 117, 118), SPEED)
+        client.call('start_leg')
+        player.play(part(sent, 118, 122), SPEED)
+        client.call('cancel_leg')
+        seen.cancelled = Path(wait_for(lambda: client.status['journal'] != str(seen.kept)
+                                       and client.status['journal'], 'another journal'))
+        client.call('start_leg')
+        player.play(part(sent, 122, 125), SPEED)
+        stopping = client.ask('stop_leg')
+        player.play(part(sent, 125, 127), SPEED)
+        answer_of(stopping)
+        seen.undone = Path(wait_for(lambda: client.status['journal'] != str(seen.cancelled)
+                                    and client.status['journal'], 'the third journal'))
+        wait_for((seen.undone / 'metadata.yaml').exists, 'its end')
+        client.call('undo_leg')
+        wait_for((seen.undone / f'{seen.undone.name}_1.mcap').exists, 'the mark')
+    finally:
+        node.end()
+        client.close()
+    return seen
+
+
+def slot_name(slot):
+    return {'imu': 'imu/data'}.get(slot, slot)
+
+
+def test_a_journal_replays_to_the_last_bit_without_options(session):
+    code, result, said = replayed(session.kept)
+    assert code == 0, said
+    same(session.live, result, session.kept)
+    assert result['inputs'][0]['topics'] == {
+        'imu': '/front/imu', 'odometer': '/odometer', 'fix': '/gps/fix'}
+    assert 'is a journal: settings and topics from' in said
+
+
+def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):
+    assert sorted(p.name for p in session.kept.iterdir()) == [
+        f'{session.kept.name}_0.mcap', 'journal.yaml', 'metadata.yaml']
+    start_ns, stop_ns = (int(session.status[f'leg_{end}_ns']) for end in ('start', 'stop'))
+    with open_bag(session.kept) as bag:
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+                  for _, m in bag.messages('/front/imu')]
+    assert {b - a for a, b in zip(stamps, stamps[1:], strict=False)} == {20_000_000}
+    assert start_ns - stamps[0] >= 20_000_000_000     # the pre-roll asked for
+    assert stamps[-1] > stop_ns
+
+
+def test_options_win_over_the_settings_of_a_journal(session):
+    code, result, _ = replayed(session.kept, '--set', 'leg.min_distance=5000')
+    assert code == 1
+    assert result['config']['leg.min_distance'] == 5000.0
+
+
+def test_dropped_legs_are_not_replayed(session):
+    for journal in (session.cancelled, session.undone):
+        code, result, said = replayed(journal)
+        assert (code, result) == (2, None)
+        assert 'cancelled or undone' in said
+        assert '--leg :' in said
+    assert replayed(session.undone, '--leg', ':')[1] is not None
+    code, result, said = replayed(session.undone, str(session.kept))
+    assert code == 0, said
+    assert 'cancelled or undone' in said
+    same(session.live, result, session.kept)
+
+
+@pytest.mark.parametrize('moment_s', [0.3, 1.3, 2.6])
+def test_a_killed_leg_is_replayed_from_its_mark(domain, tmp_path, moment_s):
+    left = killed(drive(), moment_s, tmp_path)
+    assert left.marks == [(left.start_ns, 0)]
+    # a second by design; more only where the machine is so busy that the threads wait
+    assert left.lost_s < 2.0
+    assert left.code in (0, 1, 2)     # 2: killed before a sample came after the mark
+    if moment_s > 1:
+        leg, = left.legs
+        assert round(leg['start'] * 1e3) == round(left.start_ns * 1e-6)
+        assert leg['stop'] - leg['start'] > 10 * (moment_s - left.lost_s - 1.0)
+        assert 'the leg has no stop mark' in left.text
+
+
+def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, tmp_path):
+    made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
+                               odometer_rate=25.0, fix_noise='rtk'))
+    start('-p', 'leg.min_distance:=3.0', '-p', 'output.autosave:=false')
+    client = connect()
+    player = Player(client.node, {'imu': 'sensor_msgs/msg/Imu',
+                                  'odometer': 'std_msgs/msg/Int64',
+                                  'fix': 'sensor_msgs/msg/NavSatFix'})
+    wait_for(player.matched, 'subscriptions')
+    # stamped by now, as of a real vehicle: counts are stamped by their sender's clock
+    shift_ns = time.time_ns() + 10**8 - int(made.imu.stamp_ns[0]) - 58_500_000_000
+
+    def moved(samples):
+        return replace(samples, stamp_ns=samples.stamp_ns + shift_ns,
+                       received_ns=samples.received_ns + shift_ns)
+    sent = sorted((one for slot, topic in (
+        ('imu', encode.imu('imu/data', moved(made.imu))),
+        ('odometer', encode.counter('odometer', moved(made.odometer))),
+        ('fix', encode.fix('fix', moved(made.fix)))) for one in sent_of(slot, topic)),
+        key=lambda one: one.stamp_ns)
+    player.play(part(sent, 58.5, 60), 1)
+    client.until(state='idle')
+    answer = client.call('start_leg')
+    assert answer.success, answer.message
+    player.play(part(sent, 60, 63), 1)
+    stopping = client.ask('stop_leg')
+    player.play(part(sent, 63, 63.5), 1)
+    answer_of(stopping)
+    journal = Path(client.status['journal'])
+    assert client.call('save').success
+    wait_for((journal / 'metadata.yaml').exists, 'the joined journal')
+    folder, = (p for p in tmp_path.iterdir() if p.name[0] == '2' and not p.is_symlink())
+    same(json.loads((folder / 'calibration.json').read_text()), replayed(journal)[1], journal)
+
+
+@pytest.fixture(scope='module')
+def slow():
+    """Return light messages: a minute of rest and motion."""
+    types, sent = messages_of(simulate(SimOptions(
+        duration=180.0, imu_rate=20.0, odometer_rate=10.0, odometer='speed')))
+    return types, part(sent, 45, 105)
+
+
+def recording(client, slow):
+    """Start a leg and return the player."""
+    player = Player(client.node, slow[0])
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(slow[1], 0, 10), SPEED)
+    client.until(state='idle')
+    assert client.call('start_leg').success
+    return player
+
+
+def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect, slow, tmp_path):
+    (tmp_path / 'file').touch()
+    node = start('-p', f'output.directory:={tmp_path}/file', '-p', 'output.autosave:=false')
+    client = connect()
+    player = recording(client, slow)
+    player.play(part(slow[1], 10, 55), SPEED)
+    status = wait_for(lambda: client.status['journal_trouble'] and client.status, 'the warning')
+    assert (status['state'], status['level']) == ('recording', b'\x01')
+    assert 'Not a directory' in status['journal_trouble']
+    assert 'the leg is not journalled: ' in status['message']
+    assert 'output.directory' in status['message']
+    stopping = client.ask('stop_leg')
+    player.play(part(slow[1], 55, 60), SPEED)
+    assert 'scale factor' in answer_of(stopping).message
+    assert node.text.count('the leg is not journalled') == 1
+    # and none is missed where none is wanted
+    assert client.set(journal__max_bytes=0).successful
+    wait_for(lambda: not client.status['journal_trouble'], 'the end of the warning')
+    assert client.call('reset').success
+    player.play(part(slow[1], 60, 60.5), SPEED)
+    assert client.call('start_leg').success
+    status = client.until(state='recording')
+    assert (status['journal'], status['journal_trouble'], status['level']) == ('', '', b'\0')
+
+
+def test_a_disk_full_for_a_while_costs_nothing_nor_does_the_end_of_the_node(start, connect, slow):
+    node = start()
+    client = connect()
+    player = recording(client, slow)
+    journal = Path(wait_for(lambda: client.status['journal'], 'the journal'))
+    # what a full disk does, without one: no file may grow beyond some bytes
+    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+    player.play(part(slow[1], 10, 40), SPEED)
+    status = wait_for(lambda: client.status['journal_trouble'] and client.status, 'the warning')
+    assert 'File too large' in status['journal_trouble']
+    assert status['level'] == b'\x01'
+    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE,
+                     (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    player.play(part(slow[1], 40, 45), SPEED)
+    wait_for(lambda: not client.status['journal_trouble'], 'the end of the warning')
+    assert node.end() == 0
+    assert (journal / f'{journal.name}_0.mcap').exists()
+    with open_bag(journal) as bag:
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+                  for _, m in bag.messages('/imu/data')]
+    assert {b - a for a, b in zip(stamps, stamps[1:], strict=False)} == {50_000_000}
+    left = remains(journal, 0.0, time.time_ns(), int(status['leg_start_ns']))
+    assert (left.marks, left.files) == ([(left.start_ns, 0)], 1)
+    assert left.code in (0, 1)
+    assert 'the leg has no stop mark' in left.text

@@ -1,0 +1,178 @@
+"""Parts of the journal that need no node: settings, space, pre-roll, definitions."""
+
+import math
+import os
+
+import pytest
+import ros_messages as make
+
+from odocal_ros.bagio.chunks import pack
+from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.recover import Channel
+from odocal_ros.config import Config, flat, with_settings
+from odocal_ros.live import journal_leg, journal_writer
+from odocal_ros.live.journal_leg import LegJournal, Plan
+from odocal_ros.live.journal_space import claim, journals, make_room, size_of
+from odocal_ros.live.journal_text import journal_text
+from odocal_ros.live.journal_writer import PreRoll
+from odocal_ros.offline.journal import journal_notes
+
+SECOND = 10**9
+
+
+def test_settings_come_back_to_the_last_bit(tmp_path):
+    config = with_settings(Config(), {
+        'odometer.left': 'on', 'odometer.right': '0', 'odometer.field': 'a "b" [1e3]',
+        'output.directory': '/home/jörg/a: b', 'alignment.heading': 0.1 + 0.2,
+        'odometer.nominal_scale': 1e-5, 'reference.start': (48.1, 11.5, 1e-7, 2),
+        'odometer.signed': False, 'journal.max_bytes': 2**40, 'output.formats': ()})
+    topics = {'imu': '/car/imu', 'odometer': '/car/joint states'}
+    (tmp_path / JOURNAL).write_text(journal_text(config, 3, 5, topics), encoding='utf-8')
+    found = journal_notes(tmp_path)
+    assert found.topics == topics
+    wanted = flat(config)
+    assert set(found.settings) == set(wanted)
+    for name, value in wanted.items():
+        got = found.settings[name]
+        assert type(got) is type(value), name
+        assert got == value or math.isnan(got) and math.isnan(value), name
+    assert journal_notes(tmp_path / 'some.mcap').path == found.path    # a file of it, too
+    assert journal_notes(tmp_path.parent) is None
+
+
+def journal(root, name, size, age):
+    """Make a folder that looks like a journal of some bytes."""
+    folder = root / name
+    folder.mkdir(parents=True)
+    (folder / JOURNAL).touch()
+    os.utime(folder / JOURNAL, ns=(0, -age * SECOND + 10**18))
+    (folder / 'part.mcap').write_bytes(bytes(size))
+    return folder
+
+
+def test_the_oldest_journals_go_first_and_nothing_else(tmp_path):
+    old, middle, new = (journal(tmp_path, name, 1000, age)
+                        for name, age in (('c', 3), ('b', 2), ('a', 1)))
+    (tmp_path / 'calibration').mkdir()
+    (tmp_path / 'calibration' / 'result').write_bytes(bytes(5000))
+    (tmp_path / 'link').symlink_to(new)
+    assert journals(tmp_path) == [old, middle, new]
+    assert make_room(tmp_path, 3000) == 3000
+    assert make_room(tmp_path, 3000, needed=1) == 2000
+    assert journals(tmp_path) == [middle, new]
+    with claim(middle):                                 # a node is writing to it
+        assert make_room(tmp_path, 1500) == 1000
+        assert journals(tmp_path) == [middle]
+        assert make_room(tmp_path, 10) == 1000
+    assert make_room(tmp_path, 10) == 0
+    assert (tmp_path / 'calibration' / 'result').exists()
+    assert make_room(tmp_path / 'none', 10) == 0
+
+
+def chunk(k, size=100_000):
+    """Return a chunk that does not compress."""
+    return pack(1, [k * SECOND], [os.urandom(size)])
+
+
+def leg(root, limit, leg_id=1):
+    """Return the journal of a leg, not begun."""
+    return LegJournal(Plan(leg_id, root, f'leg_{leg_id}', '', limit),
+                      {1: Channel('/odometer', 'std_msgs/msg/Int64')}, [])
+
+
+def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'MARGIN', 10_000)
+    limit = 1_000_000
+    for leg_id in range(1, 5):
+        one = leg(tmp_path, limit, leg_id)
+        for k in range(3):
+            one.put([chunk(k)])
+            assert sum(size_of(folder) for folder in journals(tmp_path)) <= limit
+        one.finish()
+        assert one.trouble == ''
+    assert len(journals(tmp_path)) in (2, 3)
+    assert [f.name for f in journals(tmp_path)][-1] == 'leg_4'
+
+
+def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'MARGIN', 10_000)
+    journal(tmp_path, 'old', 1000, 1)
+    one = leg(tmp_path, 500_000)
+    for k in range(20):
+        one.put([chunk(k)])
+    assert 'journal.max_bytes is used up' in one.trouble
+    one.finish()
+    folder, = journals(tmp_path)
+    assert size_of(folder) <= 500_000
+    with open_bag(folder) as bag:
+        # each is joined once more for a moment: two of them, and the two that are copied
+        assert 2 <= bag.topics['/odometer'].count <= 4
+        assert bag.start_ns == 0
+
+
+def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal_leg, 'MOST_WAITING', 350_000)
+    one = leg(tmp_path / 'file' / 'journal', 10**9)
+    (tmp_path / 'file').touch()
+    for k in range(3):
+        one.put([chunk(k)])
+    assert 'Not a directory' in one.trouble
+    (tmp_path / 'file').unlink()
+    one.put([chunk(3)])                # the disk is there again: nothing is lost
+    assert one.trouble == ''
+    with open_bag(one.folder) as bag:
+        assert bag.topics['/odometer'].count == 4
+    monkeypatch.setattr(one._bag, 'append', lambda _: (_ for _ in ()).throw(OSError(28, 'full')))
+    for k in range(4, 9):
+        one.put([chunk(k)])
+    assert 'it is not tried again in this leg' in one.trouble
+    assert not one._waiting
+    monkeypatch.undo()
+    one.put([chunk(9)])                # a hole would be worse than an end
+    one.finish()
+    with open_bag(one.folder) as bag:
+        assert bag.topics['/odometer'].count == 4
+
+
+def test_the_preroll_reaches_back_far_enough_and_no_further():
+    preroll = PreRoll()
+    for k in range(100):
+        preroll.feed('imu', k * SECOND, chunk(k, 100), 10 * SECOND)
+        preroll.feed('fix', (k + 500) * SECOND, chunk(k, 100), 10 * SECOND)  # another clock
+    starts = [c.start_ns // SECOND for c in preroll.chunks()]
+    assert starts == sorted([*range(89, 100)] * 2)
+    assert preroll.size == sum(c.size for c in preroll.chunks())
+    preroll.clear()
+    assert (preroll.chunks(), preroll.size) == ([], 0)
+
+
+def test_the_preroll_is_bounded_in_bytes(monkeypatch):
+    monkeypatch.setattr(journal_writer, 'MOST_HELD', 1_050_000)
+    preroll = PreRoll()
+    preroll.feed('fix', SECOND, chunk(1, 100), 600 * SECOND)
+    for k in range(100):
+        preroll.feed('imu', k * SECOND, chunk(k), 600 * SECOND)
+    assert preroll.size <= 1_050_000
+    assert sum(c.size > 1000 for c in preroll.chunks()) == 10      # the heavy topic gives way
+    assert sum(c.size < 1000 for c in preroll.chunks()) == 1
+
+
+@pytest.mark.parametrize('msgtype', [
+    'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix', 'sensor_msgs/msg/JointState',
+    'nav_msgs/msg/Odometry', 'diagnostic_msgs/msg/DiagnosticArray',
+    'std_msgs/msg/Int32MultiArray', 'std_msgs/msg/UInt64', 'sensor_msgs/msg/BatteryState',
+    'geometry_msgs/msg/TwistWithCovarianceStamped', 'shape_msgs/msg/SolidPrimitive'])
+def test_definitions_are_those_of_the_message_types(msgtype):
+    rclpy = pytest.importorskip('rclpy')
+    assert rclpy
+    from rosbags.typesys import get_types_from_msg
+
+    from odocal_ros.live.definitions import definition_of
+    from odocal_ros.live.inputs import message_class
+    found = get_types_from_msg(definition_of(message_class(msgtype)), msgtype)
+    known = make.store().fielddefs
+    assert msgtype in found
+    for name, (_, fields) in found.items():
+        # constants do not come through a message class, and no byte depends on them
+        assert fields == known[name][1], name
