@@ -22,6 +22,7 @@ setup(
     author_email='maintainers@users.noreply.h-seed-08f791d2.example',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={f'{NAME}.output': ['templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
@@ -30,6 +31,8 @@ setup(
     ],
     python_requires='>=3.11',
     install_requires=[
+        'jinja2>=3.1',
+        'matplotlib>=3.6',
         'numpy>=1.26',
         'pyproj>=3.6',
         'PyYAML>=6',
@@ -43,11 +46,9 @@ setup(
             'ros-jazzy-rclpy',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
-        'plot': ['matplotlib>=3.6'],
         'dev': [
             'colcon-common-extensions',
             'hypothesis>=6',
-            'matplotlib>=3.6',
             'mpmath>=1.3',
             'mypy>=1.8',
             'pytest>=7.4',

@@ -14,7 +14,8 @@ from odocal_ros.errors import BadConfig
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
-FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs')
+FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
+           'report')
 NAN = math.nan
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 

@@ -2,6 +2,7 @@
 
 from datetime import datetime, UTC
 import json
+import os
 from pathlib import Path
 import sys
 
@@ -100,7 +101,9 @@ def _legs_of(path, args, asked, config, journal):
     from odocal_ros.leg import LegRecorder
     from odocal_ros.messages import make_reader
     from odocal_ros.offline.legs import dropped_legs, find_legs, marked_legs, OPEN_LEG
+    from odocal_ros.offline.phases import Phase
     from odocal_ros.offline.topics import choose_topics
+    quiet = args.quiet or args.json
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
@@ -115,8 +118,8 @@ def _legs_of(path, args, asked, config, journal):
                    for slot, topic in topics.items()}
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
-        with _progress(f'reading {bag.name}', args) as progress:
-            bag.read(readers, recorder.feed, progress)
+        with Phase(f'reading {bag.name}', quiet) as phase:
+            bag.read(readers, recorder.feed, phase)
         recorder.form = readers[topics['odometer']].form or recorder.form
         if 'odometer_right' in topics:
             recorder.form_right = readers[topics['odometer_right']].form
@@ -132,7 +135,8 @@ def _legs_of(path, args, asked, config, journal):
             if isinstance(note, str):
                 _tell(args, note)
         results = _calibrated(recorder, spans, config, notes, bag.name, args)
-        described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
+        with Phase(f'checksum of {bag.name}', quiet):
+            described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
     return results, described, frame
 
@@ -140,49 +144,40 @@ def _legs_of(path, args, asked, config, journal):
 def _calibrated(recorder, spans, config, notes, name, args):
     from dataclasses import replace
 
+    from odocal_ros.offline.phases import Phase
     from odocal_ros.pipeline import calibrate
     results = []
-    with _progress('calibrating', args) as progress:
+    with Phase('calibrating', args.quiet or args.json) as phase:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
+            if len(spans) > 1:
+                phase((number - 1) / len(spans), f'calibrating leg {number} of {len(spans)}')
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
             results.append(replace(calibrate(leg, config, notes=notes, holdout=args.holdout),
                                    bag=name))
-            progress(number / len(spans))
     return results
 
 
-class _progress:
-    """A bar on a terminal, nothing anywhere else; called with the share done."""
-
-    def __init__(self, title, args):
-        self._title = title
-        self._shown = sys.stderr.isatty() and not (args.quiet or args.json)
-
-    def __enter__(self):
-        if self._shown:
-            from tqdm import tqdm
-            self._bar = tqdm(total=1.0, desc=self._title, leave=False, file=sys.stderr,
-                             bar_format='{desc} {percentage:3.0f}%|{bar}| {elapsed}')
-        return self
-
-    def __call__(self, share):
-        if self._shown:
-            self._bar.update(min(share, 1.0) - self._bar.n)
-
-    def __exit__(self, *_):
-        if self._shown:
-            self._bar.close()
+def _styled(stream) -> bool:
+    """Tell whether a stream is a terminal that takes colours."""
+    return stream.isatty() and 'NO_COLOR' not in os.environ and os.environ.get('TERM') != 'dumb'
 
 
 def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
+    from odocal_ros.offline.phases import Phase
     from odocal_ros.output.files import as_json, write_results
+    from odocal_ros.output.report import NAME as REPORT
     from odocal_ros.output.summary import screen
     from odocal_ros.output.worse import replacing, stored_in
     from odocal_ros.reasons import Verdict
     created = datetime.now(UTC).isoformat(timespec='seconds')
     old = stored_in(output)
-    written = write_results(calibration, config, output, inputs, created, force=args.force)
+    troubles: list[str] = []
+    with Phase('writing the results', args.quiet or args.json):
+        written = write_results(calibration, config, output, inputs, created, force=args.force,
+                                tell=troubles.append)
+    for trouble in troubles if not args.quiet else ():
+        print(f'odocal: {trouble}', file=sys.stderr)
     worse = replacing(old, output)
     if worse and not args.quiet:
         print(f'odocal: {output}: a better calibration was replaced, as --force asks: {worse}',
@@ -191,8 +186,11 @@ def _report(calibration, config, inputs, output, args) -> int:
         json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
         print()
     elif not args.quiet:
-        print(screen(calibration))
+        print(screen(calibration, styled=_styled(sys.stdout)))
         if args.holdout:
             print('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
-        print(f'\nwritten: {output}/ ({", ".join(p.name for p in written)})')
+        others = ', '.join(p.name for p in written if p.name != REPORT)
+        print(f'\nwritten: {output}/ ({others})')
+        if output / REPORT in written and not troubles:
+            print(f'report:  {output / REPORT}')
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK

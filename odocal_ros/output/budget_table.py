@@ -3,6 +3,8 @@
 import math
 import textwrap
 
+from odocal_ros.output.figures import two_digits
+
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
 WIDTHS = (14, 16, 16)
@@ -38,7 +40,7 @@ def budget_lines(table: dict, scale: float, shown: float, hidden=()) -> list[str
             small.append(name)
             continue
         cells = ['-' if share < shown else
-                 f'{row[p] * factor.get(p, math.degrees(1.0)):.2g} {share:>4.0%}'
+                 f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(COLUMNS, shares, strict=True)]
         lines.append(f'  {name.replace("_", " "):<20}' + ''.join(
             f'{cell:>{width}}' for cell, width in zip(cells, WIDTHS, strict=True))

@@ -23,6 +23,22 @@ def with_sigma(value: float, sigma: float | None, factor: float = 1.0,
     return f'{value:{"+" if signed else ""}.{places}f} ± {sigma:.{places}f}'
 
 
+def two_digits(x: float) -> str:
+    """Return a number with two digits that count, without an exponent where it is readable."""
+    if not math.isfinite(x):
+        return 'unknown'
+    if x == 0 or not 1e-4 <= abs(x) < 1e7:
+        return f'{x:.2g}'
+    places = 1 - math.floor(math.log10(abs(x)))
+    return f'{round(x, places):.{max(0, places)}f}'
+
+
+def share(relative: float) -> str:
+    """Return a relative sigma as people say it: ppm, or per cent from one on."""
+    return f'{two_digits(100 * relative)} %' if relative >= 0.01 else (
+        f'{two_digits(1e6 * relative)} ppm')
+
+
 def length(metres: float) -> str:
     """Return a length with a sensible unit and number of digits."""
     if not math.isfinite(metres):

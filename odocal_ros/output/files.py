@@ -4,6 +4,7 @@ Result files: calibration.json (schema 1) and what other programs load.
 A file is written whole or not at all: into a temporary one beside it, then renamed.
 """
 
+from collections.abc import Callable
 import json
 import math
 import os
@@ -17,6 +18,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
+from odocal_ros.output.report import NAME as REPORT, report_or_why
 from odocal_ros.output.summary import overall
 
 SCHEMA = 1
@@ -109,12 +111,13 @@ def _plain(value):
 
 
 def write_results(calibration: Calibration, config: Config, directory: Path, inputs: list[dict],
-                  created: str, force: bool = False) -> list[Path]:
+                  created: str, force: bool = False,
+                  tell: Callable[[str], None] = lambda note: None) -> list[Path]:
     """
-    Write the result files and return their paths, calibration.json first.
+    Write the result files and return their paths, calibration.json first, the report last.
 
     Files of formats that this result does not give are removed, so that a folder never holds
-    parts of two calibrations.
+    parts of two calibrations. ``tell`` is given a sentence when the report cannot be drawn.
 
     Raises
     ------
@@ -129,16 +132,22 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
     content = as_json(calibration, config, inputs, created)
     texts = {MAIN: json.dumps(content, indent=2, allow_nan=False) + '\n'}
     texts |= ros_files.texts(calibration, config, content)
+    wanted = {REPORT} if 'report' in config.output.formats else set()
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for name in ros_files.NAMES - set(texts):
+        for name in (ros_files.NAMES | {REPORT}) - set(texts):
             (directory / name).unlink(missing_ok=True)
         for name in sorted(texts, key=MAIN.__eq__):     # the main file last: it vouches for all
             write_whole(directory / name, texts[name])
+        if wanted:      # it takes a second to draw: the numbers are safe by then
+            page, why = report_or_why(calibration, config, content)
+            write_whole(directory / REPORT, page)
+            if why:
+                tell(f'{directory / REPORT}: not drawn: {why}')
     except OSError as error:
         raise BadUsage(f'{directory}: results cannot be written ({error.strerror}); choose a '
                        'folder that can (--output, or output.directory of the node)') from None
-    return [directory / name for name in texts]
+    return [directory / name for name in [*texts, *wanted]]
 
 
 def write_whole(path: Path, text: str) -> None:

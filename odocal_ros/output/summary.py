@@ -5,6 +5,7 @@ from datetime import datetime, UTC
 import math
 import textwrap
 
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, time_span, with_sigma
@@ -20,14 +21,20 @@ DEG_PER_HOUR = DEG * 3600
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
+COLOURS = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
 ORDER = list(Verdict)
 NONE = Estimate(None, None, '')
 
 
-def screen(calibration: Calibration) -> str:
-    """Return everything a person needs to judge a calibration, as plain text."""
-    parts = [_head(calibration), _values(calibration), _leg_table(calibration.legs),
-             _check(calibration.legs), _budget(calibration), _reasons(calibration.reasons)]
+def screen(calibration: Calibration, styled: bool = False) -> str:
+    """
+    Return everything a person needs to judge a calibration, as plain text.
+
+    styled : the verdict in bold and in colour, for a terminal.
+    """
+    parts = [_head(calibration, styled), _values(calibration), _leg_table(calibration.legs),
+             _method_table(calibration.methods), _check(calibration.legs), _budget(calibration),
+             _reasons(calibration.reasons)]
     return '\n\n'.join('\n'.join(part) for part in parts if part)
 
 
@@ -72,10 +79,13 @@ def _with_unit(estimate):
     return with_sigma(estimate.value, estimate.sigma) + unit
 
 
-def _head(calibration):
+def _head(calibration, styled):
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
-    return [f'{calibration.verdict.value.upper()}: {MEANING[calibration.verdict]}',
+    verdict = calibration.verdict.value.upper()
+    if styled:
+        verdict = f'\x1b[1;{COLOURS[calibration.verdict]}m{verdict}\x1b[0m'
+    return [f'{verdict}: {MEANING[calibration.verdict]}',
             f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
             f'{time_span(duration)}']
 
@@ -146,14 +156,30 @@ def _leg_table(legs):
     rows = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes', 'scale factor', 'yaw, deg',
              'verdict')]
     rows += [(str(number), *_leg_row(leg)) for number, leg in enumerate(legs, 1)]
+    return _columns(rows) if legs else []
+
+
+def _columns(rows):
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ['  ' + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-                             ).rstrip() for row in rows] if legs else []
+                             ).rstrip() for row in rows]
+
+
+def _method_table(methods):
+    """Return the methods side by side, nothing for one."""
+    if len(methods) < 2:
+        return []
+    rows = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
+    for name, method in methods.items():
+        scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
+        rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
+                     *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
+                       for a in angles), method.verdict.value))
+    return _columns(rows)
 
 
 def _leg_row(leg: LegResult):
-    method = min(leg.methods.values(), key=lambda m: ORDER.index(m.verdict), default=None)
-    estimates = {} if method is None else method.estimates
+    estimates = leg_estimates(leg)
     scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)

@@ -13,7 +13,7 @@ def test_each_source_has_its_size_and_share_in_the_units_people_use():
     head, fix, heading, small = budget_lines(TABLE, 0.02, 0.01)
     assert head.split() == ['error', 'budget', 'scale,', 'ppm', 'yaw,', 'deg', 'pitch,', 'deg']
     # 4e-5 of 0.02 is 2000 ppm; 3e-3 rad is 0.17 deg and 9 of 25 parts of the variance
-    assert fix.split() == ['fix', 'end', '2e+03', '100%', '0.17', '36%', '-']
+    assert fix.split() == ['fix', 'end', '2000', '100%', '0.17', '36%', '-']
     assert heading.split() == ['initial', 'heading', '-', '0.23', '64%', '-', 'shared', 'by',
                                'all', 'legs']
     assert small.split() == ['under', '1', '%:', 'quantisation']

@@ -101,8 +101,8 @@ def test_a_folder_never_holds_parts_of_two_calibrations(good, nothing, tmp_path)
     write_results(good, Config(), tmp_path, INPUTS, CREATED)
     assert (tmp_path / 'imu_transform.urdf').exists()
     write_results(nothing, Config(), tmp_path, INPUTS, CREATED, force=True)
-    assert {p.name for p in tmp_path.iterdir()} == {'calibration.json', 'calibration.yaml',
-                                                    'mine.txt'}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        'calibration.json', 'calibration.yaml', 'report.html', 'mine.txt'}
 
 
 def test_only_the_asked_formats_are_written(good, tmp_path):
@@ -140,11 +140,12 @@ def test_a_reader_of_the_old_file_reads_it_to_its_end(tmp_path):
     assert path.read_text() == 'new'
 
 
-def test_the_main_file_comes_last(good, tmp_path, monkeypatch):
+def test_the_main_file_comes_after_all_that_it_vouches_for(good, tmp_path, monkeypatch):
     order = []
     whole = write_whole
     monkeypatch.setattr(files, 'write_whole',
                         lambda path, text: (order.append(path.name), whole(path, text)))
     write_results(good, Config(), tmp_path, INPUTS, CREATED)
-    assert order[-1] == 'calibration.json'
-    assert len(order) > 3
+    # the report takes a second to draw: nothing waits for it
+    assert order[-2:] == ['calibration.json', 'report.html']
+    assert len(order) > 4

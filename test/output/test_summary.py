@@ -66,6 +66,24 @@ def test_the_sentence_is_one_line_with_the_figures(good, rejected):
     assert sentence(rejected).startswith('rejected: scale factor 0.05')
 
 
+def test_colour_is_for_terminals_that_ask_for_it(good):
+    assert '\x1b' not in screen(good)
+    assert screen(good, styled=True).startswith('\x1b[1;32mACCEPTED\x1b[0m: fit for use')
+    assert screen(good, styled=True).count('\x1b') == 2
+
+
+def test_methods_stand_side_by_side_where_there_are_several(good):
+    assert 'method  ' not in screen(good)
+    other = replace(good.methods['two_point'], name='smoother', estimates={
+        'scale_factor': Estimate(0.05001, 2e-6, 'm/pulse')})
+    text = screen(replace(good, methods=good.methods | {'smoother': other}))
+    rows = [line.split() for line in text.splitlines()
+            if line.startswith(('  two_point', '  smoother'))]
+    assert rows == [
+        ['two_point', '0.0500000', '±', '0.0000012', '-1.0000', '±', '0.0029', '-', 'accepted'],
+        ['smoother', '0.0500100', '±', '0.0000020', '-', '-', 'accepted']]
+
+
 def test_speeds_have_no_pulses(good):
     speed = good.estimates | {'scale_factor': Estimate(0.98, 1e-3, '1')}
     calibration = replace(good, estimates=speed)

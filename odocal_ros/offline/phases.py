@@ -1,0 +1,58 @@
+"""What a command is at, on a terminal: one line that is gone when the result comes."""
+
+from shutil import get_terminal_size
+import sys
+import threading
+
+TICK_S = 0.5      # the clock of a phase goes on while nothing is told
+BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
+CLOCK = '{desc:<26} {elapsed}'
+
+
+class Phase:
+    """
+    A phase of the work, as a context; called with the share done, if there is one to tell.
+
+    Parameters
+    ----------
+    title : str
+        What is being done.
+    quiet : bool
+        Show nothing. Nothing is shown either where the error stream is no terminal.
+
+    """
+
+    def __init__(self, title: str, quiet: bool = False) -> None:
+        self._title = title
+        self._shown = not quiet and sys.stderr is not None and sys.stderr.isatty()
+        self._over = threading.Event()
+
+    def __enter__(self) -> 'Phase':
+        if self._shown:
+            from tqdm import tqdm
+            columns, rows = get_terminal_size()     # 80, 24 where the terminal tells none
+            self._bar = tqdm(total=1.0, desc=self._title, leave=False, file=sys.stderr,
+                             bar_format=CLOCK, mininterval=0.0,
+                             ncols=columns, nrows=rows)
+            self._ticker = threading.Thread(target=self._tick, daemon=True)
+            self._ticker.start()
+        return self
+
+    def __call__(self, share: float, title: str = '') -> None:
+        """Tell the share done, and what comes now if it has a name of its own."""
+        if self._shown:
+            self._bar.bar_format = BAR
+            if title:
+                self._bar.set_description_str(title, refresh=False)
+            self._bar.n = min(max(share, 0.0), 1.0)
+            self._bar.refresh()
+
+    def __exit__(self, *_) -> None:
+        if self._shown:
+            self._over.set()
+            self._ticker.join()
+            self._bar.close()
+
+    def _tick(self):
+        while not self._over.wait(TICK_S):
+            self._bar.refresh()

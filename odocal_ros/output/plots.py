@@ -1,0 +1,168 @@
+"""The figures of a leg, from its evidence: track, residuals, scale by section, speed, fixes."""
+
+import numpy as np
+
+from odocal_ros.calib.evidence import Evidence
+from odocal_ros.output.plots_svg import (
+    BAND,
+    BLUE,
+    evenly,
+    GREEN,
+    GREY,
+    key,
+    lengths,
+    MOST_MARKS,
+    PINK,
+    RED,
+    relative,
+    sheet,
+    svg,
+    thinned,
+)
+
+STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
+          1: ('satellite based aid, SBAS (1)', 's', GREEN),
+          2: ('ground based aid, GBAS or RTK (2)', '^', PINK)}
+
+
+def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None) -> list[tuple]:
+    """
+    Draw a leg.
+
+    Parameters
+    ----------
+    found : Evidence
+        Of the leg.
+    name : str
+        Put before the ids of each figure.
+    scale_sigma : float, optional
+        Relative sigma of the leg's scale: the band about zero of the sections.
+
+    Returns
+    -------
+    (title, what it shows, svg element) of each figure; to be called under ``plots_svg.look``.
+
+    """
+    if not len(found.t):
+        return []
+    figures = [_track(found, name)]
+    if len(found.t_fix):
+        figures.append(_residuals(found, name))
+    if np.isfinite(found.sections.ratio).any():
+        figures.append(_sections(found, name, scale_sigma))
+    figures.append(_motion(found, name))
+    if len(found.t_fix) or len(found.t_excluded):
+        figures.append(_fixes(found, name))
+    return figures
+
+
+def _track(found, name):
+    start = found.track_n[0]
+    factor, unit = lengths(np.ptp(found.track_n[:, :2], axis=0).max())
+    after, before, fixes = (factor * (x - start)[:, :2] for x in (
+        found.track_n, found.track_before_n, found.fix_n))
+    figure, (ax,) = sheet(5.2)
+    few = evenly(len(fixes))
+    ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
+    ax.plot(*before[thinned(before)].T, '--', color=RED, label='as configured', linewidth=1.2)
+    ax.plot(*after[thinned(after)].T, '-', color=BLUE, label='as calibrated')
+    ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
+    ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
+    for point, word in ((after[0], 'start'), (after[-1], 'stop')):
+        ax.annotate(word, point, xytext=(6, 5), textcoords='offset points')
+    ax.set(xlabel=f'east of the start, {unit}', ylabel=f'north of the start, {unit}')
+    ax.set_aspect('equal', adjustable='datalim')
+    ax.margins(0.06)
+    key(figure, ax)
+    says = ('Dead reckoning over the fixes. Both tracks begin at the start mark; the line as '
+            'calibrated should cover the fixes.')
+    return 'Track', says, svg(figure, f'{name}-track', says)
+
+
+def _residuals(found, name):
+    factor, unit = lengths(found.distance[-1])
+    way, sigma = factor * found.fix_distance, found.fix_sigma
+    figure, axes = sheet(5.2, 3)
+    rows = thinned(found.residual)
+    for ax, column, word in zip(axes, found.residual.T, ('along', 'across'), strict=False):
+        band = evenly(len(way))
+        ax.fill_between(way[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
+                        label='± sigma of a fix')
+        ax.axhline(0.0, color=GREY, linewidth=0.8)
+        ax.plot(way[rows], column[rows], '-', color=BLUE, linewidth=0.9, label='as calibrated')
+        ax.set_ylabel(f'{word}, m')
+    rows = thinned(found.residual_before)
+    for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
+                                  strict=True):
+        axes[2].plot(way[rows], column[rows], dash, color=RED, linewidth=1.3,
+                     label=f'as configured, {word}')
+    axes[2].axhline(0.0, color=GREY, linewidth=0.8)
+    axes[2].set(xlabel=f'distance driven, {unit}', ylabel='as configured, m')
+    axes[2].legend(loc='best', ncols=2)
+    key(figure, axes[0])
+    figure.align_ylabels(axes)
+    says = ('Dead reckoning less fix. Along > 0: it runs ahead of the fix; across > 0: it lies '
+            'to the left. A slope along is a wrong scale, a bow across a turning heading.')
+    return 'Residuals', says, svg(figure, f'{name}-residuals', says)
+
+
+def _sections(found, name, scale_sigma):
+    part = found.sections
+    factor, unit = lengths(found.distance[-1])
+    middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
+    off = part.ratio - 1
+    times, word = relative(np.nanmax(np.abs(off) + part.sigma))
+    figure, (ax,) = sheet(2.7)
+    if scale_sigma:
+        ax.axhspan(-scale_sigma * times, scale_sigma * times, color=BAND, linewidth=0,
+                   label='± sigma of the result')
+    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    ax.hlines(off * times, middle - half, middle + half, color=BLUE, linewidth=1.1)
+    ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=BLUE, markersize=4.5,
+                capsize=3, linewidth=1.1, label='section, ± its sigma')
+    ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale less result, {word}')
+    ax.set_xlim(0.0, factor * found.distance[-1])
+    key(figure, ax)
+    says = ('Length by the fixes over length dead reckoned as calibrated, in equal parts of the '
+            'way; the bars are one sigma of what the fixes leave there. Slip, an odometer delay '
+            '(at starts and stops) or bad fixes show as sections that stand out. Errors of the '
+            'fixes that change more slowly than over a section are not in its bar.')
+    return 'Scale by section', says, svg(figure, f'{name}-sections', says)
+
+
+def _motion(found, name):
+    figure, (upper, lower) = sheet(3.6, 2)
+    speed, turn = 3.6 * found.speed, np.rad2deg(found.yaw_rate)
+    rows = thinned(speed)
+    upper.plot(found.t[rows], speed[rows], '-', color=BLUE, linewidth=1.0)
+    rows = thinned(turn)
+    lower.plot(found.t[rows], turn[rows], '-', color=BLUE, linewidth=1.0)
+    for ax in (upper, lower):
+        ax.axhline(0.0, color=GREY, linewidth=0.8)
+    upper.set_ylabel('speed, km/h')
+    lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')
+    figure.align_ylabels([upper, lower])
+    says = ('Speed by the odometer as calibrated (below zero: reversing) and turn rate by the '
+            'gyro (above zero: to the left), each over one second.')
+    return 'Speed and turn rate', says, svg(figure, f'{name}-motion', says)
+
+
+def _fixes(found, name):
+    figure, (ax,) = sheet(2.7)
+    for status in np.unique(found.fix_status):
+        rows = np.flatnonzero(found.fix_status == status)
+        rows = rows[evenly(len(rows), MOST_MARKS // 2)]
+        label, shape, colour = STATUS.get(int(status), (f'status {status}', 'D', GREY))
+        ax.plot(found.t_fix[rows], found.fix_sigma[rows], shape, color=colour, markersize=3.5,
+                markeredgewidth=0 if shape != 'x' else 1, label=label)
+    rows = evenly(len(found.t_excluded))
+    if len(rows):
+        ax.plot(found.t_excluded[rows], np.zeros(len(rows)), 'x', color=RED, markersize=5,
+                clip_on=False, zorder=5, label='not used')
+    ax.set(xlabel='time since the start mark, s', ylabel='sigma of a fix, m')
+    top = float(found.fix_sigma.max(initial=0.0))
+    ax.set_ylim(0.0, 1.25 * top if top else 1.0)
+    key(figure, ax)
+    says = ('Horizontal sigma of each axis, as stated (or gnss.default_sigma), by status. '
+            'Crosses at the foot: fixes that were not used.')
+    return 'Fix quality', says, svg(figure, f'{name}-fixes', says)

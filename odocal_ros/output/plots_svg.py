@@ -1,0 +1,114 @@
+"""How figures become parts of a page: one look, SVG with text as text, nothing left outside."""
+
+from contextlib import contextmanager
+import io
+import re
+
+import numpy as np
+
+# Okabe and Ito's colours, told apart by colour-blind eyes too; shapes and dashes tell in grey
+BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
+GREY, BAND = '0.45', '0.90'
+WIDTH = 5.6          # inch
+GRID = {'color': '0.90', 'linewidth': 0.6}
+MOST_POINTS = 1200   # of a line
+MOST_MARKS = 400     # of single marks
+LOOK = {'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
+        'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
+        'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
+        'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
+        'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
+
+
+@contextmanager
+def look():
+    """Hold the look while figures are made and written; nothing of it stays."""
+    from matplotlib import rc_context
+    with rc_context(LOOK):
+        yield
+
+
+def sheet(height, rows=1, sharex=True):
+    """Return a figure of ``height`` inch and its axes, one above the other, as an array."""
+    from matplotlib.figure import Figure
+    figure = Figure(figsize=(WIDTH, height))
+    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False)[:, 0]
+    figure.subplots_adjust(left=0.135, right=0.975, top=1 - 0.32 / height,
+                           bottom=0.48 / height, hspace=0.16)
+    for ax in axes:
+        ax.grid(**GRID)
+    return figure, axes
+
+
+def key(figure, axes, columns=3):
+    """Put the legend above the axes, where it hides nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc='upper center', ncols=columns, borderpad=0.1,
+                      handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
+
+
+def svg(figure, name: str, says: str) -> str:
+    """
+    Return a figure as an svg element.
+
+    Parameters
+    ----------
+    figure : Figure
+        Made under ``look``.
+    name : str
+        Put before each id in it: a page holds many figures.
+    says : str
+        For those who cannot see it.
+
+    """
+    from html import escape
+
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    out = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(out, metadata={
+        'Creator': None, 'Date': None, 'Format': None, 'Type': None})
+    text = out.getvalue()
+    text = text[text.index('<svg'):].strip()
+    text = re.sub(r'<defs>\s*<style.*?</style>\s*</defs>\s*', '', text, count=1, flags=re.DOTALL)
+    text = re.sub(r'<!--.*?-->\s*', '', text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'((?:xlink:)?href="|url\()#', rf'\1#{name}-', text)
+    head, _, rest = text.partition('>')
+    box = re.search(r'viewBox="[^"]*"', head).group(0)
+    return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
+
+
+def thinned(y, most=MOST_POINTS):
+    """
+    Return rows of a line that keep its peaks, and both its ends: (m,) int.
+
+    Of each piece of equally many rows the least and the greatest y are kept (of all columns).
+    """
+    y = np.asarray(y, float)
+    n = len(y)
+    if n <= most:
+        return np.arange(n)
+    columns = y.reshape(n, -1).T
+    edges = np.linspace(0, n, most // (2 * len(columns)) + 1).astype(int)
+    keep = {0, n - 1}
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for column in np.nan_to_num(columns[:, a:b]):
+            keep |= {a + int(column.argmin()), a + int(column.argmax())}
+    return np.array(sorted(keep))
+
+
+def evenly(n, most=MOST_MARKS):
+    """Return at most ``most`` row numbers of n, both ends included: (m,) int."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else \
+        np.empty(0, int)
+
+
+def lengths(metres):
+    """Return the factor and the unit for lengths up to so many metres."""
+    return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
+
+
+def relative(most):
+    """Return the factor and the unit for relative figures up to so much."""
+    return (100.0, '%') if most > 0.005 else (1e6, 'ppm')

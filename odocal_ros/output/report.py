@@ -1,0 +1,151 @@
+"""report.html: one page that needs no network, for the eye that must believe a calibration."""
+
+from datetime import datetime, UTC
+from html import escape
+from importlib.resources import files
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.config import Config
+from odocal_ros.output import report_tables as tables
+from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.output.summary import known, MEANING, overall, sentence
+from odocal_ros.reasons import Reason, Verdict
+
+NAME = 'report.html'
+MOST_BYTES = 2_600_000     # of figures; a page stays under 3 MB with its tables
+TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Take care',
+          Verdict.ACCEPTED: 'Notes'}
+
+
+def report_html(calibration: Calibration, config: Config, content: dict) -> str:
+    """
+    Return the page of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The combination of all legs; what a leg lacks (track, evidence) is left out.
+    config : Config
+        Settings it was made with.
+    content : dict
+        Of calibration.json, for what is told of bags and software.
+
+    Raises
+    ------
+    ImportError
+        matplotlib or jinja2 is missing.
+
+    """
+    from jinja2 import Environment, StrictUndefined
+    folder = files('odocal_ros.output') / 'templates'
+    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+                       lstrip_blocks=True).from_string(
+        (folder / 'report.html').read_text(encoding='utf-8'))
+    style = (folder / 'report.css').read_text(encoding='utf-8')
+    legs, compared, missing = _drawn(calibration)
+    return page.render(style=style, legs=legs, compared=compared, missing=missing,
+                       **_context(calibration, config, content)) + '\n'
+
+
+def report_or_why(calibration: Calibration, config: Config, content: dict) -> tuple[str, str]:
+    """
+    Return the page and why it could not be drawn, empty when it was.
+
+    A picture must never cost a result: whatever goes wrong, the page says so instead.
+    """
+    try:
+        return report_html(calibration, config, content), ''
+    except ImportError as error:
+        why = f'{error.name or error} cannot be imported; install matplotlib and jinja2'
+    except Exception as error:     # noqa: BLE001 the numbers are written, whatever happens here
+        why = f'{type(error).__name__}: {error}; please report it'
+    return ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>No report</title>'
+            f'</head><body><p>The report could not be drawn: {escape(why)}. All numbers are in '
+            'calibration.json.</p></body></html>\n', why)
+
+
+def _context(calibration, config, content):
+    legs = calibration.legs
+    distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
+    checks = [overall([(getattr(leg, name), leg.fixes) for leg in legs])
+              for name in ('before', 'after')]
+    bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
+    return {
+        'title': ', '.join(bags) or 'live drive', 'created': content['created'],
+        'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
+        'sentence': sentence(calibration).partition(': ')[2],
+        'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
+               f'{time_span(duration)}',
+        'values': tables.value_rows(calibration), 'rotation': calibration.imu_rotation_rpy,
+        'reasons': grouped(calibration.reasons), 'check': tables.check_rows(*checks),
+        'methods': tables.method_table(calibration.methods),
+        'budgets': _budgets(calibration.methods), 'inputs': content['inputs'],
+        'settings': tables.changed_settings(config),
+        'versions': tables.versions(content['software']),
+        'digits': tables.full_digits(content)}
+
+
+def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
+    """Return reasons by gravity, the gravest first: (gravity, title, reasons)."""
+    groups = [(v.value, title, [r for r in reasons if r.code.gravity is v])
+              for v, title in TITLES.items()]
+    return [group for group in groups if group[2]]
+
+
+def _budgets(methods):
+    found = [(tables.label(name), tables.budget_table(m)) for name, m in methods.items()]
+    return [(name, table) for name, table in found if table]
+
+
+def _drawn(calibration):
+    """Return what is told of each leg, the figure of all, and how many legs have no figures."""
+    from odocal_ros.output.plots import leg_figures
+    from odocal_ros.output.plots_compare import compared
+    from odocal_ros.output.plots_svg import look
+    legs, size, missing = [], 0, 0
+    with look():
+        together = compared(calibration, 'all')
+        for number, leg in enumerate(calibration.legs, 1):
+            figures = []
+            if leg.evidence is not None and size < MOST_BYTES:
+                figures = leg_figures(leg.evidence, f'leg{number}', _relative(leg))
+                size += sum(len(drawing) for _, _, drawing in figures)
+                if size > MOST_BYTES:
+                    figures, missing = [], missing + 1
+            elif leg.evidence is not None:
+                missing += 1
+            legs.append(_leg(number, leg, figures, several=len(calibration.legs) > 1))
+    return legs, together, missing
+
+
+def _leg(number, leg: LegResult, figures, several):
+    rows, findings = tables.left_out(leg)
+    return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
+            'start': _utc(leg.start_ns), 'stop': _utc(leg.stop_ns), 'figures': figures,
+            'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),
+                      ('Imu samples', leg.imu_samples), ('odometer messages', leg.pulses),
+                      ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
+            'methods': tables.method_table(leg.methods),
+            'budgets': _budgets(leg.methods) if several else [],
+            'check': tables.check_rows(leg.before, leg.after) if several else [],
+            'reasons': grouped(leg.reasons) if several else [],
+            'left_out': rows, 'findings': findings, 'scale': _scale(leg)}
+
+
+def _relative(leg):
+    scale = next((known(m.estimates, 'scale_factor') for m in leg.methods.values()
+                  if known(m.estimates, 'scale_factor').value), None)
+    return scale.sigma / abs(scale.value) if scale is not None and scale.sigma else None
+
+
+def _scale(leg):
+    scale = next((known(m.estimates, 'scale_factor') for m in leg.methods.values()
+                  if known(m.estimates, 'scale_factor').value), None)
+    return '' if scale is None else f'{with_sigma(scale.value, scale.sigma)} {scale.unit}'
+
+
+def _utc(stamp_ns):
+    try:
+        return f'{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC'
+    except (ValueError, OverflowError, OSError):
+        return f'{stamp_ns} ns'

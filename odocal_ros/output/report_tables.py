@@ -1,0 +1,202 @@
+"""The tables of the report as rows of text: values, methods, budget, what was left out, origin."""
+
+from collections import Counter
+import math
+
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
+from odocal_ros.config import Config, flat, SETTINGS
+from odocal_ros.output.figures import length, share, two_digits, with_sigma
+from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known, PPM
+from odocal_ros.reasons import Code, Reason
+
+LABELS = {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
+          'yaw_mounting_angle': 'yaw mounting angle',
+          'pitch_mounting_angle': 'pitch mounting angle',
+          'scale_factor_left': 'scale factor, left wheel',
+          'scale_factor_right': 'scale factor, right wheel'}
+LOST = 'not determined'
+WORTH_A_ROW = 0.005      # share of a variance
+OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
+           Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
+           Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
+           Code.WHEEL_COUNTERS_DIFFER}
+CHECKS = (('as configured', 'before'), ('as calibrated', 'after'))
+
+
+def label(name: str) -> str:
+    """Return the name of an estimate or a source as people say it."""
+    return LABELS.get(name, name.replace('_', ' '))
+
+
+def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
+    """Return an estimate in its first unit, in another, and its relative sigma, as text."""
+    value, sigma, unit = estimate.value, estimate.sigma, estimate.unit
+    if value is None:
+        return LOST, '', ''
+    native = with_sigma(value, sigma) + (f' {unit}' if unit not in ('', '1') else '')
+    if unit == 'rad':
+        return f'{with_sigma(value, sigma, DEG, signed=True)} deg', native, ''
+    if unit == 'rad/s':
+        return f'{with_sigma(value, sigma, DEG_PER_HOUR, signed=True)} deg/h', native, ''
+    if unit == 's':
+        return f'{with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
+    if name.startswith('scale'):
+        relative = share(sigma / abs(value)) if sigma and value else ''
+        other = inverse(estimate) if unit in COUNTS else (
+            f'{with_sigma(value - 1, sigma, PPM, signed=True)} ppm')
+        return native, other, relative
+    return native, '', ''
+
+
+def value_rows(calibration: Calibration) -> list[dict]:
+    """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
+    rows = []
+    for name in calibration.estimates:
+        estimate = known(calibration.estimates, name)
+        if name == 'scale_ratio' and estimate.value is None:
+            continue             # no nominal scale was given: nothing is missing
+        first, other, relative = in_units(name, estimate)
+        method = calibration.methods.get(estimate.method)
+        rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
+                     'method': label(estimate.method) if estimate.value is not None else '',
+                     'mostly': largest_source(method, name) if estimate.value is not None else '',
+                     'lost': estimate.value is None})
+    return rows
+
+
+def largest_source(method: MethodResult | None, name: str) -> str:
+    """Return which source of error dominates the sigma of an estimate, empty if none is told."""
+    if method is None or name not in method.parameters:
+        return ''
+    row = method.parameters.index(name)
+    shares = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    largest = max(shares, key=lambda source: shares[source], default='')
+    if not largest or not shares[largest]:
+        return ''
+    return "the legs' own errors" if largest == 'legs' else label(largest)
+
+
+def method_table(methods: dict[str, MethodResult]) -> dict | None:
+    """Return any set of methods side by side: heads, verdicts, rows of (name, cells)."""
+    if not methods:
+        return None
+    names = dict.fromkeys(n for m in methods.values() for n in m.estimates if n != 'scale_ratio'
+                          or known(m.estimates, n).value is not None)
+    rows = []
+    for name in names:
+        cells = []
+        for method in methods.values():
+            first, other, _ = in_units(name, known(method.estimates, name))
+            cells.append(('-', '') if name not in method.estimates else (first, other))
+        rows.append((label(name), cells))
+    return {'heads': [label(m) for m in methods],
+            'verdicts': [m.verdict.value for m in methods.values()], 'rows': rows,
+            'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
+
+
+def budget_table(method: MethodResult) -> dict | None:
+    """
+    Return a method's error budget: heads, rows of (source, shared, cells), small sources.
+
+    A cell is (sigma as text, share of the variance) or None below half a per cent.
+    """
+    table = method.details.get('budget') or {}
+    table = {s: row for s, row in table.items() if isinstance(row, dict)}
+    names = [n for n in dict.fromkeys(k for row in table.values() for k in row if k != 'shared')
+             if known(method.estimates, n).value is not None]
+    heads, factors = zip(*(_column(n, known(method.estimates, n)) for n in names),
+                         strict=True) if names else ((), ())
+    wholes = [sum(_number(row, n)**2 for row in table.values()) for n in names]
+    rows, small = [], []
+    for source, row in table.items():
+        shares = [_number(row, n)**2 / w if w else 0.0 for n, w in zip(names, wholes, strict=True)]
+        if max(shares, default=0.0) < WORTH_A_ROW:
+            small.append(label(source))
+            continue
+        cells = [None if part < WORTH_A_ROW else (two_digits(_number(row, n) * factor), part)
+                 for n, factor, part in zip(names, factors, shares, strict=True)]
+        rows.append((label(source), bool(row.get('shared')), cells))
+    totals = [two_digits(math.sqrt(w) * f) for w, f in zip(wholes, factors, strict=True)]
+    return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
+
+
+def _number(row, name):
+    value = row.get(name, 0.0)
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
+
+
+def _column(name, estimate):
+    """Return the head of a budget's column, and the factor on its numbers."""
+    if name.startswith('scale'):
+        return f'{label(name)}, ppm', PPM / abs(estimate.value or 1.0)
+    if estimate.unit == 'rad':
+        return f'{label(name)}, deg', DEG
+    return f'{label(name)}, {estimate.unit}', 1.0
+
+
+def check_rows(before, after) -> list[tuple]:
+    """Return the rows of dead reckoning against the fixes."""
+    return [(word, length(c.rms), length(c.mean), length(c.max), length(c.end),
+             f'{c.percent_of_distance:.3f} %')
+            for (word, _), c in zip(CHECKS, (before, after), strict=True) if c is not None]
+
+
+def left_out(leg: LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:
+    """Return fixes left out, counted by reason, and the findings about the leg's data."""
+    rows = []
+    if leg.evidence is not None:
+        seen = Counter(leg.evidence.excluded_because)
+        whole = sum(seen.values())
+        times = leg.evidence.t_excluded
+        for why, n in seen.most_common():
+            at = [t for t, w in zip(times, leg.evidence.excluded_because, strict=True) if w == why]
+            # the list is thinned out: counts are of the whole
+            count = round(n * leg.evidence.excluded / whole)
+            rows.append((f'{count} of {leg.evidence.fixes + leg.evidence.excluded} fixes',
+                         f'{why}; first at t = {min(at):.1f} s, last at t = {max(at):.1f} s'))
+    elif leg.rejected_fixes:
+        rows.append((f'{leg.rejected_fixes} fixes', 'see the reasons'))
+    return rows, [r for r in leg.reasons if r.code in OF_DATA]
+
+
+def changed_settings(config: Config) -> list[tuple[str, str, str]]:
+    """Return the settings that are not at their default: name, value, default."""
+    return [(name, _shown(value), _shown(SETTINGS[name].default))
+            for name, value in flat(config).items() if _shown(value) != _shown(
+                SETTINGS[name].default)]
+
+
+def _shown(value) -> str:
+    if isinstance(value, tuple):
+        return f'[{", ".join(_shown(v) for v in value)}]'
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, float) else str(value) or "''"
+
+
+def full_digits(content: dict) -> list[tuple[str, str, str, str, str]]:
+    """Return each number of the result as calibration.json has it: name, value, sigma, ..."""
+    rows = []
+    for name, entry in content['result'].items():
+        if name == 'imu_rotation':
+            rows += [(f'imu rotation, {key.replace("_", " ")}',
+                      LOST if numbers is None else ', '.join(map(repr, numbers)), '', '', '')
+                     for key, numbers in entry.items()]
+        else:
+            rows.append((name, *(LOST if entry[k] is None else repr(entry[k])
+                                 for k in ('value', 'sigma')),
+                         entry['unit'] or '', entry['method'] or ''))
+    return rows
+
+
+def versions(software: str) -> list[tuple[str, str]]:
+    """Return the versions of what computed and drew."""
+    from importlib.metadata import PackageNotFoundError, version
+    import platform
+    found = [('odocal_ros', software.rpartition(' ')[2]), ('Python', platform.python_version())]
+    for name in ('numpy', 'scipy', 'pyproj', 'rosbags', 'matplotlib', 'jinja2'):
+        try:
+            found.append((name, version(name)))
+        except PackageNotFoundError:
+            continue
+    return found
