@@ -44,11 +44,12 @@ def driven(domain, tmp_path_factory):
         player = Player(client.node, types, TOPICS)
         wait_for(player.matched, 'subscriptions to the topics of the page')
         calls = list(dict.fromkeys(map(tuple, of('service', 'call'))))
-        stretches = [(45, 60), (60, 117)]     # standing; driving to the next stop
-        for (name, kind), (begin, end) in zip(calls, stretches, strict=True):
-            player.play(part(sent, begin, end), SPEED)
+        # standing; driving to the next stop, and a little on: a leg ends with its last message
+        stretches = [(45, 60, 60), (60, 117, 119)]
+        for (name, kind), (begin, mark, end) in zip(calls, stretches, strict=True):
+            player.play(part(sent, begin, mark), SPEED)
             future = ask(client.node, name, kind)
-            player.play(part(sent, end, end + 1), SPEED)
+            player.play(part(sent, mark, end), SPEED)
             seen.answers[name] = answer_of(future)
         client.until(leg_event='stopped')
         seen.graph = dict(client.node.get_topic_names_and_types())
