@@ -7,7 +7,7 @@ from importlib.resources import files
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
-from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.summary import known, MEANING, overall, sentence
 from odocal_ros.reasons import Reason, Verdict
 
@@ -129,19 +129,17 @@ def _leg(number, leg: LegResult, figures, several):
             'budgets': _budgets(leg.methods) if several else [],
             'check': tables.check_rows(leg.before, leg.after) if several else [],
             'reasons': grouped(leg.reasons) if several else [],
-            'left_out': rows, 'findings': findings, 'scale': _scale(leg)}
+            'left_out': rows, 'findings': findings}
 
 
 def _relative(leg):
-    scale = next((known(m.estimates, 'scale_factor') for m in leg.methods.values()
-                  if known(m.estimates, 'scale_factor').value), None)
-    return scale.sigma / abs(scale.value) if scale is not None and scale.sigma else None
-
-
-def _scale(leg):
-    scale = next((known(m.estimates, 'scale_factor') for m in leg.methods.values()
-                  if known(m.estimates, 'scale_factor').value), None)
-    return '' if scale is None else f'{with_sigma(scale.value, scale.sigma)} {scale.unit}'
+    """Return the relative sigma of the scale by the leg's best method, None without one."""
+    order = list(Verdict)
+    for method in sorted(leg.methods.values(), key=lambda m: order.index(m.verdict)):
+        scale = known(method.estimates, 'scale_factor')
+        if scale.value and scale.sigma:
+            return scale.sigma / abs(scale.value)
+    return None
 
 
 def _utc(stamp_ns):
