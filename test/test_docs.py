@@ -104,6 +104,16 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         assert out
 
 
+def test_the_figures_of_the_page_are_those_that_are_drawn():
+    table = page_of('docs/report.md').partition('| figure |')[2].partition('\n\n')[0]
+    told = re.findall(r'^\| ([A-Z][\w ]+) \|', table, re.MULTILINE)
+    source = ''.join((ROOT / 'odocal_ros' / 'output' / name).read_text()
+                     for name in ('plots.py', 'plots_compare.py'))
+    drawn = re.findall(r"return '([^']+)', says", source)
+    assert told == drawn
+    assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()
+
+
 def test_settings_files_on_the_pages_are_taken(tmp_path):
     texts = [text for page in PAGES for text in yaml_blocks(page.read_text(encoding='utf-8'))
              if 'ros__parameters' in text]
