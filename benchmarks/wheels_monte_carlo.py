@@ -1,0 +1,159 @@
+"""
+Monte Carlo of the wheels' method, to see whether its stated sigmas hold.
+
+    python benchmarks/wheels_monte_carlo.py [--drives 200] [--processes 1] [--cell TEXT] [--file F]
+
+Each cell (scenario, IMU grade, fix noise, what is told) is driven N times with two wheels, errors
+drawn anew from what the settings believe: gyro and accelerometer biases, walks and noise, fixes,
+where the encoders' discs stand, latency of the fixes (50 ms), of the odometer (10 ms), the
+antenna's place (0.1 m), and the track width where one is given (2 %); routes of the town are drawn
+too. Printed for the scale of the mean, of each wheel, for the heading error (of alignment and
+mounting together) and the track width: mean error, RMS error, RMS of error / stated sigma, share
+within 1.96 sigmas. Goal at N = 2000: ratio 0.93 to 1.07, share 93.5 to 96.5 % (its own noise there
+is 1.6 % and 0.5 %, 1 sigma). Drive k of cell c has seed 40_000_000 + 100_000 c + k, fixed before
+the first run. Results go to the file line by line: an interrupted run goes on where it stopped.
+"""
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+import json
+import math
+import os
+from pathlib import Path
+import sys
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'calib'))
+
+import numpy as np
+
+CELLS = {
+    'town consumer white': {},
+    'town industrial white': {'imu_grade': 'industrial'},
+    'town consumer correlated': {'fix_noise': 'correlated'},
+    'straight industrial white': {'scenario': 'straight'},
+    'straight tactical white': {'scenario': 'straight', 'imu_grade': 'tactical'},
+    'town consumer white, width given': {'given': True},
+    'town industrial white, angles': {'imu_grade': 'industrial', 'odometer': 'angle'},
+    'town consumer white, outliers': {'outliers': 0.02, 'outlier_size': 30.0},
+    'town industrial correlated': {'imu_grade': 'industrial', 'fix_noise': 'correlated'},
+    'town consumer white, slip': {'slip_walk': 0.01},
+    'town consumer rtk': {'fix_noise': 'rtk'},
+    'straight industrial, width given': {'scenario': 'straight', 'given': True},
+}
+FIRST_SEED, SEEDS_A_CELL = 40_000_000, 100_000
+RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'fix_rate': 5.0}
+LATENCY, LATE_ODOMETER, ARM, WIDTH = 0.05, 0.01, 0.1, 0.02     # as the settings' defaults
+BLOCK = 20      # drives a process does before it reports
+GOAL_RATIO, GOAL_SHARE = (0.93, 1.07), (93.5, 96.5)
+
+
+def drive(number: int, k: int) -> dict:
+    """Calibrate one drive; return errors and stated sigmas (scales: relative; rad; m)."""
+    from wheel_legs import true_heading_error, wheel_leg
+
+    from odocal_ros.calib.wheels.result import fit_wheels
+    from odocal_ros.config import Config, with_settings
+    from odocal_ros.sim.noise import stream
+    from odocal_ros.sim.scenarios import SimOptions, simulate
+    options = {'scenario': 'town', 'two_wheels': True} | RATES | list(CELLS.values())[number]
+    given = options.pop('given', False)
+    seed = FIRST_SEED + SEEDS_A_CELL * number + k
+    draw = stream(seed, 'what the settings believe').standard_normal(6)
+    made = simulate(SimOptions(
+        seed=seed, fix_delay=float(LATENCY * draw[0]), odometer_delay=float(
+            LATE_ODOMETER * draw[1]), antenna_lever_arm=tuple(map(float, ARM * draw[2:5])),
+        **options))
+    settings = {'imu.grade': made.options.imu_grade,
+                'odometer.nominal_scale': float(made.options.nominal_scale)}
+    if given:
+        settings['odometer.track_width'] = float(made.options.track_width
+                                                 * (1 + WIDTH * draw[5]))
+    leg = wheel_leg(made.leg(), with_settings(Config(), settings))
+    method = fit_wheels(leg, with_settings(Config(), settings))
+    truth = {'scale_factor': made.truth.scale, 'heading_error': true_heading_error(made, leg),
+             'scale_factor_left': made.truth.wheel_scales[0],
+             'scale_factor_right': made.truth.wheel_scales[1],
+             'track_width': made.options.track_width}
+    row = {'seed': seed, 'codes': sorted({r.code.name for r in method.reasons})}
+    for name, true in truth.items():
+        e = method.estimates[name]
+        if e.value is not None:
+            size = true if name.startswith('scale') else 1.0
+            error = math.remainder(e.value - true, 2 * math.pi)
+            row |= {name: error / size, f'{name}_sigma': e.sigma / size}
+    return row
+
+
+def run_block(number: int, drives: list[int]) -> list[dict]:
+    """Drive some drives of a cell (in a process of its own)."""
+    return [drive(number, k) for k in drives]
+
+
+def main() -> None:
+    """Run what the file does not hold yet, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=200, help='drives a cell')
+    parser.add_argument('--processes', type=int, default=1)
+    parser.add_argument('--cell', default='', help="cells whose name holds this, e.g. 'town'")
+    parser.add_argument('--file', type=Path, default=Path('/tmp/wheels_monte_carlo.jsonl'))
+    args = parser.parse_args()
+    have = _read(args.file)
+    wanted = [i for i, name in enumerate(CELLS) if args.cell in name]
+    with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
+        for number in wanted:
+            name = list(CELLS)[number]
+            first = FIRST_SEED + SEEDS_A_CELL * number
+            missing = [k for k in range(args.drives) if first + k not in have]
+            blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
+            for done, rows in enumerate(pool.map(run_block, [number] * len(blocks), blocks), 1):
+                out.writelines(json.dumps(row) + '\n' for row in rows)
+                out.flush()
+                have |= {row['seed']: row for row in rows}
+                print(f'\r{name}: {min(done * BLOCK, len(missing))} of {len(missing)}',
+                      end='', file=sys.stderr, flush=True)
+            print(file=sys.stderr)
+    print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"RMS/sigma":>11}'
+          f'{"within 95 %":>13}')
+    for number in wanted:
+        first = FIRST_SEED + SEEDS_A_CELL * number
+        print_cell(list(CELLS)[number],
+                   [have[first + k] for k in range(args.drives) if first + k in have])
+
+
+def _read(path) -> dict[int, dict]:
+    """Return rows by seed; a last line cut short by an interruption is done again."""
+    rows = {}
+    if path.exists():
+        text = path.read_text()
+        if text and not text.endswith('\n'):
+            text = text[:text.rfind('\n') + 1]
+            path.write_text(text)
+        rows = {row['seed']: row for row in map(json.loads, text.splitlines())}
+    return rows
+
+
+def print_cell(name, rows) -> None:
+    """Print what came of a cell's drives."""
+    for label, key, unit in (('scale, ppm', 'scale_factor', 1e6),
+                             ('left, ppm', 'scale_factor_left', 1e6),
+                             ('right, ppm', 'scale_factor_right', 1e6),
+                             ('heading, mdeg', 'heading_error', 1e3 * math.degrees(1.0)),
+                             ('width, mm', 'track_width', 1e3)):
+        have = [r for r in rows if key in r]
+        if not have:
+            continue
+        error = np.array([r[key] for r in have])
+        z = error / np.array([r[f'{key}_sigma'] for r in have])
+        ratio, share = math.sqrt((z**2).mean()), 100 * (np.abs(z) <= 1.96).mean()
+        good = (GOAL_RATIO[0] <= ratio <= GOAL_RATIO[1]
+                and GOAL_SHARE[0] <= share <= GOAL_SHARE[1])
+        print(f'{name:34}{len(have):6d} {label:15}{error.mean() * unit:+11.3f}'
+              f'{math.sqrt((error**2).mean()) * unit:10.3f}{ratio:11.3f}{share:13.2f}'
+              f'{"" if good else "  <-"}')
+        name = ''
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,314 @@
+"""
+The estimator of the wheels: generalised least squares over all bins, relinearised until it rests.
+
+All that errs is in one covariance V of the observations, so the sigma is that of the estimate,
+whole, and falls apart into the shares of the parts: it is B V B^T with
+B = (X^T V^-1 X)^-1 X^T V^-1.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheels.first import first_state, near_neighbours, thinned
+from odocal_ros.calib.wheels.height import Height, solve_height
+from odocal_ros.calib.wheels.judge_noise import (
+    FixNoise,
+    judge_fixes,
+    judge_slip,
+    white_share,
+)
+from odocal_ros.calib.wheels.leg import WheelLeg
+from odocal_ros.calib.wheels.model import (
+    Bins,
+    Equations,
+    equations,
+    HEADING,
+    make_bins,
+    OFFSET,
+    RATIO,
+    SCALE,
+    State,
+    WIDTH,
+)
+from odocal_ros.calib.wheels.noise import (
+    ANY_WIDTH,
+    drift_covariance,
+    known_parts,
+    Part,
+    phi_loading,
+    tilted,
+    unknown_width,
+    walk_root,
+)
+from odocal_ros.nav.dead_reckoning import forward_b
+
+BINS = 100           # of a leg: twice as many move no sigma by more than 2 %
+SHORTEST = 1.0       # s, of a bin
+ROUNDS = 5           # of relinearisation, at most
+EQUAL = 0.01         # of wheels whose ratio nothing tells
+SETTLED = 0.01       # sigmas: smaller steps are none
+WIDE = 10.0          # m, sigma of a track width of which nothing is known
+GUESS = 0.8          # m, sigma of that of a car
+LEAST_TURN = 0.05    # rad rms: less is no turn
+TURNED = 10.0        # times what the gyro may have drifted: turns that tell the track width
+WIDTH_SIGMA = 0.02   # of a track width given: taped, and tyres are wide
+FAR_BIN = 5.0        # sigmas of a bin against all others: a run of bad fixes
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """
+    The estimate: state, and B with which the observations make it.
+
+    residual : (3N,) m, what is taken for errors of the fixes.   left : V^-1 times all that is
+    left.   B, X : (7, 3N), (3N, 7).   normal : (7, 7) inverse covariance.   used : (3N,) bool.
+    parts : of the covariance.   beliefs : (7,) inverse variance known beforehand.
+    kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
+    against that of the alignment.   phi_sigma : (N + 1,) rad.
+    """
+
+    state: State
+    bins: Bins
+    eq: Equations
+    residual: NDArray[np.float64]
+    left: NDArray[np.float64]
+    X: NDArray[np.float64]
+    B: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    beliefs: NDArray[np.float64]
+    parts: tuple[Part, ...]
+    height: Height
+    noise: FixNoise
+    slip: float
+    kept: int
+    dropped: int
+    bias_z: tuple[float, float]
+    width_told: bool
+    phi_sigma: NDArray[np.float64]
+    settled: bool
+
+
+def solve(leg: WheelLeg, config, turn_rate=True, n_bins=BINS) -> Solution | None:
+    """
+    Estimate scale, ratio, heading and track width of a leg.
+
+    turn_rate : False leaves the wheels' turn against the gyro's out.
+
+    Returns
+    -------
+    Solution, None where the fixes are too few.
+
+    """
+    variance = np.trace(leg.covariance_n[:, :2, :2], axis1=1, axis2=2) / 2
+    t0 = max(leg.t_start, float(leg.left.t[0]))
+    t1 = min(leg.t_stop, float(leg.left.t[-1]))
+    inside = (leg.t_fix >= t0) & (leg.t_fix <= t1)
+    if inside.sum() < 5 or t1 - t0 < 5 * SHORTEST:
+        return None
+    leg = thinned(leg)
+    state, residual = first_state(leg, inside, variance)
+    keep = inside.copy()
+    keep[inside] = near_neighbours(residual, np.sqrt(variance[inside]))
+    n = int(np.clip(min(n_bins, (t1 - t0) / SHORTEST, keep.sum() / 2), 4, None))
+    bins = make_bins(leg.t_fix, keep, variance, t0, t1, n)
+    width = config.odometer.track_width
+    state = replace(state, width=width or ANY_WIDTH, phi=np.zeros((n + 1, 3)))
+    return _Rounds(leg, config, bins, turn_rate, width).run(state, int(inside.sum()))
+
+
+class _Rounds:
+    """The rounds of relinearisation over one leg."""
+
+    def __init__(self, leg, config, bins, turn_rate, width):
+        self.leg, self.config, self.turn_rate = leg, config, turn_rate
+        self.bins, self.width = bins, width
+        self.since = leg.start.t if leg.alignment.heading_source == 'fixed' else leg.alignment.t
+        n = len(bins.edges) - 1
+        self.bad = np.zeros(n, bool)
+        self.slip, self.told, self.rounds = 0.0, False, 0
+
+    def run(self, state, fixes):
+        """Return the solution from a first state."""
+        again, dropped = False, 0
+        for k in range(ROUNDS):
+            eq = equations(self.leg, self.bins, state, self.since)
+            height = solve_height(self.leg, eq, self.bins, state, self.since)
+            solution, step = self._round(eq, state, height, judge=k == 1 or again)
+            state, again = solution.state, self.bad.sum() > dropped
+            dropped = self.bad.sum()
+            if k > 1 and not again and np.all(np.abs(step) < SETTLED):
+                break
+        return replace(solution, dropped=fixes - solution.kept,
+                       settled=bool(np.all(np.abs(step) < 10 * SETTLED)))
+
+    def _round(self, eq, state, height, judge):
+        leg, n = self.leg, len(eq.turn)
+        L = phi_loading(eq, state.width)
+        r = np.concatenate([eq.residual[:, 0], eq.residual[:, 1], eq.turn]) + L @ state.phi[:, 2]
+        X = design(eq)
+        self._judge_slip(eq, state, r, X, judge)
+        parts = known_parts(leg, eq, self.bins, state, self.since, self.slip, self.config)
+        parts.append(Part('pitch', np.concatenate(
+            [eq.by[:, 0, 3], eq.by[:, 1, 3], 0 * eq.turn])[:, None] * height.pitch_sigma))
+        parts.append(tilted(eq, state, height.tilt_variance))
+        if not (self.width or self.told):
+            parts.append(unknown_width(eq, self._drift(eq)))
+        known = sum(p.whole() for p in parts)
+        if judge or self.rounds == 0:
+            self._judge_fixes(eq, state, r, X, known, judge)
+        fix = np.zeros((3 * n, 3 * n))
+        fix[:2 * n, :2 * n] = self.noise.covariance
+        parts.append(Part('fix_noise', covariance=fix))
+        V = known + fix
+        use = self._used(n)
+        solution = self._solve(V, r, X, use, state, L, eq)
+        if judge and self._drop_bins(solution[3], n):
+            use = self._used(n)
+            solution = self._solve(V, r, X, use, state, L, eq)
+        B, normal, delta, (_, left, use), phi, phi_sigma, bias = solution
+        # else the gyro's own drift would pass for turns, and the width for nothing
+        self.told = self._turns_tell(eq, V, r, X, state, L)
+        widen = float(delta[WIDTH]) if self.told else 0.0
+        self.rounds += 1
+        new = replace(
+            state, scale=state.scale * float(np.exp(np.clip(delta[SCALE], -0.5, 0.5))),
+            log_ratio=state.log_ratio + float(np.clip(delta[RATIO], -0.5, 0.5)),
+            heading=state.heading + float(delta[HEADING]), width=max(state.width + widen, 0.1),
+            offset=state.offset + float(delta[OFFSET]), pitch=height.pitch,
+            start_n=np.append(state.start_n[:2] + delta[3:5], height.start),
+            phi=np.column_stack([height.phi, phi]))
+        step = delta / np.sqrt(np.diag(np.linalg.inv(normal)))
+        kept = int((~self.bad)[self.bins.of_fix].sum())
+        return Solution(new, self.bins, eq, fix[:, use] @ left, left, X, B, normal, use,
+                        self._beliefs(state)[0], tuple(parts), height,
+                        self.noise, self.slip, kept, 0, bias, self.told, phi_sigma, False), \
+            step[[SCALE, RATIO, HEADING]]
+
+    def _turns_tell(self, eq, V, r, X, state, L):
+        """Tell whether the turns are far above what the gyro may have drifted."""
+        if not self.turn_rate:
+            return False
+        way = np.append(0.0, np.cumsum(eq.length))
+        away = eq.yaw - np.polyval(np.polyfit(way, eq.yaw, 1), way)     # a ratio makes a line
+        turned = np.sqrt((away**2).mean())
+        if turned > TURNED * np.sqrt(np.diag(self._drift(eq)).mean()):
+            return True
+        if self.rounds == 0 or turned < LEAST_TURN:
+            return False
+        level = self._used(len(eq.turn))        # the fixes alone may hold the drift
+        level[2 * len(eq.turn):] = False
+        drift = self._solve(V, r, X, level, state, L, eq)[5]
+        return bool(turned > TURNED * np.sqrt((drift**2).mean()))
+
+    def _drift(self, eq):
+        return drift_covariance(self.leg.alignment, self.bins, eq, self.since)
+
+    def _used(self, n):
+        level = self.bins.filled & ~self.bad
+        return np.concatenate([level, level, np.full(n, self.turn_rate)])
+
+    def _beliefs(self, state):
+        """Return inverse variances and values known beforehand, (7,) each, as steps from state."""
+        weight, value = np.zeros(7), np.zeros(7)
+        given = self.width or ANY_WIDTH
+        loose = WIDE if self.told else GUESS if self.rounds > 2 else WIDTH_SIGMA * given
+        weight[WIDTH] = 1 / (WIDTH_SIGMA * given if self.width else loose)**2
+        value[WIDTH] = given - state.width
+        # without turns the fixes leave it open, and the mean of both hangs on its square
+        weight[RATIO] = 1.0 if self.turn_rate else 1 / EQUAL**2
+        value[RATIO] = -state.log_ratio
+        weight[OFFSET] = 1e-6
+        value[OFFSET] = -state.offset
+        if self.leg.start.surveyed:
+            variance = np.diag(self.leg.start.covariance_n)[:2]
+            weight[3:5] = 1 / np.maximum(variance, 1e-8)
+            value[3:5] = self.leg.start.position_n[:2] - state.start_n[:2]
+        return weight, value
+
+    def _solve(self, V, r, X, use, state, L, eq):
+        """Return B, normal, step, P, phi of heading, its sigma, and the bias about z."""
+        cut = np.ix_(use, use)
+        root = np.linalg.cholesky(V[cut])
+        inverse = np.linalg.inv(root)
+        inverse = inverse.T @ inverse
+        Xu, ru, Lu = X[use], r[use], L[use]
+        weight, value = self._beliefs(state)
+        right = Xu.T @ inverse
+        normal = right @ Xu + np.diag(weight)
+        covariance = np.linalg.inv(normal)
+        B = np.zeros((7, len(r)))
+        B[:, use] = covariance @ right
+        delta = covariance @ (right @ ru + weight * value)
+        P = inverse - right.T @ covariance @ right
+        left = inverse @ (ru - Xu @ delta)
+        a = self.leg.alignment
+        Q = self._drift(eq)
+        LQ = Lu @ Q
+        phi = LQ.T @ left
+        phi_sigma = np.sqrt(np.maximum(np.diag(Q) - np.einsum('ij,ij->j', LQ, P @ LQ), 0.0))
+        # the bias about the vertical: what the drift's part that grows with time says
+        up = eq.phi_axes[:, 2]
+        toward = up[-1] / max(np.linalg.norm(up[-1]), 1e-9)
+        c = Lu @ (-up * a.gyro_bias_sigma**2) @ toward
+        variance = toward**2 @ a.gyro_bias_sigma**2
+        bias = float(c @ left), float(np.sqrt(max(variance - c @ P @ c, 0.0)))
+        return B, normal, delta, (P, left, use), phi, phi_sigma, bias
+
+    def _drop_bins(self, found, n):
+        """Leave out bins that stray from what all others say; tell whether there are new ones."""
+        P, left, use = found
+        z = np.zeros(3 * n)
+        z[use] = left / np.sqrt(np.maximum(np.diag(P), 1e-12))
+        far = (np.hypot(z[:n], z[n:2 * n]) > FAR_BIN) & ~self.bad
+        if not far.any() or (self.bad | far).mean() > 0.3:
+            return False
+        self.bad |= far
+        return True
+
+    def _judge_slip(self, eq, state, r, X, judge):
+        if not ((judge or self.rounds == 0) and self.turn_rate):
+            return      # at first too: else the drift would take the slip upon itself
+        n = len(eq.turn)
+        turn = slice(2 * n, 3 * n)
+        known = sum(p.whole()[turn, turn] for p in known_parts(
+            self.leg, eq, self.bins, state, self.since, 0.0, self.config))
+        walk = walk_root(eq.moving)
+        columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
+        if self.width:      # given, and so no free column: its belief is part of what is known
+            known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
+            columns = columns[:, [0, 2]]
+        self.slip = judge_slip(r[turn], columns, known, 2 * walk @ walk.T)
+
+    def _judge_fixes(self, eq, state, r, X, known, judge):
+        leg, bins, n = self.leg, self.bins, len(eq.turn)
+        level = slice(0, 2 * n)
+        t = leg.t_fix[bins.fix]
+        k = np.array([SCALE, HEADING, 3, 4])
+        detail = leg.fixes_n[bins.fix, :2] - self._track(t, state)
+        white = white_share(leg.t_fix, detail, leg.covariance_n, bins)
+        good = self._used(n)[level]
+        weightless = np.where(good, 0.0, 1e12)      # dropped bins say nothing
+        self.noise = judge_fixes(r[level], X[level][:, k], known[level, level]
+                                 + np.diag(weightless), bins, leg.t_fix, leg.covariance_n, white,
+                                 self.config.gnss.correlation_time if judge else 0)
+
+    def _track(self, t, state):
+        """Return the level track roughly: only steps from fix to fix of it are used."""
+        leg = self.leg
+        f = forward_b(-state.heading, 0.0) * state.scale
+        return ((leg.left.at(t) + leg.right.at(t)) / 2 @ f)[:, :2]
+
+
+def design(eq: Equations):
+    """Return the derivatives of the observations by the parameters, (3N, 7)."""
+    n = len(eq.turn)
+    X = np.zeros((3 * n, 7))
+    for axis in range(2):
+        rows = slice(axis * n, (axis + 1) * n)
+        X[rows, :3] = eq.by[:, axis, :3]
+        X[rows, 3 + axis] = 1.0
+    X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET]] = eq.turn_by
+    return X

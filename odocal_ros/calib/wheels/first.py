@@ -1,0 +1,59 @@
+"""What comes before the fit: fewer epochs, a first state, fixes far from those beside them."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.wheels.model import State
+from odocal_ros.nav.dead_reckoning import Track
+
+RATE = 20.0          # Hz, of epochs: between them a turn bends the way by a millimetre
+FAR = 5.0            # robust sigmas from the fixes beside: an outlier
+BESIDE = 7           # fixes each side
+HUBER = 1.345        # sigmas beyond which the pull of a fix no longer grows
+
+
+def thinned(leg):
+    """Return a leg with no more epochs than RATE asks: its tracks are sums, nothing is lost."""
+    t = leg.left.t
+    step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / RATE))
+    pick = np.unique(np.append(np.arange(0, len(t), step), len(t) - 1))
+    return replace(leg, **{side: Track(*(getattr(getattr(leg, side), name)[pick] for name in (
+        't', 'q_nb', 's', 'P'))) for side in ('left', 'right')})
+
+
+def first_state(leg, inside, variance):
+    """Return a first state by the mean track against the fixes in the level, and residuals."""
+    t = leg.t_fix[inside]
+    P = ((leg.left.at(t) + leg.right.at(t) - leg.left.at(leg.start.t) - leg.right.at(leg.start.t))
+         / 2)[:, :2, :2]
+    arm = (leg.left.C_nb_at(t) - leg.left.C_nb_at(np.array(leg.start.t))) @ leg.lever_b
+    y = (leg.fixes_n[inside] - arm)[:, :2].ravel()
+    A = np.concatenate([P, np.tile(np.eye(2), (len(t), 1, 1))], -1).reshape(-1, 4)
+    sigma = np.repeat(np.sqrt(variance[inside]), 2)
+    weight = 1 / sigma
+    for _ in range(8):      # Huber, scaled by the median: outliers do not pull
+        x = np.linalg.lstsq(A * weight[:, None], y * weight, rcond=None)[0]
+        off = np.abs(y - A @ x)
+        scale = np.median(off) / 0.6745
+        weight = np.sqrt(np.minimum(1.0, HUBER * scale / np.maximum(off, 1e-9))) / sigma
+    start = np.append(x[2:], leg.start.position_n[2])
+    state = State(float(np.hypot(*x[:2])), 0.0, float(np.arctan2(x[1], x[0])), 0.0, start, 0.0,
+                  0.0, np.zeros((1, 3)))
+    return state, (y - A @ x).reshape(-1, 2)
+
+
+def near_neighbours(residual, sigma):
+    """
+    Tell which fixes lie with those beside them.
+
+    residual : (k, 2) fixes less a track, m, slow errors and all.   sigma : (k,) stated.
+    """
+    span = 2 * BESIDE + 1
+    if len(residual) <= span:
+        return np.ones(len(residual), bool)
+    padded = np.pad(residual, ((BESIDE, BESIDE), (0, 0)), mode='reflect')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, span, axis=0)
+    off = np.hypot(*(residual - np.median(windows, axis=-1)).T)
+    usual = max(np.median(off / sigma) / 1.1774, 0.2)       # of a Rayleigh law
+    return off <= FAR * usual * sigma

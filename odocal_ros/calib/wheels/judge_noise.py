@@ -1,0 +1,157 @@
+"""
+How large and how slow the fixes' errors are, and how far wheels slip, judged from the residuals.
+
+Restricted likelihood over a grid, together with what the receiver states: the covariance used is
+its mean over what is believable, so that a sigma holds what is not known of the noise itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheels.model import Bins
+
+TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])   # s
+SLOW = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
+BELIEF = 0.5          # ln: how far the stated variance may be off, before looking
+SLIPS = np.append(0.0, np.geomspace(1e-5, 0.1, 41))      # m/sqrt(s)
+WHITE_BELIEF = 0.8    # that nothing lasts
+LEAST_WHITE = 1e-4    # of the stated variance
+FEW = 20              # fixes below which their scatter says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class FixNoise:
+    """
+    What was judged of the fixes.
+
+    white, slow : of the stated variance, from fix to fix, and lasting.   time : s, of the slow
+    part, likeliest; NaN where none is.   covariance : (2N, 2N) m^2, of east and north bin means.
+    """
+
+    white: float
+    slow: float
+    time: float
+    covariance: NDArray[np.float64]
+
+
+def white_share(t_fix, residual, covariance_n, bins: Bins):
+    """
+    Return the variance of the fixes' errors from one to the next, of that stated.
+
+    residual : (k, 2) fixes less track, m, of the fixes in the bins.
+    """
+    near = np.diff(t_fix[bins.fix]) < 3 * np.median(np.diff(t_fix[bins.fix]))
+    stated = np.diagonal(covariance_n[bins.fix][:, :2, :2], axis1=1, axis2=2)
+    step = np.diff(residual, axis=0)**2 / (stated[1:] + stated[:-1])
+    if near.sum() < FEW:
+        return 1.0
+    return max(float(step[near].mean()), LEAST_WHITE)
+
+
+def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise:
+    """
+    Judge the slow part of the fixes' errors.
+
+    Parameters
+    ----------
+    r, X : (2N,), (2N, p) arrays
+        Residuals east and north, and derivatives; rows of empty bins are ignored.
+    known : (2N, 2N) array
+        Covariance of all else.
+    bins, t_fix, covariance_n
+        Of the fixes: bins, times, s, and stated covariance, m^2.
+    white : float
+        As white_share returns it.
+    told : float
+        gnss.correlation_time: 0 white, NaN to be judged.
+
+    """
+    n = len(bins.edges) - 1
+    stated = bins.mean(np.diagonal(covariance_n[bins.fix][:, :2, :2], axis1=1, axis2=2))
+    cross = np.zeros((n, 2, 2))
+    np.add.at(cross, bins.of_fix,
+              covariance_n[bins.fix][:, :2, :2] * (bins.share**2)[:, None, None])
+    W = np.zeros((2, n, 2, n))
+    k = np.arange(n)
+    W[:, k, :, k] = cross
+    W = white * W.reshape(2 * n, 2 * n)
+    if told == 0:
+        return FixNoise(white, 0.0, np.nan, W)
+    use = np.flatnonzero(np.tile(bins.filled, 2))
+    root = np.sqrt(stated).T.ravel()
+    times = TIMES if np.isnan(told) else np.array([told])
+    begin, end = spread(bins, t_fix)
+    shapes = [root[:, None] * np.kron(np.eye(2), slow_means(begin, end, time)) * root
+              for time in times]
+    belief = -0.5 * (np.log(white + SLOW) / BELIEF)**2
+    belief += np.log(np.where(SLOW > 0, (1 - WHITE_BELIEF) / (len(SLOW) - 1), WHITE_BELIEF))
+    cut = np.ix_(use, use)
+    log = np.array([belief + evidence(r[use], X[use], (known + W)[cut], S[cut], SLOW)
+                    for S in shapes])
+    p = np.exp(log - log.max())
+    p /= p.sum()
+    best = np.unravel_index(np.argmax(p), p.shape)
+    slow = sum((p[i] @ SLOW) * S for i, S in enumerate(shapes))
+    return FixNoise(white, float((p @ SLOW).sum()),
+                    float(times[best[0]]) if best[1] else np.nan, W + slow)
+
+
+def judge_slip(r, X, known, walk):
+    """
+    Return the mean variance rate of a wheel's slip that is believable, m^2/s.
+
+    r, X : (N,), (N, p) of the turn equation.  known, walk : (N, N) covariance of all else, and of
+    slips of 1 m/sqrt(s).
+    """
+    log = evidence(r, X, known, walk, SLIPS**2)
+    p = np.exp(log - log.max())
+    return float(p @ SLIPS**2 / p.sum())
+
+
+def evidence(r, X, known, shape, sizes):
+    """
+    Return the restricted log likelihood of r = X b + e, cov e = known + size shape, by size.
+
+    But for ln det known. In the axes in which both are diagonal, so that each size costs next to nothing.
+    """
+    L = np.linalg.cholesky(known)
+    half = np.linalg.solve(L, shape)
+    values, axes = np.linalg.eigh(np.linalg.solve(L, half.T))
+    r, X = axes.T @ np.linalg.solve(L, r), axes.T @ np.linalg.solve(L, X)
+    out = np.empty(len(sizes))
+    for i, size in enumerate(sizes):
+        d = 1 + size * np.maximum(values, 0.0)
+        half, e = X / np.sqrt(d)[:, None], r / np.sqrt(d)
+        length = np.linalg.norm(half, axis=0)
+        Q, R = np.linalg.qr(half / length)
+        fitted = Q.T @ e
+        out[i] = -0.5 * (np.log(d).sum() + 2 * np.log(np.abs(np.diag(R)) * length).sum()
+                         + e @ e - fitted @ fitted)
+    return out
+
+
+def slow_means(begin, end, time):
+    """
+    Return the covariance of bin means of a Gauss-Markov process of unit variance, (N, N).
+
+    begin, end : (N,) s, of the fixes in each bin.   time : s, its time constant.
+    """
+    x = np.maximum((end - begin) / time, 1e-6)
+    inside = np.where(x > 1e-3, 2 * (x - 1 + np.exp(-x)) / x**2, 1 - x / 3)
+    mean = -np.expm1(-x) / x
+    gap = np.maximum(begin[:, None] - end, begin - end[:, None])
+    out = mean[:, None] * mean * np.exp(-np.maximum(gap, 0.0) / time)
+    np.fill_diagonal(out, inside)
+    return out
+
+
+def spread(bins: Bins, t_fix):
+    """Return begin and end of the fixes of each bin, s; the middle of an empty one."""
+    t, n = t_fix[bins.fix], len(bins.edges) - 1
+    begin, end = np.full(n, np.inf), np.full(n, -np.inf)
+    np.minimum.at(begin, bins.of_fix, t)
+    np.maximum.at(end, bins.of_fix, t)
+    middle = (bins.edges[:-1] + bins.edges[1:]) / 2
+    return np.where(begin > end, middle, begin), np.where(begin > end, middle, end)

@@ -1,0 +1,122 @@
+"""What a drive can tell of the wheels and what not: figures, and refusals with the reason."""
+
+import numpy as np
+
+from odocal_ros.calib.two_point import PITCH_PRIOR
+from odocal_ros.calib.wheels.estimate import Solution
+from odocal_ros.calib.wheels.model import PARAMETERS
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+
+RANGE = 0.05         # of a wheel's factor, where wheels.radius_range says nothing
+SHARE = 0.5          # of that range: a ratio no better is none
+WIDTH_SHARE = 0.05   # of a track width: a sigma that still says something
+BETTER = 0.5         # of the belief's sigma: what counts as learned
+SCALE_LIMIT = 0.1    # relative sigma beyond which there is no scale
+HEADING_LIMIT = 0.5  # rad
+NOISY = 1.25         # times the stated sigma: worth saying
+BACKWARDS = np.deg2rad(160.0)
+FAR = np.deg2rad(20.0)
+
+
+def correlation(covariance, names=PARAMETERS):
+    """Return the correlation of each pair of parameters, for calibration.json."""
+    sigma = np.sqrt(np.diag(covariance))
+    rho = covariance / np.outer(sigma, sigma)
+    return {f'{names[i]},{names[j]}': float(rho[i, j])
+            for i in range(len(names)) for j in range(i + 1, len(names))}
+
+
+def without_turns(solution: Solution):
+    """
+    Return what the fixes alone would tell of left and right, the patent's way.
+
+    Returns
+    -------
+    condition : condition number of left, right and heading, each in units of what it does alone,
+    so that it tells how alike two of them act.   sigma : of ln(right / left).
+
+    """
+    n = len(solution.eq.turn)
+    use = solution.used & (np.arange(3 * n) < 2 * n)
+    V = sum(p.whole() for p in solution.parts)
+    X = solution.X[use][:, :5]
+    normal = X.T @ np.linalg.solve(V[np.ix_(use, use)], X)
+    start = normal[3:, 3:]
+    normal = normal[:3, :3] - normal[:3, 3:] @ np.linalg.solve(start, normal[3:, :3])
+    ratio = np.exp(solution.state.log_ratio)
+    to = np.linalg.inv(np.array([[1, -1 / (1 + ratio), 0], [1, ratio / (1 + ratio), 0],
+                                 [0, 0, 1]]))       # (ln left, ln right) to (ln scale, ln ratio)
+    wheels = to.T @ normal @ to
+    size = np.sqrt(np.diag(wheels))
+    values = np.linalg.eigvalsh(wheels / np.outer(size, size))
+    size = np.sqrt(np.diag(normal))
+    rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
+    return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(rest[1, 1]) / size[1])
+
+
+def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reason, ...]:
+    """Return why left and right cannot be told apart, empty if they can."""
+    limit = SHARE * (config.wheels.radius_range or RANGE)
+    if turn_rate and sigma_ratio <= limit:
+        return ()
+    condition, _ = without_turns(solution)
+    if not turn_rate:
+        return (Reason(Code.WHEELS_NOT_SEPARABLE, "without the gyro's turn rate the fixes see "
+                       f'only the mean of both wheels (condition number {condition:.0e}): left '
+                       'and right are not stated'),)
+    return (Reason(Code.WHEELS_NOT_SEPARABLE, 'the ratio of right to left is known to '
+                   f'{100 * sigma_ratio:.2g} %, {100 * limit:.2g} % is the limit: '
+                   'left and right are not stated'),)
+
+
+def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ...]]:
+    """Tell whether the drive itself tells the track width, and why not where none is given."""
+    width = solution.state.width
+    told = solution.width_told and sigma < WIDTH_SHARE * width
+    if told or given:
+        return told and (not given or sigma < BETTER * 0.02 * given), ()
+    away = solution.eq.yaw
+    return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the heading ranges over '
+                          f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
+
+
+def judge_heading(leg, heading, config) -> tuple[Reason, ...]:
+    """Return what is to be said of the yaw mounting angle."""
+    a = leg.alignment
+    if not a.heading_separable:
+        return (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, which '
+                       'holds the mounting angle: the heading error is the sum of both'),)
+    reasons: tuple[Reason, ...] = ()
+    if a.heading_sigma > config.verdict.max_yaw_sigma:
+        reasons = (Reason(Code.YAW_NOT_SEPARABLE, f'the heading ({a.heading_source}) is known to '
+                          f'{np.rad2deg(a.heading_sigma):.3f} deg, the yaw is asked to '
+                          f'{np.rad2deg(config.verdict.max_yaw_sigma):.3f} deg: the heading error '
+                          'is their sum'),)
+    nominal = config.imu.nominal_yaw
+    off = abs(float(wrap(-heading - (0.0 if np.isnan(nominal) else nominal))))
+    if off > BACKWARDS:
+        reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
+                           'counts mean backwards, or the Imu faces backwards (yaw '
+                           f'{np.rad2deg(-heading):+.1f} deg)'),)
+    elif off > FAR:
+        reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({a.heading_source}) and course '
+                           f'make a yaw mounting of {np.rad2deg(-heading):+.1f} deg, '
+                           f'{np.rad2deg(off):.1f} deg from the nominal one'),)
+    return reasons
+
+
+def judge_fit(solution: Solution) -> tuple[Reason, ...]:
+    """Return what is to be said of fixes, heights and convergence."""
+    reasons: tuple[Reason, ...] = ()
+    noise = np.sqrt(solution.noise.white + solution.noise.slow)
+    if noise > NOISY:
+        reasons += (Reason(Code.FIXES_NOISIER_THAN_SAID, f'the fixes stray {noise:.1f} times as '
+                           'far from the track as their covariance says'),)
+    if not solution.height.known:
+        reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height good enough for '
+                           f'the pitch; taken as 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg'),)
+    if not solution.settled:
+        reasons += (Reason(Code.MODEL_MISMATCH, 'the fit of the wheels still moves by more than a '
+                           'tenth of its sigma after its last round'),)
+    return reasons

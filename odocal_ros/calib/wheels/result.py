@@ -1,0 +1,192 @@
+"""The method ``wheels``: from the solution of a leg to estimates, sources and reasons."""
+
+import numpy as np
+
+from odocal_ros.calib.budget import budget_table, HEIGHT_UNKNOWN, total_covariance
+from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.wheels.estimate import Solution, solve
+from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
+from odocal_ros.calib.wheels.model import HEADING, RATIO, SCALE, WIDTH
+from odocal_ros.calib.wheels.observable import (
+    correlation,
+    HEADING_LIMIT,
+    judge_fit,
+    judge_heading,
+    SCALE_LIMIT,
+    separable,
+    width_told,
+    without_turns,
+)
+from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.earth import A
+from odocal_ros.reasons import Code, Reason
+
+PARAMETERS = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle',
+              'track_width')       # rows of the sources: relative for scales, rad, m
+NOTE = 'heading_error is the error of the heading at the start plus the yaw mounting angle'
+LEARNED = 0.7        # of the alignment's sigma: a gyro bias that the leg tells better
+
+
+def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
+    """
+    Return left and right scale, heading error and track width of a leg with their sigmas.
+
+    Parameters
+    ----------
+    leg : WheelLeg
+        Tracks of both wheels, fixes, alignment.
+    config : Config
+        gnss, odometer (time_sigma, track_width), wheels and verdict are used.
+    turn_rate : bool
+        False leaves the wheels' turn against the gyro's out, as the patent does.
+
+    """
+    solution = solve(leg, config, turn_rate)
+    if solution is None:
+        return refused(leg, Reason(Code.NO_FIX, 'fewer than five fixes between the marks, or less '
+                                   'than five seconds of them'))
+    covariance = np.linalg.inv(solution.normal)
+    sigma = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(sigma).all() and sigma[SCALE] < SCALE_LIMIT
+            and sigma[HEADING] < HEADING_LIMIT):
+        return refused(leg, Reason(Code.LEG_TOO_SHORT, 'the fixes tell the scale only to '
+                                   f'{100 * sigma[SCALE]:.2g} %'))
+    reasons = separable(solution, sigma[RATIO], config, turn_rate)
+    apart = not reasons
+    told, why = width_told(solution, sigma[WIDTH], config.odometer.track_width)
+    heading = float(wrap(solution.state.heading))
+    about_heading = judge_heading(leg, heading, config)
+    yaw_known = Code.YAW_NOT_SEPARABLE not in {r.code for r in about_heading}
+    sources = _sources(leg, solution)
+    reasons += why + about_heading + judge_fit(solution)
+    total = np.sqrt(np.diag(total_covariance(sources)))
+    K = solution.state.scale
+    left, right = wheel_factors(K, solution.state.log_ratio)
+    values = {'scale_factor': K, 'scale_factor_left': left, 'scale_factor_right': right}
+    estimates = {name: Estimate(value, value * float(s), leg.scale_unit)
+                 if apart or name == 'scale_factor' else Estimate(None, None, leg.scale_unit)
+                 for (name, value), s in zip(values.items(), total, strict=False)}
+    estimates |= {
+        'scale_ratio': Estimate(K / leg.nominal, K / leg.nominal * float(total[0]), '1')
+        if leg.nominal else Estimate(None, None, '1'),
+        'heading_error': Estimate(heading, float(sigma[HEADING]), 'rad'),
+        'yaw_mounting_angle': Estimate(-heading, float(total[3]), 'rad') if yaw_known
+        else Estimate(None, None, 'rad'),
+        'track_width': Estimate(solution.state.width, float(sigma[WIDTH]), 'm') if told
+        else Estimate(None, None, 'm'),
+        'gyro_bias_z': _gyro_bias(leg, solution)}
+    return MethodResult('wheels', tuple(reasons), estimates, PARAMETERS, sources,
+                        _details(leg, solution, covariance, sources, (K, left, right, 1.0, 1.0),
+                                 config))
+
+
+def refused(leg, reason) -> MethodResult:
+    """Return the result of a leg that the method refuses: every value unknown."""
+    unit = {'yaw_mounting_angle': 'rad', 'heading_error': 'rad', 'track_width': 'm',
+            'scale_ratio': '1', 'gyro_bias_z': 'rad/s'}
+    names = (*PARAMETERS, 'scale_ratio', 'heading_error', 'gyro_bias_z')
+    return MethodResult('wheels', (reason,), {
+        n: Estimate(None, None, unit.get(n, leg.scale_unit)) for n in names}, PARAMETERS)
+
+
+def _rows(solution):
+    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, 7)."""
+    ratio = np.exp(solution.state.log_ratio)
+    rows = np.zeros((5, 7))
+    rows[:3, SCALE] = 1.0
+    rows[1, RATIO], rows[2, RATIO] = -1 / (1 + ratio), ratio / (1 + ratio)
+    rows[3, HEADING] = -1.0
+    rows[4, WIDTH] = 1.0
+    return rows
+
+
+def _root(covariance):
+    value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
+    return vector * np.sqrt(np.maximum(value, 0.0))
+
+
+def _sources(leg, solution: Solution):
+    """Return the parts of the covariance as effects on PARAMETERS, each with its name."""
+    rows = _rows(solution)
+    BX = rows @ solution.B
+    sources = []
+    for part in solution.parts:
+        effects = BX @ part.root if part.root is not None else _root(BX @ part.covariance @ BX.T)
+        if effects.shape[1] > len(rows):
+            effects = _root(effects @ effects.T)
+        sources.append(Source(part.name, effects, part.shared))
+    # what was believed beforehand is a source too: of the width given, of a surveyed start
+    beliefs = np.linalg.inv(solution.normal) * np.sqrt(solution.beliefs)
+    keep = solution.beliefs > 0
+    sources.append(Source('beliefs', rows @ beliefs[:, keep]))
+    heading = np.zeros((5, 1))
+    heading[3] = leg.alignment.heading_sigma
+    sources.append(Source('initial_heading', heading, leg.alignment.heading_shared))
+    for name, size, shared in (('height', _height_sigma(leg) / A, True),
+                               ('second_order', _second_order(solution), False)):
+        sources.append(Source(name, np.array([[size]] * 3 + [[0.0]] * 2), shared))
+    return tuple(sources)
+
+
+def _height_sigma(leg):
+    if not np.isfinite(leg.fixes_n[:, 2]).any():
+        return HEIGHT_UNKNOWN
+    return float(np.sqrt(np.median(leg.covariance_n[:, 2, 2])))
+
+
+def _second_order(solution):
+    """
+    Return what climb and heading not known make of the scale, relative.
+
+    Half their mean square over the way shortens the level track; of a normal error its rms is
+    sqrt(3) / 2 of the variance.
+    """
+    share = solution.eq.length / max(solution.eq.length.sum(), 1e-9)
+    phi = (solution.phi_sigma[:-1]**2 + solution.phi_sigma[1:]**2) / 2
+    return float(np.sqrt(3) / 2 * np.hypot(solution.height.climb_variance, share @ phi))
+
+
+def _gyro_bias(leg, solution):
+    a = leg.alignment
+    value, sigma = solution.bias_z
+    up = solution.eq.phi_axes[-1, 2]
+    up = up / max(np.linalg.norm(up), 1e-9)
+    before = float(np.sqrt(up**2 @ a.gyro_bias_sigma**2))
+    if sigma > LEARNED * before:
+        return Estimate(None, None, 'rad/s')
+    return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
+
+
+def _latency(solution, config):
+    """Return the latency of the fixes that their run against speed speaks of, s."""
+    root = next(p.root for p in solution.parts if p.name == 'fix_latency')
+    return float(root[solution.used, 0] @ solution.left * config.gnss.time_sigma)
+
+
+def _details(leg, solution: Solution, covariance, sources, scale, config):
+    state, noise = solution.state, solution.noise
+    condition, ratio_sigma = without_turns(solution)
+    used = solution.used[:2 * len(solution.eq.turn)]
+    residual = solution.residual[:2 * len(solution.eq.turn)][used]
+    return {
+        'budget': budget_table(sources, PARAMETERS, scale),
+        'correlation': correlation(covariance),
+        'condition_number': condition,       # of left, right and heading by the fixes alone
+        'f': state.scale * forward_b(-state.heading, state.pitch),
+        'wheel_ratio': {'value': float(np.exp(state.log_ratio)),
+                        'sigma': float(np.exp(state.log_ratio) * np.sqrt(covariance[1, 1])),
+                        'sigma_by_fixes_alone': ratio_sigma},
+        'pitch': {'value': state.pitch, 'sigma': solution.height.pitch_sigma,
+                  'known': solution.height.known},
+        'track_width_used': state.width,
+        'start_n': state.start_n,
+        'residual_rms': float(np.sqrt((residual**2).mean() * 2)),
+        'fixes': {'used': solution.kept, 'dropped': solution.dropped,
+                  'white_share': noise.white, 'slow_share': noise.slow,
+                  'correlation_time': noise.time},
+        'fix_latency_seen': _latency(solution, config),
+        'slip_walk': float(np.sqrt(solution.slip)),
+        'heading_source': leg.alignment.heading_source,
+        'heading_drift': {'t': solution.bins.edges, 'rad': state.phi[:, 2]},
+        'note': NOTE}

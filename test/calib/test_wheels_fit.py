@@ -1,0 +1,161 @@
+"""The method ``wheels`` on simulated legs: values, sigmas, refusals."""
+
+from functools import cache
+
+from drives import drive, settings
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from wheel_legs import held_out, true_heading_error, wheel_leg
+
+from odocal_ros.calib.budget import total_covariance
+from odocal_ros.calib.combine import combine_method
+from odocal_ros.calib.wheels.estimate import solve
+from odocal_ros.calib.wheels.leg import positions
+from odocal_ros.calib.wheels.result import _rows, fit_wheels
+from odocal_ros.reasons import Code
+
+TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
+STRAIGHT = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True}
+
+
+@cache
+def leg_of(known_heading=False, **options):
+    """Return drive, settings and leg; equal options give the same ones."""
+    made = drive(**options)
+    config = settings(made, heading_sigma=1e-3 if known_heading else None)
+    return made, config, wheel_leg(made.leg(), config)
+
+
+@cache
+def fitted(known_heading=False, turn_rate=True, **options):
+    """Return drive, leg and result."""
+    made, config, leg = leg_of(known_heading, **options)
+    return made, leg, fit_wheels(leg, config, turn_rate)
+
+
+def truth(made, leg):
+    """Return what each estimate should be."""
+    return {'scale_factor': made.truth.scale, 'scale_factor_left': made.truth.wheel_scales[0],
+            'scale_factor_right': made.truth.wheel_scales[1],
+            'scale_ratio': made.truth.scale_ratio, 'yaw_mounting_angle': made.truth.yaw,
+            'heading_error': true_heading_error(made, leg),
+            'track_width': made.options.track_width}
+
+
+def codes(method):
+    return {r.code for r in method.reasons}
+
+
+def test_perfect_sensors_give_the_truth():
+    made, leg, method = fitted(True, **TOWN, imu_grade='perfect', fix_sigma=0.01,
+                               odometer='angle')
+    # fixes of 1 cm, 1400 of them: 1 cm / sqrt(700) over 1.9 km is 0.2 ppm; travel and attitude
+    # between samples of 20 and 50 Hz are worth some ppm
+    for name, true in truth(made, leg).items():
+        if name.startswith('scale'):
+            assert method.estimates[name].value == pytest.approx(true, rel=1e-5)
+    assert method.estimates['track_width'].value == pytest.approx(1.6, abs=1e-3)
+    # the heading is given, to 0 here; the level of point samples is good to 1e-5
+    assert method.estimates['heading_error'].value == pytest.approx(-made.truth.yaw, abs=1e-4)
+
+
+@pytest.mark.parametrize('options', [
+    TOWN, TOWN | {'imu_grade': 'industrial', 'seed': 3}, TOWN | {'odometer': 'angle', 'seed': 4},
+    TOWN | {'fix_noise': 'correlated', 'seed': 5}, TOWN | {'slope': 0.08, 'seed': 6}, STRAIGHT,
+    TOWN | {'slip_walk': 0.01, 'seed': 8}, TOWN | {'yaw': 0.7, 'seed': 9},
+    TOWN | {'pitch': 0.065, 'seed': 10}], ids=str)
+def test_errors_are_as_large_as_the_sigmas_say(options):
+    made, leg, method = fitted(True, **options)
+    for name, true in truth(made, leg).items():
+        estimate = method.estimates[name]
+        if estimate.value is not None:
+            # of some 60 normal errors one beyond 4 sigmas is as good as impossible
+            assert abs(estimate.value - true) < 4 * estimate.sigma, name
+    assert method.estimates['scale_factor'].sigma < 2e-3 * made.truth.scale
+
+
+def test_the_way_by_the_true_factors_runs_through_the_fixes():
+    made, _, leg = leg_of(True, **TOWN, imu_grade='perfect', fix_sigma=0.01, odometer='angle')
+    inside = (leg.t_fix >= leg.t_start) & (leg.t_fix <= leg.t_stop)
+    way = positions(leg, leg.t_fix[inside], *made.truth.wheel_scales,
+                    true_heading_error(made, leg), made.truth.pitch)
+    # 1 cm of each fix, a little at the mark, interpolation of a turn at 12 m/s over 50 ms
+    assert np.abs(way - leg.fixes_n[inside])[:, :2].max() < 0.06
+
+
+def test_without_the_turn_rate_only_the_mean_is_stated():
+    _, _, with_turns = fitted(**TOWN)
+    _, _, method = fitted(turn_rate=False, **TOWN)
+    e = method.estimates
+    assert Code.WHEELS_NOT_SEPARABLE in codes(method)
+    assert e['scale_factor_left'].value is None
+    assert e['scale_factor_right'].value is None
+    both = with_turns.estimates['scale_factor']
+    assert e['scale_factor'].value == pytest.approx(both.value, abs=both.sigma)
+    assert with_turns.details['condition_number'] > 1e4
+
+
+def test_a_straight_way_tells_the_ratio_and_no_track_width():
+    made, leg, method = fitted(**STRAIGHT)
+    assert Code.TRACK_WIDTH_NOT_DETERMINED in codes(method)
+    assert method.estimates['track_width'].value is None
+    ratio = method.details['wheel_ratio']
+    true = made.truth.wheel_scales[1] / made.truth.wheel_scales[0]
+    assert abs(ratio['value'] - true) < 4 * ratio['sigma']
+    assert ratio['sigma'] < 1e-4
+    assert ratio['sigma_by_fixes_alone'] > 0.1
+
+
+def test_a_course_holds_the_mounting_angle():
+    _, _, method = fitted(**TOWN)
+    assert Code.YAW_NOT_SEPARABLE in codes(method)
+    assert method.estimates['yaw_mounting_angle'].value is None
+    assert method.estimates['heading_error'].value is not None
+
+
+def test_outliers_neither_pull_nor_widen():
+    _, _, clean = fitted(**TOWN)
+    made, leg, method = fitted(**TOWN, outliers=0.02, outlier_size=30.0)
+    scale, before = method.estimates['scale_factor'], clean.estimates['scale_factor']
+    assert method.details['fixes']['dropped'] > 10
+    assert abs(scale.value - before.value) < before.sigma
+    assert scale.sigma == pytest.approx(before.sigma, rel=0.2)
+
+
+def test_sources_add_up_to_the_sigma():
+    made, config, leg = leg_of(**TOWN)
+    solution, method = solve(leg, config), fit_wheels(leg, config)
+    rows = _rows(solution)
+    known = [s for s in method.sources if s.name not in ('initial_heading', 'height',
+                                                         'second_order')]
+    whole = rows @ np.linalg.inv(solution.normal) @ rows.T
+    assert_allclose(total_covariance(known), whole, rtol=1e-5,
+                    atol=1e-9 * np.abs(whole).max())
+
+
+def test_fixes_after_the_stop_are_not_used():
+    made, config, leg = leg_of(**TOWN)
+    late = leg.t_fix > leg.t_start + 0.8 * (leg.t_stop - leg.t_start)
+    spoilt = leg.fixes_n.copy()
+    spoilt[late] += 1000.0
+    from dataclasses import replace
+    a, b = (fit_wheels(held_out(x, 0.8), config).estimates['scale_factor']
+            for x in (leg, replace(leg, fixes_n=spoilt)))
+    assert a == b
+
+
+def test_few_fixes_are_refused():
+    from dataclasses import replace
+    made, config, leg = leg_of(**TOWN)
+    method = fit_wheels(replace(leg, t_stop=leg.t_start + 0.5), config)
+    assert codes(method) == {Code.NO_FIX}
+    assert all(e.value is None for e in method.estimates.values())
+
+
+def test_two_legs_combine():
+    results = [fitted(**(TOWN | {'seed': seed}))[2] for seed in (1, 2)]
+    both = combine_method('wheels', results)
+    sigma = [r.estimates['scale_factor_left'].sigma for r in results]
+    assert both.estimates['scale_factor_left'].sigma < min(sigma)
+    assert both.estimates['track_width'].value == pytest.approx(1.6, abs=0.01)
