@@ -29,9 +29,9 @@ def blocks(page: str) -> list[list[str]]:
 
 
 def commands(page: str) -> list[str]:
-    """Return the lines of blocks, and what stands between backquotes and begins with odocal."""
+    """Return the lines of blocks, and what stands between backquotes: odocal or ros2 and more."""
     return [line for block in blocks(page) for line in block] + re.findall(
-        r'`(odocal [^`]+)`', page)
+        r'`((?:odocal|ros2 \w+) [^`]+)`', page)
 
 
 def yaml_blocks(page: str) -> list[str]:

@@ -1,6 +1,8 @@
 """What the shipped layouts name is what a running node has: topics, types, keys, services."""
 
-from bench import wait_for
+import re
+
+from bench import ROOT, wait_for
 import pytest
 import shown
 
@@ -22,6 +24,13 @@ def has_field(msgtype, fields):
     return kind in ('double', 'float', 'int64')
 
 
+def keys_on_the_page():
+    """Return the keys of the status that docs/watching.md lists."""
+    page = (ROOT / 'docs' / 'watching.md').read_text(encoding='utf-8')
+    rows = re.findall(r'^\| ([^|]+) \|', page.partition('| keys |')[2], re.MULTILINE)
+    return {name for row in rows for name in re.findall(r'`(\w+)`', row) if name != '_sigma'}
+
+
 def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
     start()
     client = connect()
@@ -37,6 +46,8 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
         if topic != '/diagnostics':      # the display asks for it: latched
             assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
     assert shown.status_keys() <= set(status)
+    assert len(keys_on_the_page()) > 15
+    assert keys_on_the_page() <= set(status)
     array = client.arrays[-1].status[0]
     assert shown.status_names() == {(array.hardware_id, array.name)}
     served = dict(node.get_service_names_and_types_by_node('calibrator', '/'))
