@@ -1,5 +1,6 @@
 """The method ``wheels`` on simulated legs: values, sigmas, refusals."""
 
+from dataclasses import replace
 from functools import cache
 
 from drives import drive, settings
@@ -129,7 +130,7 @@ def test_sources_add_up_to_the_sigma():
     rows = _rows(solution)
     known = [s for s in method.sources if s.name not in ('initial_heading', 'height',
                                                          'second_order')]
-    whole = rows @ np.linalg.inv(solution.normal) @ rows.T
+    whole = rows @ np.linalg.inv(solution.fit.normal) @ rows.T
     assert_allclose(total_covariance(known), whole, rtol=1e-5,
                     atol=1e-9 * np.abs(whole).max())
 
@@ -139,14 +140,12 @@ def test_fixes_after_the_stop_are_not_used():
     late = leg.t_fix > leg.t_start + 0.8 * (leg.t_stop - leg.t_start)
     spoilt = leg.fixes_n.copy()
     spoilt[late] += 1000.0
-    from dataclasses import replace
     a, b = (fit_wheels(held_out(x, 0.8), config).estimates['scale_factor']
             for x in (leg, replace(leg, fixes_n=spoilt)))
     assert a == b
 
 
 def test_few_fixes_are_refused():
-    from dataclasses import replace
     made, config, leg = leg_of(**TOWN)
     method = fit_wheels(replace(leg, t_stop=leg.t_start + 0.5), config)
     assert codes(method) == {Code.NO_FIX}

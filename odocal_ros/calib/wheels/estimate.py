@@ -19,6 +19,7 @@ from odocal_ros.calib.wheels.judge_noise import (
     judge_slip,
     white_share,
 )
+from odocal_ros.calib.wheels.least_squares import design, Fit, least_squares
 from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import (
     Bins,
@@ -60,24 +61,20 @@ FAR_BIN = 5.0        # sigmas of a bin against all others: a run of bad fixes
 @dataclass(frozen=True, eq=False)
 class Solution:
     """
-    The estimate: state, and B with which the observations make it.
+    The estimate: state, and how the observations make it.
 
-    residual : (3N,) m, what is taken for errors of the fixes.   left : V^-1 times all that is
-    left.   B, X : (7, 3N), (3N, 7).   normal : (7, 7) inverse covariance.   used : (3N,) bool.
-    parts : of the covariance.   beliefs : (7,) inverse variance known beforehand.
+    residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, 7).
+    beliefs : (7,) inverse variance known beforehand.   parts : of the covariance.
     kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
-    against that of the alignment.   phi_sigma : (N + 1,) rad.
+    against that of the alignment.   width_told : the drive turns enough for the track width.
     """
 
     state: State
     bins: Bins
     eq: Equations
+    fit: Fit
     residual: NDArray[np.float64]
-    left: NDArray[np.float64]
     X: NDArray[np.float64]
-    B: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    used: NDArray[np.bool_]
     beliefs: NDArray[np.float64]
     parts: tuple[Part, ...]
     height: Height
@@ -87,7 +84,6 @@ class Solution:
     dropped: int
     bias_z: tuple[float, float]
     width_told: bool
-    phi_sigma: NDArray[np.float64]
     settled: bool
 
 
@@ -163,28 +159,19 @@ class _Rounds:
         fix[:2 * n, :2 * n] = self.noise.covariance
         parts.append(Part('fix_noise', covariance=fix))
         V = known + fix
-        use = self._used(n)
-        solution = self._solve(V, r, X, use, state, L, eq)
-        if judge and self._drop_bins(solution[3], n):
-            use = self._used(n)
-            solution = self._solve(V, r, X, use, state, L, eq)
-        B, normal, delta, (_, left, use), phi, phi_sigma, bias = solution
+        fit = self._fit(V, r, X, self._used(n), state, L, eq)
+        if judge and self._drop_bins(fit, n):
+            fit = self._fit(V, r, X, self._used(n), state, L, eq)
         # else the gyro's own drift would pass for turns, and the width for nothing
         self.told = self._turns_tell(eq, V, r, X, state, L)
-        widen = float(delta[WIDTH]) if self.told else 0.0
+        widen = float(fit.step[WIDTH]) if self.told else 0.0
         self.rounds += 1
-        new = replace(
-            state, scale=state.scale * float(np.exp(np.clip(delta[SCALE], -0.5, 0.5))),
-            log_ratio=state.log_ratio + float(np.clip(delta[RATIO], -0.5, 0.5)),
-            heading=state.heading + float(delta[HEADING]), width=max(state.width + widen, 0.1),
-            offset=state.offset + float(delta[OFFSET]), pitch=height.pitch,
-            start_n=np.append(state.start_n[:2] + delta[3:5], height.start),
-            phi=np.column_stack([height.phi, phi]))
-        step = delta / np.sqrt(np.diag(np.linalg.inv(normal)))
+        new = _stepped(state, fit, height, widen)
+        step = fit.step / np.sqrt(np.diag(np.linalg.inv(fit.normal)))
         kept = int((~self.bad)[self.bins.of_fix].sum())
-        return Solution(new, self.bins, eq, fix[:, use] @ left, left, X, B, normal, use,
-                        self._beliefs(state)[0], tuple(parts), height,
-                        self.noise, self.slip, kept, 0, bias, self.told, phi_sigma, False), \
+        return Solution(new, self.bins, eq, fit, fix[:, fit.use] @ fit.left, X,
+                        self._beliefs(state)[0], tuple(parts), height, self.noise, self.slip,
+                        kept, 0, self._bias(fit, L, eq), self.told, False), \
             step[[SCALE, RATIO, HEADING]]
 
     def _turns_tell(self, eq, V, r, X, state, L):
@@ -200,7 +187,7 @@ class _Rounds:
             return False
         level = self._used(len(eq.turn))        # the fixes alone may hold the drift
         level[2 * len(eq.turn):] = False
-        drift = self._solve(V, r, X, level, state, L, eq)[5]
+        drift = self._fit(V, r, X, level, state, L, eq).phi_sigma
         return bool(turned > TURNED * np.sqrt((drift**2).mean()))
 
     def _drift(self, eq):
@@ -228,40 +215,22 @@ class _Rounds:
             value[3:5] = self.leg.start.position_n[:2] - state.start_n[:2]
         return weight, value
 
-    def _solve(self, V, r, X, use, state, L, eq):
-        """Return B, normal, step, P, phi of heading, its sigma, and the bias about z."""
-        cut = np.ix_(use, use)
-        root = np.linalg.cholesky(V[cut])
-        inverse = np.linalg.inv(root)
-        inverse = inverse.T @ inverse
-        Xu, ru, Lu = X[use], r[use], L[use]
-        weight, value = self._beliefs(state)
-        right = Xu.T @ inverse
-        normal = right @ Xu + np.diag(weight)
-        covariance = np.linalg.inv(normal)
-        B = np.zeros((7, len(r)))
-        B[:, use] = covariance @ right
-        delta = covariance @ (right @ ru + weight * value)
-        P = inverse - right.T @ covariance @ right
-        left = inverse @ (ru - Xu @ delta)
-        a = self.leg.alignment
-        Q = self._drift(eq)
-        LQ = Lu @ Q
-        phi = LQ.T @ left
-        phi_sigma = np.sqrt(np.maximum(np.diag(Q) - np.einsum('ij,ij->j', LQ, P @ LQ), 0.0))
-        # the bias about the vertical: what the drift's part that grows with time says
+    def _fit(self, V, r, X, use, state, L, eq):
+        return least_squares(V, r, X, L, self._drift(eq), use, *self._beliefs(state))
+
+    def _bias(self, fit, L, eq):
+        """Return the gyro's bias about the vertical beyond that of the alignment, and sigma."""
+        variance = self.leg.alignment.gyro_bias_sigma**2
         up = eq.phi_axes[:, 2]
         toward = up[-1] / max(np.linalg.norm(up[-1]), 1e-9)
-        c = Lu @ (-up * a.gyro_bias_sigma**2) @ toward
-        variance = toward**2 @ a.gyro_bias_sigma**2
-        bias = float(c @ left), float(np.sqrt(max(variance - c @ P @ c, 0.0)))
-        return B, normal, delta, (P, left, use), phi, phi_sigma, bias
+        c = L[fit.use] @ (-up * variance) @ toward      # with what is observed
+        left = toward**2 @ variance - c @ fit.P @ c
+        return float(c @ fit.left), float(np.sqrt(max(left, 0.0)))
 
-    def _drop_bins(self, found, n):
+    def _drop_bins(self, fit, n):
         """Leave out bins that stray from what all others say; tell whether there are new ones."""
-        P, left, use = found
         z = np.zeros(3 * n)
-        z[use] = left / np.sqrt(np.maximum(np.diag(P), 1e-12))
+        z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
         far = (np.hypot(z[:n], z[n:2 * n]) > FAR_BIN) & ~self.bad
         if not far.any() or (self.bad | far).mean() > 0.3:
             return False
@@ -302,13 +271,13 @@ class _Rounds:
         return ((leg.left.at(t) + leg.right.at(t)) / 2 @ f)[:, :2]
 
 
-def design(eq: Equations):
-    """Return the derivatives of the observations by the parameters, (3N, 7)."""
-    n = len(eq.turn)
-    X = np.zeros((3 * n, 7))
-    for axis in range(2):
-        rows = slice(axis * n, (axis + 1) * n)
-        X[rows, :3] = eq.by[:, axis, :3]
-        X[rows, 3 + axis] = 1.0
-    X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET]] = eq.turn_by
-    return X
+def _stepped(state, fit, height, widen):
+    """Return the state after a step."""
+    step = fit.step
+    return replace(
+        state, scale=state.scale * float(np.exp(np.clip(step[SCALE], -0.5, 0.5))),
+        log_ratio=state.log_ratio + float(np.clip(step[RATIO], -0.5, 0.5)),
+        heading=state.heading + float(step[HEADING]), width=max(state.width + widen, 0.1),
+        offset=state.offset + float(step[OFFSET]), pitch=height.pitch,
+        start_n=np.append(state.start_n[:2] + step[3:5], height.start),
+        phi=np.column_stack([height.phi, fit.phi]))

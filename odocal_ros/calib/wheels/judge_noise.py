@@ -114,9 +114,9 @@ def evidence(r, X, known, shape, sizes):
     """
     Return the restricted log likelihood of r = X b + e, cov e = known + size shape, by size.
 
-    But for ln det known. In the axes in which both are diagonal, so that each size costs next to nothing.
+    But for ln det known. In the axes in which both are diagonal: a size costs next to nothing.
     """
-    L = np.linalg.cholesky(known)
+    L = np.linalg.cholesky(known + 1e-13 * np.diag(known).max() * np.eye(len(known)))
     half = np.linalg.solve(L, shape)
     values, axes = np.linalg.eigh(np.linalg.solve(L, half.T))
     r, X = axes.T @ np.linalg.solve(L, r), axes.T @ np.linalg.solve(L, X)

@@ -38,7 +38,7 @@ def without_turns(solution: Solution):
 
     """
     n = len(solution.eq.turn)
-    use = solution.used & (np.arange(3 * n) < 2 * n)
+    use = solution.fit.use & (np.arange(3 * n) < 2 * n)
     V = sum(p.whole() for p in solution.parts)
     X = solution.X[use][:, :5]
     normal = X.T @ np.linalg.solve(V[np.ix_(use, use)], X)

@@ -42,11 +42,15 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
         False leaves the wheels' turn against the gyro's out, as the patent does.
 
     """
-    solution = solve(leg, config, turn_rate)
+    try:
+        solution = solve(leg, config, turn_rate)
+    except np.linalg.LinAlgError:
+        return refused(leg, Reason(Code.NOT_CONVERGED, 'the equations of both wheels have no '
+                                   'solution'))
     if solution is None:
         return refused(leg, Reason(Code.NO_FIX, 'fewer than five fixes between the marks, or less '
                                    'than five seconds of them'))
-    covariance = np.linalg.inv(solution.normal)
+    covariance = np.linalg.inv(solution.fit.normal)
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(sigma).all() and sigma[SCALE] < SCALE_LIMIT
             and sigma[HEADING] < HEADING_LIMIT):
@@ -109,7 +113,7 @@ def _root(covariance):
 def _sources(leg, solution: Solution):
     """Return the parts of the covariance as effects on PARAMETERS, each with its name."""
     rows = _rows(solution)
-    BX = rows @ solution.B
+    BX = rows @ solution.fit.B
     sources = []
     for part in solution.parts:
         effects = BX @ part.root if part.root is not None else _root(BX @ part.covariance @ BX.T)
@@ -117,7 +121,7 @@ def _sources(leg, solution: Solution):
             effects = _root(effects @ effects.T)
         sources.append(Source(part.name, effects, part.shared))
     # what was believed beforehand is a source too: of the width given, of a surveyed start
-    beliefs = np.linalg.inv(solution.normal) * np.sqrt(solution.beliefs)
+    beliefs = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.beliefs)
     keep = solution.beliefs > 0
     sources.append(Source('beliefs', rows @ beliefs[:, keep]))
     heading = np.zeros((5, 1))
@@ -143,7 +147,7 @@ def _second_order(solution):
     sqrt(3) / 2 of the variance.
     """
     share = solution.eq.length / max(solution.eq.length.sum(), 1e-9)
-    phi = (solution.phi_sigma[:-1]**2 + solution.phi_sigma[1:]**2) / 2
+    phi = (solution.fit.phi_sigma[:-1]**2 + solution.fit.phi_sigma[1:]**2) / 2
     return float(np.sqrt(3) / 2 * np.hypot(solution.height.climb_variance, share @ phi))
 
 
@@ -161,13 +165,13 @@ def _gyro_bias(leg, solution):
 def _latency(solution, config):
     """Return the latency of the fixes that their run against speed speaks of, s."""
     root = next(p.root for p in solution.parts if p.name == 'fix_latency')
-    return float(root[solution.used, 0] @ solution.left * config.gnss.time_sigma)
+    return float(root[solution.fit.use, 0] @ solution.fit.left * config.gnss.time_sigma)
 
 
 def _details(leg, solution: Solution, covariance, sources, scale, config):
     state, noise = solution.state, solution.noise
     condition, ratio_sigma = without_turns(solution)
-    used = solution.used[:2 * len(solution.eq.turn)]
+    used = solution.fit.use[:2 * len(solution.eq.turn)]
     residual = solution.residual[:2 * len(solution.eq.turn)][used]
     return {
         'budget': budget_table(sources, PARAMETERS, scale),

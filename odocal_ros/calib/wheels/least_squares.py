@@ -1,0 +1,75 @@
+"""Generalised least squares of the wheels, with the gyro's drift as what is left over."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheels.model import Equations, OFFSET, RATIO, SCALE, WIDTH
+
+TINY = 1e-13      # of the largest variance: keeps a covariance solvable
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """
+    A solved step.
+
+    step : (7,).   normal : (7, 7) its inverse covariance.   B : (7, 3N) observations to step.
+    use : (3N,) observations used, u of them.   P : (u, u) inverse covariance less what the
+    parameters take up.   left : (u,) V^-1 times what is left.   phi, phi_sigma : (N + 1,) rad,
+    drift of the heading at the nodes.
+    """
+
+    step: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    B: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    P: NDArray[np.float64]
+    left: NDArray[np.float64]
+    phi: NDArray[np.float64]
+    phi_sigma: NDArray[np.float64]
+
+
+def least_squares(V, r, X, L, Q, use, weight, value) -> Fit:
+    """
+    Solve r = X step + e, cov e = V, with beliefs; and the drift, whose share of e is L phi.
+
+    Parameters
+    ----------
+    V, r, X : (3N, 3N), (3N,), (3N, 7) arrays
+        Covariance, residuals, derivatives.
+    L, Q : (3N, N + 1), (N + 1, N + 1) arrays
+        What the drift makes of the observations, and its covariance.
+    use : (3N,) bool array
+        Observations to use.
+    weight, value : (7,) arrays
+        Inverse variance and value of what is believed of each step.
+
+    """
+    V = V[np.ix_(use, use)]
+    root = np.linalg.inv(np.linalg.cholesky(V + TINY * np.diag(V).max() * np.eye(len(V))))
+    inverse = root.T @ root
+    Xu, ru, LQ = X[use], r[use], L[use] @ Q
+    right = Xu.T @ inverse
+    normal = right @ Xu + np.diag(weight)
+    covariance = np.linalg.inv(normal)
+    step = covariance @ (right @ ru + weight * value)
+    B = np.zeros((len(step), len(r)))
+    B[:, use] = covariance @ right
+    P = inverse - right.T @ covariance @ right
+    left = inverse @ (ru - Xu @ step)
+    variance = np.diag(Q) - np.einsum('ij,ij->j', LQ, P @ LQ)
+    return Fit(step, normal, B, use, P, left, LQ.T @ left, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def design(eq: Equations):
+    """Return the derivatives of the observations by the parameters, (3N, 7)."""
+    n = len(eq.turn)
+    X = np.zeros((3 * n, 7))
+    for axis in range(2):
+        rows = slice(axis * n, (axis + 1) * n)
+        X[rows, :3] = eq.by[:, axis, :3]
+        X[rows, 3 + axis] = 1.0
+    X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET]] = eq.turn_by
+    return X
