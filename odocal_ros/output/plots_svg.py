@@ -75,7 +75,7 @@ def svg(figure, name: str, says: str) -> str:
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'((?:xlink:)?href="|url\()#', rf'\1#{name}-', text)
     head, _, rest = text.partition('>')
-    box = re.search(r'viewBox="[^"]*"', head).group(0)
+    box = re.findall(r'viewBox="[^"]*"', head)[0]
     return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
 
 
