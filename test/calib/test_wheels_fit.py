@@ -152,6 +152,30 @@ def test_few_fixes_are_refused():
     assert all(e.value is None for e in method.estimates.values())
 
 
+def test_a_wheel_that_does_not_count_is_named():
+    made, config, leg = leg_of(**TOWN)
+    still = replace(leg.right, s=0 * leg.right.s, P=0 * leg.right.P)
+    method = fit_wheels(replace(leg, right=still), config)
+    assert codes(method) == {Code.WHEEL_DEAD}
+    assert 'right' in method.reasons[0].text
+
+
+def test_one_wheel_of_half_the_size_is_no_trouble():
+    made, leg, method = fitted(**TOWN, wheel_difference=-0.5)
+    for name in ('scale_factor', 'scale_factor_left', 'scale_factor_right'):
+        estimate = method.estimates[name]
+        assert abs(estimate.value - truth(made, leg)[name]) < 4 * estimate.sigma
+
+
+def test_a_fix_that_is_no_number_is_left_out():
+    made, config, leg = leg_of(**TOWN)
+    holes = leg.fixes_n.copy()
+    holes[100:110] = np.nan
+    method = fit_wheels(replace(leg, fixes_n=holes), config)
+    whole = fit_wheels(leg, config).estimates['scale_factor']
+    assert method.estimates['scale_factor'].value == pytest.approx(whole.value, abs=whole.sigma)
+
+
 def test_two_legs_combine():
     results = [fitted(**(TOWN | {'seed': seed}))[2] for seed in (1, 2)]
     both = combine_method('wheels', results)

@@ -101,7 +101,8 @@ def solve(leg: WheelLeg, config, turn_rate=True, n_bins=BINS) -> Solution | None
     variance = np.trace(leg.covariance_n[:, :2, :2], axis1=1, axis2=2) / 2
     t0 = max(leg.t_start, float(leg.left.t[0]))
     t1 = min(leg.t_stop, float(leg.left.t[-1]))
-    inside = (leg.t_fix >= t0) & (leg.t_fix <= t1)
+    inside = ((leg.t_fix >= t0) & (leg.t_fix <= t1)
+              & np.isfinite(leg.fixes_n[:, :2]).all(axis=1))
     if inside.sum() < 5 or t1 - t0 < 5 * SHORTEST:
         return None
     leg = thinned(leg)

@@ -42,6 +42,11 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
         False leaves the wheels' turn against the gyro's out, as the patent does.
 
     """
+    dead = [side for side, track in (('left', leg.left), ('right', leg.right))
+            if not np.diff(track.at(np.array([leg.t_start, leg.t_stop])), axis=0).any()]
+    if dead:
+        return refused(leg, Reason(Code.WHEEL_DEAD, f'the {" and the ".join(dead)} wheel does not '
+                                   'count between the marks'))
     try:
         solution = solve(leg, config, turn_rate)
     except np.linalg.LinAlgError:
