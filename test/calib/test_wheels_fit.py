@@ -12,7 +12,7 @@ from wheel_legs import held_out, true_heading_error, wheel_leg
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.wheels.estimate import solve
-from odocal_ros.calib.wheels.leg import positions
+from odocal_ros.calib.wheels.leg import positions, wheel_factors
 from odocal_ros.calib.wheels.result import _rows, fit_wheels
 from odocal_ros.reasons import Code
 
@@ -133,6 +133,21 @@ def test_sources_add_up_to_the_sigma():
     whole = rows @ np.linalg.inv(solution.fit.normal) @ rows.T
     assert_allclose(total_covariance(known), whole, rtol=1e-5,
                     atol=1e-9 * np.abs(whole).max())
+
+
+def test_rows_are_the_derivatives_of_what_is_stated():
+    made, config, leg = leg_of(**TOWN)
+    solution = solve(leg, config)
+
+    def stated(step):
+        state = solution.state
+        scale, ratio = state.scale * np.exp(step[0]), state.log_ratio + step[1]
+        return np.array([*np.log([scale, *wheel_factors(scale, ratio)]),
+                         -(state.heading + step[2]), state.width + step[5]])
+
+    step = 1e-5 * np.eye(7)
+    by = np.stack([(stated(x) - stated(-x)) / 2e-5 for x in step], -1)
+    assert_allclose(_rows(solution), by, atol=1e-8)
 
 
 def test_fixes_after_the_stop_are_not_used():
