@@ -83,7 +83,7 @@ class Journal:
         if self.trouble != self._told:
             self._told = self.trouble
             if self._told:
-                self._log.warning(f'the leg is not journalled: {self._told}')
+                self._log.warning(f'the journal cannot be written: {self._told}')
 
     def _limit_from(self, config: Config) -> int:
         """Take over what the settings say; return the limit, 0 for no journal."""

@@ -80,8 +80,8 @@ class LegJournal:
     def _write(self) -> None:
         if self._bag is None:
             self._bag = self._open()
-        # joining some files takes their size once more for a moment
-        size = sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + MARGIN
+        # joining some files, this one too, takes their size once more for a moment
+        size = 2 * sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + MARGIN
         if self._others + self._bag.size + size > self.plan.limit:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size
@@ -110,8 +110,8 @@ class LegJournal:
 
     def _finish(self) -> None:
         assert self._bag is not None
-        taken = make_room(self.plan.root, self.plan.limit, self._bag.size)
-        self._bag.finish(room=self.plan.limit - taken)
+        taken = make_room(self.plan.root, self.plan.limit, self._bag.size + MARGIN)
+        self._bag.finish(room=self.plan.limit - taken - MARGIN)
 
     def _give_up(self, trouble: str) -> None:
         self.trouble, self._over, self._waiting = trouble, True, []

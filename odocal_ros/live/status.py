@@ -97,7 +97,8 @@ def sentence(now: Situation, text: str) -> str:
         'rejected': 'Rejected',
         'failed': f'Failed: {session.trouble}',
     }[state_name(now)]
-    journal = f'the leg is not journalled: {now.journal_trouble}' if now.journal_trouble else ''
+    trouble = now.journal_trouble
+    journal = f'the journal cannot be written: {trouble}' if trouble else ''
     return '; '.join(filter(None, (seen, text, journal)))
 
 

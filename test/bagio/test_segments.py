@@ -3,6 +3,8 @@
 import errno
 import os
 from pathlib import Path
+import struct
+import zlib
 
 import pytest
 import ros_bags
@@ -86,6 +88,27 @@ def test_chunks_come_back_as_they_were_packed(tmp_path):
     write_file(tmp_path / 'part.mcap', CHANNELS, packed)
     assert [vars(chunk) for chunk in read_chunks(tmp_path / 'part.mcap')] == [
         vars(chunk) for chunk in packed]
+
+
+@pytest.mark.parametrize('zstd', [True, False])
+def test_the_index_of_a_chunk_points_at_its_messages(monkeypatch, zstd):
+    # rosbags reads without it, the readers of ros2 bag and Foxglove do not
+    if not zstd:
+        monkeypatch.setattr(chunks, '_zstd', lambda: None)
+    times, raws = [T0 + 5, T0 + 3, T0 + 9], [b'a' * 10, b'b', b'c' * 300]
+    chunk = pack(7, times, raws, sequence=40)
+    start_ns, end_ns, size, crc, form, packed = chunks._chunk_body(chunk.record)
+    records = chunk.record[-packed:]
+    records = chunks.zstd_module().decompress(records) if zstd else records
+    assert (start_ns, end_ns, size, crc, form) == (
+        T0 + 3, T0 + 9, len(records), zlib.crc32(records), 'zstd' if zstd else '')
+    channel, nbytes = struct.unpack_from('<HI', chunk.index, 9)
+    entries = list(struct.iter_unpack('<QQ', chunk.index[15:]))
+    assert (channel, nbytes, [t for t, _ in entries]) == (7, 48, times)
+    for number, ((time_ns, at), raw) in enumerate(zip(entries, raws, strict=True), 40):
+        assert struct.unpack_from('<BQHIQQ', records, at) == (
+            5, len(raw) + 22, 7, number, time_ns, time_ns)
+        assert records[at + 31:at + 31 + len(raw)] == raw
 
 
 def test_a_growing_bag_is_read_at_any_moment(tmp_path):
