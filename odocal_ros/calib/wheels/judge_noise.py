@@ -16,7 +16,7 @@ TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])   # s
 SLOW = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
 BELIEF = 0.5          # ln: how far the stated variance may be off, before looking
 SLIPS = np.append(0.0, np.geomspace(1e-5, 0.1, 41))      # m/sqrt(s)
-WHITE_BELIEF = 0.8    # that nothing lasts
+WHITE_BELIEF = 0.8    # that nothing lasts, no wheel slips
 LEAST_WHITE = 1e-4    # of the stated variance
 FEW = 20              # fixes below which their scatter says nothing
 
@@ -106,6 +106,7 @@ def judge_slip(r, X, known, walk):
     slips of 1 m/sqrt(s).
     """
     log = evidence(r, X, known, walk, SLIPS**2)
+    log += np.log(np.where(SLIPS > 0, (1 - WHITE_BELIEF) / (len(SLIPS) - 1), WHITE_BELIEF))
     p = np.exp(log - log.max())
     return float(p @ SLIPS**2 / p.sum())
 
