@@ -155,8 +155,8 @@ class WheelsConfig:
     heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half of the range searched about '
                                    'the heading at the start; 0: twice its sigma, 10 deg where it '
                                    'is not known.')
-    levels: int = setting(7, '', 2, 49, about='Levels of each parameter in the first search; 3 or '
-                          'more: the next prime power, an orthogonal array.')
+    levels: int = setting(7, '', 1, 49, about='Levels of each parameter in the first search; 3 or '
+                          'more: the next odd prime power (zero is a level), an orthogonal array.')
     robust: bool = setting(False, about='Weight fixes by their covariance and bound the pull of '
                            'outliers in the search.')
 
@@ -220,8 +220,8 @@ class UpdaterConfig:
 class Config:
     """All settings of the calibrator; see the module for how they are named."""
 
-    method: str = setting('auto', choices=('auto', 'two_point', 'all'), about='Method whose '
-                          'figures are the result; auto: the best that the leg supports.')
+    method: str = setting('auto', choices=('auto', 'two_point', 'wheels', 'all'), about=(
+        'Method whose figures are the result; auto: the best that the leg supports.'))
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

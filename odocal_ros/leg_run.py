@@ -1,13 +1,12 @@
 """One leg on its way through the pipeline: align, propagate, dead reckon, each method, check."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from odocal_ros.align import align
 from odocal_ros.calib.agreement import disagreements
-from odocal_ros.calib.check import stray, track_check
 from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.judge import nominal_scale
@@ -15,6 +14,7 @@ from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
 from odocal_ros.fix_screen import origin_amid
+from odocal_ros.leg_tracks import check_of, tracks
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
@@ -22,27 +22,17 @@ from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
 from odocal_ros.two_point_run import two_point
+from odocal_ros.wheels_run import wheels
 
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
-FEWEST_FIXES = 3        # for a check of the track
-FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
-TRACK_ROWS = 5000       # of a track kept in a result
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
 
 
-@dataclass(frozen=True)
-class Member:
-    """A method of the pipeline: its name, how it runs, and on which legs it can."""
-
-    name: str
-    run: object
-    fits: object
-
-
-MEMBERS = (Member('two_point', two_point, lambda run: True),)     # always computed and shown
+# in order of running; two_point, the operator's own marks, is always computed and shown
+METHODS = {'two_point': two_point, 'wheels': wheels}
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -89,9 +79,8 @@ class LegRun:
             return leg_result(self.leg, self.inputs, self.reasons)
         self._prepare()
         methods, paths = {}, {}
-        for member in MEMBERS:
-            if member.name in deciding(self.config.method, shown=True) and member.fits(self):
-                methods[member.name], paths[member.name] = member.run(self)
+        for name in self._asked():
+            methods[name], paths[name] = METHODS[name](self)
         self.reasons += disagreements(methods)
         estimates, _ = choose(methods, self.config.method)
         scale = estimates.get('scale_factor')
@@ -101,18 +90,24 @@ class LegRun:
         distance = self.distance
         if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
             distance *= scale.value / self.rough
-        before = self.path(np.array([self.nominal or self.rough, 0.0, 0.0]))
+        shown = tracks(self, paths[scale.method])
+        methods = {name: m if paths[name] is None else replace(
+            m, details=m.details | check_of(self, paths[name])) for name, m in methods.items()}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
-                          deciding=deciding(self.config.method),
-                          **self._tracks(before, paths[scale.method]))
+                          deciding=deciding(self.config.method), **shown)
 
-    def path(self, f, track=None):
+    def _asked(self):
+        """Return the methods to run: those asked for, of auto those that the leg can carry."""
+        wanted = deciding(self.config.method, shown=True)
+        one_counter = self.inputs.travel_right is None and self.config.method != 'wheels'
+        return [name for name in METHODS if name in wanted
+                and not (name == 'wheels' and one_counter)]
+
+    def path(self, f):
         """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
-        track = track or self.track
-
         def at(t):
-            path = track.at(t) @ f
-            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+            path = self.track.at(t) @ f
+            return path + self.track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
         return at
 
     def mark(self, t, path, name=''):
@@ -142,21 +137,6 @@ class LegRun:
         if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
             return getattr(self.config.reference, name)
         return ()
-
-    def near(self, path, pin, between):
-        """Tell which fixes do not lie absurdly far from a path that fits: (k,) bool."""
-        if not between.any():
-            return between
-        off = np.hypot(*stray(path, pin, (self.inputs.t_fix, self.fixes_n))[:, :2].T)
-        usual = max(float(np.median(off[between])), self.fix_sigma)
-        far = between & (off > FAR * usual)
-        if far.any():
-            found = Reason(Code.BAD_ROWS_DROPPED, f'{int(far.sum())} of {int(between.sum())} '
-                           f'fixes lie more than {FAR * usual:.0f} m off the track; not used in '
-                           'the check')
-            if found.code not in {r.code for r in self.reasons if 'off the track' in r.text}:
-                self.reasons.append(found)
-        return ~far
 
     def _moves(self):
         """Tell whether there is a drive to speak of, and say what is not."""
@@ -205,10 +185,10 @@ class LegRun:
 
     def reckon(self, travel):
         """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
-        return dead_reckon(*self._epochs, travel)
+        return dead_reckon(*self.epochs, travel)
 
     @cached_property
-    def _epochs(self):
+    def epochs(self):
         """Return the attitude through the leg: t (m,) s, q_nb (m, 4)."""
         inputs, a = self.inputs, self.alignment
         pick = (inputs.t_imu >= a.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
@@ -223,28 +203,3 @@ class LegRun:
         s = self.track.s[inside]
         way = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
         return float(self.track.t[inside][np.searchsorted(way, 0.8 * way[-1])])
-
-    def _tracks(self, before, after):
-        """Return the tracks as configured and as calibrated, and how far both stray."""
-        start = self.mark(max(0.0, float(self.track.t[0]), float(self.inputs.travel.t[0])), after,
-                          'start')
-        if start is None:
-            return {}
-        step = max(1, len(self.track.t) // TRACK_ROWS)
-        t = self.track.t[::step]
-        more = {name: start.position_n + path(t) - path(np.array(start.t))
-                for name, path in (('track_before_n', before), ('track_n', after))}
-        more |= {'origin': (self.origin.latitude, self.origin.longitude, self.origin.height)}
-        pin, begin, end = start, start.t, self.t_fit
-        if self.holdout:
-            pin, begin, end = self.mark(self.t_fit, after), self.t_fit, self.inputs.t_stop
-        between = (self.inputs.t_fix >= begin) & (self.inputs.t_fix <= end)
-        if pin is not None:
-            between &= self.near(after, pin, between)
-        fixes = self.inputs.t_fix[between], self.fixes_n[between]
-        more['reference_n'] = fixes[1]
-        if between.sum() < FEWEST_FIXES or pin is None:
-            return more
-        way = np.abs(np.diff(self.track.s[(self.track.t >= begin) & (self.track.t <= end)])).sum()
-        return more | {name: track_check(stray(path, pin, fixes), way * self.rough)
-                       for name, path in (('before', before), ('after', after))}

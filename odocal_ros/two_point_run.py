@@ -19,6 +19,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.slip import find_slips, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
+from odocal_ros.leg_tracks import near
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
@@ -55,7 +56,7 @@ class TwoPointRun:
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
-        between &= self.run.near(self.run.path(f), chord.start, between)
+        between &= near(self.run, self.run.path(f), chord.start, between)
         factor = np.ones(3)
         if between.sum() >= 3:
             chord, factor = self._judged(chord, f, between)

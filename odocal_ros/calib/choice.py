@@ -20,18 +20,20 @@ ABOUT = {
 }
 
 
-def deciding(asked: str, shown: bool = False) -> tuple[str, ...]:
+def deciding(asked, shown: bool = False) -> tuple[str, ...]:
     """
     Return the methods whose figures may be the result, the first choice first.
 
-    asked : the setting ``method``.   shown : with those that are only shown beside it.
+    asked : the setting ``method``, or such methods.   shown : with those only shown beside it.
     """
+    if not isinstance(asked, str):
+        return asked
     if asked in ('auto', 'all'):
         return ORDER
     return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
 
 
-def choose(methods: dict[str, MethodResult], asked: str):
+def choose(methods: dict[str, MethodResult], asked):
     """
     Take each parameter from the first method that has it and is not rejected.
 
@@ -39,8 +41,8 @@ def choose(methods: dict[str, MethodResult], asked: str):
     ----------
     methods : dict of MethodResult
         By name.
-    asked : str
-        The setting ``method``.
+    asked : str or tuple of str
+        The setting ``method``, or the methods that may give.
 
     Returns
     -------
@@ -62,8 +64,12 @@ def choose(methods: dict[str, MethodResult], asked: str):
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
 
 
+def leg_estimates(leg) -> dict[str, Estimate]:
+    """Return what a LegResult says, each value by the method that gives it."""
+    return choose(leg.methods, leg.deciding or ORDER)[0]
+
+
 def worth_saying(reasons, method: str, estimates: dict[str, Estimate]):
-    """Return a method's reasons without those about values that another method gives."""
+    """Return a method's reasons without those about values that are another method's to give."""
     return tuple(r for r in reasons if r.code not in ABOUT or (
-        given := estimates.get(ABOUT[r.code])) is None or given.value is None
-        or given.method == method)
+        given := estimates.get(ABOUT[r.code])) is None or given.method == method)

@@ -4,10 +4,10 @@ import csv
 from datetime import datetime, UTC
 import io
 
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output.summary import known
-from odocal_ros.reasons import Verdict
 
 LEGS = 'legs.csv'
 SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',
@@ -49,12 +49,9 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
 
 
 def _estimate(leg, calibration, name):
-    """Return a leg's value by the method whose value the calibration gives, else by its best."""
+    """Return a leg's value by the method whose value the calibration gives, else by its own."""
     method = leg.methods.get(calibration.estimates[name].method)
-    if method is None:
-        order = list(Verdict)
-        method = min(leg.methods.values(), key=lambda m: order.index(m.verdict), default=None)
-    return known({} if method is None else method.estimates, name)
+    return known(leg_estimates(leg) if method is None else method.estimates, name)
 
 
 def _iso(stamp_ns: int) -> str:

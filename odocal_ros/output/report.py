@@ -4,6 +4,7 @@ from datetime import datetime, UTC
 from html import escape
 from importlib.resources import files
 
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
@@ -133,13 +134,9 @@ def _leg(number, leg: LegResult, figures, several):
 
 
 def _relative(leg):
-    """Return the relative sigma of the scale by the leg's best method, None without one."""
-    order = list(Verdict)
-    for method in sorted(leg.methods.values(), key=lambda m: order.index(m.verdict)):
-        scale = known(method.estimates, 'scale_factor')
-        if scale.value and scale.sigma:
-            return scale.sigma / abs(scale.value)
-    return None
+    """Return the relative sigma of the leg's scale, None without one."""
+    scale = known(leg_estimates(leg), 'scale_factor')
+    return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None
 
 
 def _utc(stamp_ns):

@@ -5,6 +5,7 @@ from datetime import datetime, UTC
 import math
 import textwrap
 
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, time_span, with_sigma
@@ -178,8 +179,7 @@ def _method_table(methods):
 
 
 def _leg_row(leg: LegResult):
-    method = min(leg.methods.values(), key=lambda m: ORDER.index(m.verdict), default=None)
-    estimates = {} if method is None else method.estimates
+    estimates = leg_estimates(leg)
     scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
     minutes, seconds = divmod(round(leg.duration), 60)

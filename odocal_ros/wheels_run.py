@@ -1,0 +1,99 @@
+"""The method ``wheels`` on one leg: the estimate, and beside it the search of source B."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.wheels.leg import positions, WheelLeg
+from odocal_ros.calib.wheels.planar import planar_leg
+from odocal_ros.calib.wheels.ranges import ranges_of
+from odocal_ros.calib.wheels.result import fit_wheels, refused
+from odocal_ros.calib.wheels.search import search
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.rotations import quat_from_rotvec, quat_multiply
+from odocal_ros.reasons import Code, Reason
+
+ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
+                     'and odometer.right name them')
+
+
+def wheels(run):
+    """
+    Run the method on a leg.
+
+    run : LegRun, aligned and reckoned.
+
+    Returns
+    -------
+    MethodResult, and the antenna's path (t to (n, 3), but for a constant); None where refused.
+
+    """
+    if run.inputs.travel_left is None or run.inputs.travel_right is None:
+        return refused(run.inputs, ONE_COUNTER), None
+    leg = _leg(run)
+    if leg is None:
+        return refused(run.inputs, Reason(Code.NO_FIX, 'no usable fix at the start mark')), None
+    method = fit_wheels(leg, run.config)
+    if method.estimates['scale_factor'].value is None:
+        return method, None
+    found = _search(run, leg, method.details['pitch']['value'])
+    more = {} if found is None else {'search': found.as_dict()}
+    # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself
+    reasons = tuple(r for r in (found.reasons if found else ())
+                    if r.code is not Code.WHEELS_NOT_SEPARABLE)
+    method = replace(method, details=method.details | more, reasons=(
+        *method.reasons, *reasons, *judge(method.estimates, run.nominal, run.config)))
+    return method, _path(run, leg, method)
+
+
+def _leg(run) -> WheelLeg | None:
+    inputs = run.inputs
+    left, right = inputs.travel_left, inputs.travel_right
+    ends = (max(0.0, float(run.track.t[0]), float(left.t[0]), float(right.t[0])),
+            min(run.t_fit, float(run.track.t[-1]), float(left.t[-1]), float(right.t[-1])))
+    start = run.mark(ends[0], run.path(np.array([run.rough, 0.0, 0.0])), 'start')
+    if start is None or ends[1] <= ends[0]:
+        return None
+    between = (inputs.t_fix >= ends[0]) & (inputs.t_fix <= ends[1])
+    slips = run.wheel_slips
+    return WheelLeg(
+        origin=run.origin, left=run.reckon(left), right=run.reckon(right),
+        quantum=max(left.quantum, right.quantum), t_fix=inputs.t_fix[between],
+        fixes_n=run.fixes_n[between], covariance_n=inputs.covariance_n[between], start=start,
+        t_start=ends[0], t_stop=ends[1], alignment=run.alignment, lever_b=run.lever_b,
+        nominal=run.nominal, rough=run.rough, scale_unit=inputs.scale_unit,
+        interval=float(np.median(np.diff(left.t))), doubt=(inputs.doubt_t, inputs.doubt_sigma),
+        slips=(slips.t, slips.size))
+
+
+def _search(run, leg, pitch):
+    """Return what source B finds: array, response surface, least squares by positions alone."""
+    a, wheels = run.alignment, run.config.wheels
+    start = run.nominal or run.rough
+    planar = planar_leg(leg.left, leg.right, leg.t_fix, leg.fixes_n, leg.covariance_n,
+                        (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
+    course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
+    return search(planar, ranges_of(wheels, course), wheels.robust)
+
+
+def _path(run, leg, method):
+    """Return the path that the corrected wheels, heading and gyro dead reckon."""
+    e = method.estimates
+    if e['scale_factor_left'].value is None:
+        return run.path(method.details['f'])
+    if e['gyro_bias_z'].value is not None:
+        drift = e['gyro_bias_z'].value - run.alignment.gyro_bias[2]
+        leg = replace(leg, left=_straightened(run, run.inputs.travel_left, drift, leg.t_start),
+                      right=_straightened(run, run.inputs.travel_right, drift, leg.t_start))
+    values = [e[name].value for name in ('scale_factor_left', 'scale_factor_right',
+                                         'heading_error')]
+    return lambda t: positions(leg, t, *values, method.details['pitch']['value'])
+
+
+def _straightened(run, travel, drift, t_start):
+    """Return the track of a wheel without a drift of the heading, rad/s, since the start."""
+    t, q_nb = run.epochs
+    turn = np.zeros((len(t), 3))
+    turn[:, 2] = -drift * (t - t_start)
+    return dead_reckon(t, quat_multiply(quat_from_rotvec(turn), q_nb), travel)
