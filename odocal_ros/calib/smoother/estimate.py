@@ -1,0 +1,147 @@
+"""
+Iterate: linearise, solve, estimate the noise, until nothing moves.
+
+The noise levels go to the maximum of the restricted likelihood (the fixed point of Harville 1977:
+quadratic sum over its expectation). What lies far outside its distribution is taken to have a
+heavy tail: fixes, slips of an interval, and beliefs (a lever arm, a delay, a turn-on bias) that
+the data gainsay.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from odocal_ros.calib.smoother.chain import solve, Solved
+from odocal_ros.calib.smoother.components import components, road_noise
+from odocal_ros.calib.smoother.equations import Equations, Priors, Weighted
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import M, PITCH, State, YAW
+
+MOST = 25            # iterations
+SETTLED = 0.03       # sigmas that the constants may still move
+SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant is held to that
+# rad: an angle known no better drifts where the cost is flat, and is refused (lever arms: m)
+UNKNOWN = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
+FIRST_TAILS, LAST_TAILS = 3, 12     # iterations in which heavy tails are looked for
+QUIET = 0.01         # relative change of the sigmas of scale and mounting, the same
+# pseudo-observations that a level is as first believed (Imu), or as it is (the others)
+SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
+INERTIA = 4.0
+HASTE = 1.6          # power on the steps of levels: the fixed point is slow where a noise is small
+ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
+OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
+GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
+MOST_WIDE = 30.0     # times its own sigma
+
+
+@dataclass(eq=False)
+class Fit:
+    """Where the iteration ended."""
+
+    state: State
+    levels: Levels
+    priors: Priors
+    spread: np.ndarray       # (K, 3) factors on the odometer's variances: slips
+    weighted: Weighted
+    solved: Solved
+    settled: bool
+    iterations: int
+
+    @property
+    def likelihood(self) -> float:
+        """Return the restricted log likelihood, but for a constant."""
+        return -0.5 * (self.weighted.cost() + self.weighted.log_R_total()
+                       + self.solved.log_determinant)
+
+
+def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=False, about=None,
+        trace=None) -> Fit:
+    """
+    Iterate from a state to the restricted maximum of the likelihood.
+
+    Parameters
+    ----------
+    problem, state, levels : Problem, State, Levels
+        The leg, where to start.
+    most : int
+        Iterations.
+    frozen : bool
+        Leave the noise levels alone.
+    about : Fit, optional
+        An earlier fit whose slips and beliefs are taken over.
+    trace : callable, optional
+        Called with each pass, for benchmarks.
+
+    """
+    sums, before, settled = None, np.ones(3), False
+    priors = about.priors if about else problem.priors
+    spread = about.spread if about else np.ones((len(state.t) - 1, 3))
+    tails = 1 if about else FIRST_TAILS
+    for count in range(1, most + 1):
+        if sums is None or not sums.hold_at(state):
+            sums = problem.sums(state)
+        weighted = Equations(problem, state, sums, priors, spread).at(levels)
+        solved = solve(weighted.normal())
+        sigma = np.sqrt(np.diag(solved.covariance))
+        move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
+        change = np.abs(np.log(sigma[:3] / before)).max()
+        before = sigma[:3]
+        state = state.moved(solved.step, solved.step_border)
+        weighted.after(solved)
+        if trace is not None:
+            trace(count, state, levels, weighted, solved)
+        settled = bool(move < SETTLED and (frozen or change < QUIET and count > tails + 2))
+        if settled or count == most:
+            break
+        if not frozen:
+            near = solved.neighbours()
+            levels = update(weighted, near, levels, problem)
+            if tails <= count <= LAST_TAILS:
+                spread = slips(weighted, near, spread)
+                priors = beliefs(problem.priors, priors, state, solved, near)
+    return Fit(state, levels, priors, spread, weighted, solved, settled, count)
+
+
+def update(weighted, neighbours, levels, problem) -> Levels:
+    """Return levels moved towards the maximum of the restricted likelihood."""
+    new = {}
+    for name, (quadratic, expected) in components(weighted, neighbours).items():
+        level = levels[name]
+        belief = SENSOR.get(name, INERTIA)
+        pull = belief * (problem.first_levels[name] / level if name in SENSOR else 1.0)
+        factor = (quadratic + pull) / (max(expected, 0.0) + belief)
+        if name in ROAD_NOISE or name in SENSOR:
+            factor = factor**HASTE
+        new[name] = max(level * float(np.clip(factor, 0.03, 30.0)), problem.least[name])
+    return levels.but(**new)
+
+
+def slips(weighted, neighbours, spread):
+    """Return factors on the odometer's variances where an interval lies far out: (K, 3)."""
+    noise, found = road_noise(weighted, neighbours)
+    z2 = noise**2 / np.maximum(found, 1e-12)
+    z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
+    # half way in the logarithm: neighbours share a slip, and would hand it to and fro
+    return np.sqrt(spread * np.clip(spread * z2 / OUTLIER**2, 1.0, 1e6))
+
+
+def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
+    """Return priors widened where the data are far from their centre."""
+    n = solved.step.shape[1]
+    P0 = np.diagonal(neighbours[0])[:n]
+    return replace(
+        now,
+        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),
+        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[12:15]),
+        constants=_wider(first.constants, now.constants, state.constants - first.centre,
+                         np.diag(solved.covariance)))
+
+
+def _wider(first, now, off, variance):
+    """Return sigmas at which ``off`` lies no more than GAINSAID out, none below the first."""
+    held = np.isfinite(first)
+    first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
+    z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)
+    wide = np.clip(now_ * np.sqrt(z2) / GAINSAID, first_, MOST_WIDE * first_)
+    return np.where(held, wide, np.inf)

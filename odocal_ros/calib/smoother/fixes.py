@@ -1,0 +1,109 @@
+"""Fixes as rows: the antenna's place at the time of a fix, from the keyframe before it."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.preintegrate import turn
+from odocal_ros.calib.smoother.state import (
+    BA,
+    BARE,
+    BG,
+    C_bv_gradient,
+    GNSS_ARM,
+    GNSS_DELAY,
+    M,
+    P,
+    PHI,
+    PITCH,
+    SLOW,
+    V,
+    YAW,
+)
+from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.rotations import skew
+
+FAR = 3.0             # sigmas beyond which a fix loses weight as a heavy tail has it
+NO_HEIGHT = 1e6       # m, sigma of a height that is not there
+
+
+class Fixes:
+    """
+    Residuals (fix less prediction) and their derivatives at one state.
+
+    later : s by which the delay of the fixes exceeds that of the points.
+    """
+
+    def __init__(self, leg, state, points, mean_rate, use, later=0.0):
+        self.state, self.points = state, points
+        k, tau = points.interval, points.tau[:, None]
+        self.k = k
+        self.C = state.C_nb[k]
+        dp = turn(self.C, points.dp)
+        v = state.v_n[k]
+        w = earth_rate_n(leg.origin.latitude)
+        g = gravity_n(state.p_n[k], leg.origin)
+        self.arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
+        arm_b = state.C_bv @ self.arm_v
+        self.C_t = self.C @ points.R
+        self.arm_n = self.C_t @ arm_b
+        T = np.diff(state.t)[k]
+        self.share = np.clip(points.tau / T, 0.0, 1.0)
+        slow = state.slow_n[k] * (1 - self.share)[:, None] \
+            + state.slow_n[k + 1] * self.share[:, None]
+        self.dp = dp
+        self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
+            self.C_t, np.cross(mean_rate[k], arm_b))
+        place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
+        raw = leg.fixes_n[use] - place - self.arm_n - slow
+        self.raw = np.nan_to_num(raw) + self.v_n * later
+
+    def jacobians(self, n):
+        """
+        Return derivatives of the residual: (m, 3, n) by the keyframe before, (m, 3, M).
+
+        Those by the slow errors are left to ``share``: -(1 - share) before, -share after.
+        """
+        tau = self.points.tau[:, None, None]
+        m = len(tau)
+        one = np.broadcast_to(np.eye(3), (m, 3, 3))
+        J, c = np.zeros((m, 3, n)), np.zeros((m, 3, M))
+        J[:, :, P], J[:, :, V] = -one, -one * tau
+        J[:, :, PHI] = skew(self.dp + self.arm_n)
+        J[:, :, BA] = self.C * tau**2 / 2
+        J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
+        if n > BARE:
+            J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
+        yaw, pitch = self.state.constants[YAW], self.state.constants[PITCH]
+        by_yaw, by_pitch = C_bv_gradient(yaw, pitch)
+        c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
+        c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
+        # stamps late by d: the place is that of d before
+        c[:, :, GNSS_DELAY] = self.v_n
+        return J, c
+
+
+def whitener(covariance_n, no_height):
+    """Return inverse roots of covariances, lower triangular: level rows know no height."""
+    C = covariance_n.copy()
+    C[no_height, 2, :] = C[no_height, :, 2] = 0.0
+    C[no_height, 2, 2] = NO_HEIGHT**2
+    return np.linalg.inv(np.linalg.cholesky(C))
+
+
+def weights(white):
+    """Return weights of level and height of (m, 3) whitened residuals: (m, 3), heavy tails."""
+    level = np.hypot(white[:, 0], white[:, 1])
+    up = np.abs(white[:, 2])
+    w = np.ones_like(white)
+    w[:, 0] = w[:, 1] = np.minimum(1.0, FAR / np.maximum(level, 1e-12))**2
+    w[:, 2] = np.minimum(1.0, FAR / np.maximum(up, 1e-12))**2
+    return w
+
+
+def heavy(white) -> float:
+    """Return the sum of the losses that ``weights`` belong to: squares, logarithms beyond FAR."""
+    total = 0.0
+    for d in (np.hypot(white[:, 0], white[:, 1]), np.abs(white[:, 2])):
+        far = np.maximum(d / FAR, 1.0)
+        total += float((np.minimum(d, FAR)**2 + 2 * FAR**2 * np.log(far)).sum())
+    return total

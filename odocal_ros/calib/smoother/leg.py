@@ -1,0 +1,86 @@
+"""What the smoother works on: one leg as clean arrays, and how the parameters are numbered."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.judge import nominal_scale
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.odometer import Travel
+
+Floats = NDArray[np.float64]
+BEFORE_MARK = 30.0     # s: a standstill that ended longer before the start mark is another drive
+
+
+def _none(*shape):
+    return field(default_factory=lambda: np.empty((0, *shape)))
+
+
+@dataclass(frozen=True, eq=False)
+class SmootherLeg:
+    """
+    One leg, screened: times in s since the start mark, SI, body frame b, n fixed at ``origin``.
+
+    Lever arms are positions in base_link axes, m. Fixes without a height have NaN up.
+    """
+
+    origin: Origin
+    t_begin: float              # s, first moment used: the standstill before the mark, or the mark
+    t_stop: float               # s
+    t_imu: Floats               # (n,)
+    w_b: Floats                 # (n, 3) rad/s
+    f_b: Floats                 # (n, 3) m/s^2
+    travel: Travel
+    t_fix: Floats               # (k,)
+    fixes_n: Floats             # (k, 3) m
+    covariance_n: Floats        # (k, 3, 3) m^2
+    standstills: Floats         # (s, 2) s
+    rough_scale: float          # metres per unit of travel, good to 30 %
+    nominal_scale: float = 0.0  # K0, 0 unknown
+    scale_unit: str = 'm/pulse'
+    imu_arm: Floats = field(default_factory=lambda: np.zeros(3))
+    odometer_arm: Floats = field(default_factory=lambda: np.zeros(3))
+    antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
+    doubt_t: Floats = _none()
+    doubt_sigma: Floats = _none()        # scale units
+    t_velocity: Floats = _none()         # GNSS velocity, antenna's
+    velocity_n: Floats = _none(3)        # m/s
+    velocity_variance: Floats = _none(3)
+    t_heading: Floats = _none()          # outside heading of b's x axis
+    yaw_n: Floats = _none()              # rad, ENU
+    yaw_variance: Floats = _none()       # rad^2, of an error common to the leg
+
+
+def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:
+    """
+    Return the smoother's view of screened inputs.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Of ``screen``.
+    config : Config
+        Lever arms, nominal scale.
+    origin, fixes_n : Origin, (k, 3) array
+        Where n is fixed and the fixes in it, m; NaN up where a fix has no height.
+    spans : (s, 2) array
+        Standstills, s.
+    rough_scale : float
+        Metres per unit of travel.
+    t_stop : float, optional
+        End of what is used, s (a held-out rest); the stop mark by default.
+
+    """
+    t_stop = inputs.t_stop if t_stop is None else t_stop
+    before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
+    t_begin = min(0.0, float(before[-1][0])) if before else 0.0
+    return SmootherLeg(
+        origin=origin, t_begin=t_begin, t_stop=float(t_stop), t_imu=inputs.t_imu,
+        w_b=inputs.w_b, f_b=inputs.f_b, travel=inputs.travel, t_fix=inputs.t_fix,
+        fixes_n=fixes_n, covariance_n=inputs.covariance_n, standstills=np.asarray(spans),
+        rough_scale=float(rough_scale), nominal_scale=nominal_scale(config, inputs.scale_unit),
+        scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
+        odometer_arm=np.array(config.odometer.lever_arm, float),
+        antenna_arm=np.array(config.gnss.lever_arm, float),
+        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma)

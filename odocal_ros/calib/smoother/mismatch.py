@@ -1,0 +1,45 @@
+"""Where the model does not hold: what is said of it, and by how much the sigmas are widened."""
+
+import numpy as np
+
+from odocal_ros.grades import grade_of
+from odocal_ros.reasons import Code, Reason
+
+WORSE = 3.0            # times the grade's noise or bias that is another sensor
+ODD_FIXES = 0.15       # share of the fixes with little weight
+ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
+SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
+WIDEN = 2.0            # factor on the sigmas where the model does not hold
+
+
+def mismatch(problem, fit, neighbours, config):
+    """Return the factor on all sigmas, at least 1, and reasons."""
+    reasons: list[Reason] = []
+    grade = grade_of(config.imu)
+    level = fit.levels.roots()
+    worse = [f'{what} {level[name] / own:.1f} times' for name, own, what in (
+        ('gyro', grade.gyro_noise, 'gyro noise'),
+        ('accel', grade.accel_noise, 'accelerometer noise')) if level[name] > WORSE * own]
+    worse += [f'{what} {np.max(now / own):.1f} times' for now, own, what in (
+        (np.abs(fit.state.gyro_bias[0]), problem.priors.gyro_bias, 'gyro bias'),
+        (np.abs(fit.state.accel_bias[0]), problem.priors.accel_bias, 'accelerometer bias'))
+        if np.max(now / own) > 2 * WORSE]
+    if worse:
+        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
+                              f'({", ".join(worse)}); estimated from the drive instead'))
+    widen, odd = 1.0, []
+    if worse:       # what shakes a vehicle is not white, and how it is coloured is not known
+        odd.append('the Imu errs more than its grade, in ways that are not white noise')
+    share = float((fit.weighted.fix_weight[:, 0] < 0.5).mean())
+    if share > ODD_FIXES:
+        odd.append(f'{100 * share:.0f} % of the fixes lie far off')
+    share = float((fit.spread[:, 0] > 1.5).mean())
+    if share > ODD_ROAD:
+        odd.append(f'the wheel slips in {100 * share:.0f} % of the time')
+    if max(level['side'], level['side_turn']) > SLIDES:
+        odd.append(f"the odometer's point moves sideways by "
+                   f'{max(level["side"], level["side_turn"]):.2f} m in a second')
+    if odd:
+        widen = WIDEN
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd)))
+    return widen, reasons

@@ -1,0 +1,141 @@
+"""
+The noise model: variance components, and what a unit of each does to the rows of an interval.
+
+White noise that enters at a time within the interval acts on all that follows; the integral over
+that time is a three-point Gauss rule, exact for the polynomials that constant force and speed
+make. Columns of one component times the root of its level are independent unit noises.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.smoother.motion import D, ROWS
+from odocal_ros.calib.smoother.state import BA, BG, P, PHI, V
+from odocal_ros.nav.rotations import skew
+
+Floats = NDArray[np.float64]
+# level: variance per second of the white noise or walk
+INTERVAL = ('gyro', 'accel', 'gyro_walk', 'accel_walk', 'along', 'along_hard', 'side',
+            'side_turn', 'up')
+OTHERS = ('travel', 'fix', 'fix_up', 'slow', 'slow_up')
+GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
+    np.polynomial.legendre.leggauss(3)[1] / 2
+HARD = 0.5          # m/s^2 along: above it, a wheel may slip
+TURNING = 0.05      # rad/s: above it, a vehicle may slide sideways
+SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
+GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
+GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
+ABSENT = 1e4        # m^2: no odometer
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Variance of each component: per s of INTERVAL, of OTHERS as factors on the stated ones."""
+
+    values: dict[str, float]
+    correlation_time: float = 0.0      # s of the slow fix error, 0: none
+
+    def __getitem__(self, name):
+        return self.values[name]
+
+    def but(self, correlation_time=None, **values) -> 'Levels':
+        """Return levels with some replaced."""
+        tau = self.correlation_time if correlation_time is None else correlation_time
+        return Levels(self.values | values, tau)
+
+    def roots(self) -> dict[str, float]:
+        """Return standard deviations."""
+        return {k: float(np.sqrt(v)) for k, v in self.values.items()}
+
+
+@dataclass(eq=False)
+class IntervalNoise:
+    """Columns of unit noises of K intervals, (K, 18, c), and the component of each column."""
+
+    columns: Floats
+    component: NDArray[np.int64]       # (c,)
+    extra: Floats                      # (K, 18) variances that are given, not estimated
+
+    def covariance(self, levels: Levels) -> Floats:
+        """Return the covariance of the rows, (K, 18, 18)."""
+        root = np.sqrt([levels[INTERVAL[i]] for i in self.component])
+        W = self.columns * root
+        Q = W @ np.swapaxes(W, 1, 2)
+        Q[:, range(ROWS), range(ROWS)] += self.extra
+        return Q
+
+
+def interval_noise(motion, leg, spread=None) -> IntervalNoise:
+    """Return the noises of a motion; ``spread``, (K, 3): factors on the odometer's (slips)."""
+    K, T = len(motion.T), motion.T[:, 0]
+    force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
+    C = motion.C
+    one = np.broadcast_to(np.eye(3), (K, 3, 3))
+    parts, component = [], []
+
+    def add(name, rows, width):
+        block = np.zeros((K, ROWS, width))
+        for where, matrix in rows:
+            block[:, where] = matrix
+        parts.append(block)
+        component.extend([INTERVAL.index(name)] * width)
+
+    for x, weight in zip(GAUSS_X, GAUSS_W, strict=True):
+        u = ((1 - x) * T)[:, None, None]
+        root = np.sqrt(weight * T)[:, None, None]
+        add('gyro', [(PHI, -one * root), (V, force * u * root), (P, force * (u**2 / 2) * root),
+                     (D, way * u * root)], 3)
+        add('accel', [(V, one * root), (P, one * u * root)], 3)
+        add('gyro_walk', [(PHI, -C * u * root), (V, force @ C * (u**2 / 2) * root),
+                          (P, force @ C * (u**3 / 6) * root),
+                          (D, way @ C * (u**2 / 2) * root), (BG, one * root)], 3)
+        add('accel_walk', [(V, -C * u * root), (P, -C * (u**2 / 2) * root),
+                           (BA, one * root)], 3)
+    axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
+    axes = axes + np.swapaxes(C @ motion.state.C_bv, 1, 2)
+    axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
+    speed = np.linalg.norm(motion.way, axis=1) / T
+    share = np.sqrt(np.clip(speed, SLOWEST, 1.0) * T)
+    hard, turning = hard_and_turning(motion)
+    spread = np.ones((K, 3)) if spread is None else spread
+    for name, axis, where in (('along', 0, ~hard), ('along_hard', 0, hard), ('side', 1, ~turning),
+                              ('side_turn', 1, turning), ('up', 2, np.ones(K, bool))):
+        root = share * where * np.sqrt(spread[:, axis])
+        add(name, [(D, (axes[:, axis] * root[:, None])[:, :, None])], 1)
+    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component),
+                         _extra(motion, leg))
+
+
+def hard_and_turning(motion):
+    """Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each."""
+    T = motion.T[:, 0]
+    speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
+        / motion.state.scale / T
+    padded = np.pad(speed, 1, mode='edge')
+    hard = np.abs(padded[2:] - padded[:-2]) > 2 * HARD * T
+    rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))
+    return hard, rate > TURNING
+
+
+def _extra(motion, leg):
+    """Return variances of what gaps hide: (K, 18)."""
+    sums, T = motion.sums, motion.T[:, 0]
+    extra = np.zeros((len(T), ROWS))
+    gap = np.where(sums.longest_step > max(GAP, 3 * np.median(sums.longest_step)),
+                   sums.longest_step, 0.0)
+    extra[:, PHI] = (GAP_RATE * gap[:, None])**2
+    extra[:, V] = (GAP_FORCE * gap[:, None])**2
+    extra[:, P] = (GAP_FORCE * gap * T)[:, None]**2
+    t = motion.state.t
+    way = leg.travel
+    delay = motion.state.constants[9]
+    outside = (t[:-1] + delay < way.t[0] - 0.1) | (t[1:] + delay > way.t[-1] + 0.1)
+    extra[outside, D] = ABSENT
+    for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
+        k = np.searchsorted(t, at) - 1
+        if 0 <= k < len(T) and sigma > 0:
+            near = slice(max(k - 1, 0), k + 2)       # the row before the gap may lie in the last
+            extra[near, D] += (motion.state.scale * sigma)**2
+    return extra

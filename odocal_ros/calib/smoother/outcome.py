@@ -1,0 +1,159 @@
+"""The smoother's fit as a method's result: estimates, reasons, budget, what the drive was like."""
+
+import numpy as np
+
+from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.smoother.mismatch import mismatch
+from odocal_ros.calib.smoother.shares import shares
+from odocal_ros.calib.smoother.slow_fix import correlation
+from odocal_ros.calib.smoother.state import (
+    BG,
+    CONSTANTS,
+    GNSS_ARM,
+    GYRO_SCALE,
+    HEADING,
+    LN_K,
+    ODO_ARM,
+    PITCH,
+    YAW,
+)
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason
+
+YAW_LIMIT = np.deg2rad(0.5)     # a mounting angle no better than this and asked is not known
+SCALE_LIMIT = 0.05              # the same of the scale, relative
+INFORMED = 0.5                  # posterior over prior: above it the data say little
+BACKWARDS = np.deg2rad(135.0)   # of yaw from nominal: no mounting, but the other way round
+FAR = np.deg2rad(20.0)
+TRACK_ROWS = 5000
+UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
+                                         'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
+                                         'gnss_delay': 's'}
+OPTIONAL = [i for i, name in enumerate(CONSTANTS)
+            if i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
+
+
+def refused(reasons, scale_unit, details=None) -> MethodResult:
+    """Return the result of a leg that the method refuses: every value unknown."""
+    return MethodResult('smoother', tuple(reasons), _unknown(scale_unit), PARAMETERS, (),
+                        details or {})
+
+
+def _unknown(scale_unit):
+    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
+    units |= {CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
+    return {name: Estimate(None, None, unit) for name, unit in units.items()}
+
+
+def outcome(leg, problem, fit, config) -> MethodResult:
+    """Return what a settled fit says of the leg."""
+    near = fit.solved.neighbours()
+    widen, reasons = mismatch(problem, fit, near, config)
+    sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
+    state, c = fit.state, fit.state.constants
+    K, yaw, pitch = state.scale, float(wrap(c[YAW])), float(c[PITCH])
+    found = _unknown(leg.scale_unit)
+    if sigma[LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), leg.scale_unit)
+        if leg.nominal_scale:
+            ratio = K / leg.nominal_scale
+            found['scale_ratio'] = Estimate(ratio, float(ratio * sigma[LN_K]), '1')
+    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
+    for name, i, value in (('yaw_mounting_angle', YAW, yaw),
+                           ('pitch_mounting_angle', PITCH, pitch)):
+        if sigma[i] <= limit:
+            found[name] = Estimate(value, float(sigma[i]), 'rad')
+    reasons += _undetermined(sigma, limit, config, yaw)
+    after = np.sqrt(np.diag(fit.solved.covariance)) / problem.priors.constants
+    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, GYRO_SCALE)}
+    for i in OPTIONAL:
+        name = CONSTANTS[i]
+        if ratio[name] < INFORMED:
+            value = c[i] + _configured(leg, i)
+            found[name] = Estimate(float(value), float(sigma[i]), UNITS[name])
+    bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
+    for i, axis in enumerate('xyz'):
+        name = f'gyro_bias_{axis}'
+        ratio[name] = float(bias_sigma[i] / problem.priors.gyro_bias[i])
+        if ratio[name] < INFORMED:
+            found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
+    unsaid = [f'{name} {r:.2f}' for name, r in ratio.items()
+              if name in found and found[name].value is None]
+    if unsaid:
+        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'the drive adds little to what is '
+                              'believed of these (sigma after over before): ' + ', '.join(unsaid)))
+    reasons += judge(found, leg.nominal_scale, config)
+    sources = [_widened(s, widen) for s in shares(fit, near)]
+    return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
+                        _details(leg, problem, fit, sources, ratio, widen, sigma))
+
+
+def _widened(source, widen):
+    return type(source)(source.name, source.effects * widen, source.shared)
+
+
+def _configured(leg, i):
+    """Return the configured value that a constant is a correction to, 0 for delays."""
+    if ODO_ARM.start <= i < ODO_ARM.stop:
+        return leg.odometer_arm[i - ODO_ARM.start]
+    return leg.antenna_arm[i - GNSS_ARM.start] if GNSS_ARM.start <= i < GNSS_ARM.stop else 0.0
+
+
+def _undetermined(sigma, limit, config, yaw):
+    reasons = []
+    if sigma[LN_K] > SCALE_LIMIT:
+        reasons.append(Reason(Code.SCALE_NOT_DETERMINED, f'the scale would be good to '
+                              f'{100 * sigma[LN_K]:.0f} % only'))
+    nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
+    off = abs(float(wrap(yaw - nominal)))
+    if sigma[YAW] > limit:
+        reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'the drive tells the yaw mounting to '
+                              f'{np.rad2deg(sigma[YAW]):.1f} deg only: too little acceleration '
+                              'and too few turns'))
+    elif off > BACKWARDS:
+        reasons.append(Reason(Code.ODOMETER_REVERSED, 'the odometer runs against the Imu: '
+                              'positive counts mean backwards, or the Imu faces backwards (yaw '
+                              f'{np.rad2deg(yaw):+.1f} deg)'))
+    elif off > FAR:
+        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'the yaw mounting of '
+                              f'{np.rad2deg(yaw):+.1f} deg is {np.rad2deg(off):.1f} deg from the '
+                              'nominal one'))
+    if sigma[PITCH] > limit:
+        reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'the drive tells the pitch mounting to '
+                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only'))
+    return reasons
+
+
+def _details(leg, problem, fit, sources, ratio, widen, sigma):
+    state, w = fit.state, fit.weighted
+    K = state.scale
+    arm = state.C_bv @ w.eq.motion.arm_v
+    step = max(1, len(state.t) // TRACK_ROWS)
+    t_fix = leg.t_fix[problem.use]
+    alike, _ = correlation(t_fix, w.fix_r[:, :2])
+    motion = w.eq.motion
+    speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]
+    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
+                    * motion.T[:, 0]).sum()
+    return {
+        'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
+        'correlation': correlations(fit.solved.covariance[:3, :3], PARAMETERS),
+        'f': K * state.forward,
+        'noise': fit.levels.roots() | {'correlation_time': fit.levels.correlation_time},
+        'iterations': fit.iterations, 'widened': float(widen),
+        'posterior_to_prior': ratio,
+        'gyro_scale_z': {'value': float(state.constants[GYRO_SCALE]),
+                         'sigma': float(sigma[GYRO_SCALE])},
+        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((w.fix_r[:, :2]**2).mean())),
+                      'fix_correlation_2s': alike,
+                      'fixes_downweighted': int((w.fix_weight[:, 0] < 0.5).sum()),
+                      'fixes': len(t_fix),
+                      'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
+        'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
+                       'speed_changes': float(np.abs(np.diff(speed)).sum()),
+                       'turned': float(turned), 'standing': float(problem.still.sum())},
+        'track': {'t': state.t[::step], 'position_n': (state.p_n + state.C_nb @ arm)[::step]},
+    }

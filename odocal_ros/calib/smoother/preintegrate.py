@@ -1,0 +1,238 @@
+"""
+Preintegration: what the Imu and the odometer say of each interval between keyframes.
+
+All in the body frame at the interval's begin, so that nothing depends on where the vehicle is:
+with R the attitude since then, dv, dp the single and double integral of R f, S the sum of R over
+travel (Forster et al. 2017 have the first two). Derivatives by a constant change of the biases
+follow from the same sums: a bias db turns R by -A db, A the integral of R. No loop over samples:
+rotations by a prefix product, the rest by cumulative sums, a chunk of intervals at a time.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.rotations import (
+    exp_so3,
+    matrix_from_quat,
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    skew,
+    transpose,
+)
+from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+
+Floats = NDArray[np.float64]
+CHUNK = 8192      # samples worked on at a time: their arrays stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Sums over K intervals of length T, s; (K, ...) in the body frame at each begin."""
+
+    T: Floats        # (K,)
+    R: Floats        # (K, 3, 3) attitude at the end
+    dv: Floats       # (K, 3) m/s
+    dp: Floats       # (K, 3) m
+    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba, and the end turns by -A d bg
+    AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
+    dv_bg: Floats    # (K, 3, 3) derivative of dv by the gyro bias
+    dp_bg: Floats    # (K, 3, 3)
+    S: Floats        # (K, 3, 3) sum of R over travel, scale units
+    S_bg: Floats     # (K, 3, 3) derivative of S @ forward by the gyro bias
+    mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
+    longest_step: Floats   # (K,) longest gap between Imu rows, s
+
+
+    def shifted(self, gyro_bias, accel_bias) -> 'Intervals':
+        """Return the sums for biases that differ a little, (K, 3) each, to first order."""
+        turned = -turn(self.A, gyro_bias)
+        return replace(
+            self, R=exp_so3(turned) @ self.R,
+            dv=self.dv + turn(self.dv_bg, gyro_bias) - turn(self.A, accel_bias),
+            dp=self.dp + turn(self.dp_bg, gyro_bias) - turn(self.AA, accel_bias))
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Sums from the begin of an interval to m times within it."""
+
+    interval: NDArray[np.int64]   # (m,)
+    tau: Floats      # (m,) s since the begin
+    dv: Floats       # (m, 3)
+    dp: Floats       # (m, 3)
+    R: Floats        # (m, 3, 3)
+
+
+def turn(C, vectors):
+    """Return C @ v row by row: (K, 3, 3), (K, 3)."""
+    return np.einsum('kij,kj->ki', C, vectors)
+
+
+def keyframes(t, t_begin, t_end, spacing):
+    """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
+    first, last = np.searchsorted(t, t_begin), np.searchsorted(t, t_end, side='right') - 1
+    count = max(1, round((t[last] - t[first]) / spacing))
+    grid = np.linspace(t[first], t[last], count + 1)
+    k = np.clip(np.searchsorted(t, grid), first, last)
+    earlier = np.maximum(k - 1, first)
+    k = np.where(grid - t[earlier] < t[k] - grid, earlier, k)
+    return np.unique(k)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuRows:
+    """Imu samples of the leg with what never changes from one pass to the next."""
+
+    t: Floats           # (n,)
+    f_b: Floats         # (n, 3)
+    turn: Floats        # (n - 1, 3) rotation vectors between samples, bias and all
+    key: NDArray[np.int64]   # (K + 1,) samples that are keyframes
+
+    @classmethod
+    def of(cls, leg, spacing):
+        """Return the rows of a leg between its begin and stop."""
+        key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
+        rows = slice(key[0], key[-1] + 1)
+        t = leg.t_imu[rows]
+        return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
+
+
+def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forward, t_points,
+                 derivatives=True):
+    """
+    Sum up all intervals.
+
+    Parameters
+    ----------
+    imu : ImuRows
+        Samples.
+    gyro_bias, accel_bias : (K, 3) arrays
+        Taken out, one for each interval.
+    gyro_scale : float
+        Relative scale error of the gyro's z axis, taken out.
+    travel : callable
+        (m,) times, s, to travel, scale units.
+    forward : (3,) array
+        Scale times forward axis, for S_bg.
+    t_points : (m,) array
+        Times of fixes, rising, within the keyframes.
+    derivatives : bool
+        False: zeros stand in for those that cost most (AA, dv_bg, dp_bg, S_bg).
+
+    Returns
+    -------
+    Intervals, Points.
+
+    """
+    key, out, points = imu.key, [], []
+    unscaled = np.array([1.0, 1.0, 1 / (1 + gyro_scale)])
+    owner = np.clip(np.searchsorted(imu.t[key], t_points, side='right') - 1, 0, len(key) - 2)
+    per = max(1, int(CHUNK * (len(key) - 1) / max(len(imu.t), 1)))
+    for first in range(0, len(key) - 1, per):
+        last = min(first + per, len(key) - 1)
+        mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
+        rows = slice(key[first], key[last] + 1)
+        part = _Chunk(imu.t[rows], imu.f_b[rows], imu.turn[key[first]:key[last]] * unscaled,
+                      key[first:last + 1] - key[first], gyro_bias[first:last],
+                      accel_bias[first:last])
+        out.append(part.intervals(travel, forward, derivatives))
+        points.append(part.points(t_points[mine], owner[mine] - first, first))
+    return _joined(Intervals, out), _joined(Points, points)
+
+
+def _joined(cls, parts):
+    if len(parts) == 1:
+        return parts[0]
+    return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts])
+                  for f in fields(cls)})
+
+
+def _cross(a, M):
+    """Return [a x] M: (n, 3), (n, 3, 3)."""
+    x, y, z = (a[:, i, None] for i in range(3))
+    out = np.empty_like(M)
+    out[:, 0] = y * M[:, 2] - z * M[:, 1]
+    out[:, 1] = z * M[:, 0] - x * M[:, 2]
+    out[:, 2] = x * M[:, 1] - y * M[:, 0]
+    return out
+
+
+class _Chunk:
+    """Some intervals at once: sums from each interval's begin up to every step."""
+
+    def __init__(self, t, f_b, turn, key, gyro_bias, accel_bias):
+        self.t, self.key, self.turn = t, key, turn
+        self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
+        dt = self.dt = np.diff(t)
+        q = np.empty((len(t), 4))
+        q[0] = 0.0, 0.0, 0.0, 1.0
+        self.rate_turn = turn - gyro_bias[self.own] * dt[:, None]
+        q[1:] = quat_from_rotvec(self.rate_turn)
+        q = prefix_product(q)
+        back = quat_conjugate(q[key[:-1]])[self.own]
+        self.Rs = matrix_from_quat(quat_multiply(back, q[:-1]))
+        self.Re = matrix_from_quat(quat_multiply(back, q[1:]))
+        bias = accel_bias[self.own]
+        self.a_s = np.einsum('nij,nj->ni', self.Rs, f_b[:-1] - bias)
+        self.a_e = np.einsum('nij,nj->ni', self.Re, f_b[1:] - bias)
+        self.v, self.dv = self._sums(self.a_s, self.a_e)
+        self.p, self.dp = self._twice(self.v, self.a_s, self.a_e)
+        self.A_before, self.A = self._sums(self.Rs, self.Re)
+
+    def _widen(self, x, like):
+        return x.reshape(-1, *(1,) * (like.ndim - 1))
+
+    def _running(self, step):
+        """Return the sum before each step since the interval's begin, and each interval's sum."""
+        total = np.cumsum(step, axis=0)
+        before = total - step
+        start = before[self.key[:-1]]
+        return before - start[self.own], total[self.key[1:] - 1] - start
+
+    def _sums(self, at_start, at_end):
+        return self._running((at_start + at_end) * self._widen(self.dt / 2, at_start))
+
+    def _twice(self, before, at_start, at_end):
+        """Integrate once more what grows from ``before`` by rates linear over the step."""
+        dt = self._widen(self.dt, at_start)
+        return self._running(before * dt + (2 * at_start + at_end) * (dt**2 / 6))
+
+    def intervals(self, travel, forward, derivatives=True) -> Intervals:
+        """Return the sums of each interval; without derivatives zeros stand for them."""
+        ds = np.diff(travel(self.t)) / 2
+        _, S = self._running((self.Rs + self.Re) * self._widen(ds, self.Rs))
+        T = np.diff(self.t[self.key])
+        _, turn = self._running(self.turn)
+        AA = dv_bg = dp_bg = S_bg = np.zeros_like(S)
+        if derivatives:
+            A_after = self.A_before + (self.Rs + self.Re) * self._widen(self.dt / 2, self.Rs)
+            _, AA = self._twice(self.A_before, self.Rs, self.Re)
+            x_s, x_e = _cross(self.a_s, self.A_before), _cross(self.a_e, A_after)
+            before, dv_bg = self._sums(x_s, x_e)
+            _, dp_bg = self._twice(before, x_s, x_e)
+            turned = _cross(self.Rs @ forward, self.A_before) + _cross(self.Re @ forward, A_after)
+            _, S_bg = self._running(turned * self._widen(ds, turned))
+        return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, self.A, AA, dv_bg, dp_bg,
+                         S, S_bg, turn / T[:, None],
+                         np.maximum.reduceat(self.dt, self.key[:-1]))
+
+    def points(self, t, interval, first) -> Points:
+        """Return the sums up to times within given intervals of the chunk."""
+        j = np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
+                    self.key[interval + 1] - 1)
+        h = t - self.t[j]
+        h1 = h[:, None]
+        share = h / self.dt[j]
+        a = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 3)[:, None]
+        dp = self.p[j] + self.v[j] * h1 + a * h1**2 / 2
+        dv = self.v[j] + (self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 2)[:, None]) * h1
+        R = self.Rs[j] + self.Rs[j] @ skew(self.rate_turn[j] * share[:, None])
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R)
+
+
+def orthonormal(C):
+    """Return the rotation nearest to C, (..., 3, 3), that is a rotation but for rounding."""
+    return C @ (1.5 * np.eye(3) - 0.5 * transpose(C) @ C)

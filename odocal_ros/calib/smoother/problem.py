@@ -1,0 +1,164 @@
+"""A leg made ready for the smoother: keyframes, priors, first noise levels, sums over samples."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.smoother.equations import Priors
+from odocal_ros.calib.smoother.fixes import whitener
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, preintegrate
+from odocal_ros.calib.smoother.start import standing
+from odocal_ros.calib.smoother.state import (
+    GNSS_ARM,
+    GNSS_DELAY,
+    GYRO_SCALE,
+    HEADING,
+    M,
+    ODO_ARM,
+    ODO_DELAY,
+    State,
+)
+from odocal_ros.grades import grade_of
+
+# how near to the last pass over the samples a state must lie to do without another
+NEAR_GYRO, NEAR_ACCEL, NEAR_TIME, NEAR_FORWARD = 3e-5, 1e-2, 3e-4, 1e-3   # rad/s, m/s^2, s, 1
+LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
+SPACING = 1.0        # s between keyframes
+ROAD = 0.01          # m/sqrt(s), what slip and slide are believed to be at first
+LEAST_ROAD = 2e-4    # m/sqrt(s)
+LEAST_FIX = 0.005    # m
+GYRO_SCALE_SIGMA = {'consumer': 3e-3, 'industrial': 2e-3, 'tactical': 3e-4, 'navigation': 1e-5}
+
+
+@dataclass(eq=False)
+class Problem:
+    """A leg made ready: rows, whitening, priors; what stays the same from pass to pass."""
+
+    leg: SmootherLeg
+    imu: ImuRows
+    priors: Priors
+    use: np.ndarray          # (k,) bool, fixes within the keyframes
+    root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
+    still: np.ndarray        # (N,) bool
+    travel_floor: float
+    least: dict
+    first_levels: Levels
+    shaken: dict             # levels of gyro and accelerometer to come down from
+
+    @classmethod
+    def of(cls, leg, config):
+        """Return the problem of a leg."""
+        imu = ImuRows.of(leg, SPACING)
+        t = imu.t[imu.key]
+        still = standing(leg, t)
+        use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+        grade = grade_of(config.imu)
+        covariance = leg.covariance_n[use]
+        fix_sigma = np.sqrt(np.median(covariance[:, 0, 0]))
+        root = whitener(covariance, np.isnan(leg.fixes_n[use, 2]))
+        q = leg.travel.quantum
+        floor = max(q**2 / 12, (1e-3 / leg.rough_scale)**2)
+        values = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2,
+                  'gyro_walk': grade.gyro_bias_walk**2, 'accel_walk': grade.accel_bias_walk**2,
+                  'along': ROAD**2, 'along_hard': ROAD**2, 'side': ROAD**2,
+                  'side_turn': ROAD**2, 'up': ROAD**2, 'travel': floor, 'fix': 1.0,
+                  'fix_up': 1.0, 'slow': fix_sigma**2, 'slow_up': 4 * fix_sigma**2}
+        values |= at_rest(imu, leg, still)
+        least = {k: v for k, v in values.items() if k in ('gyro', 'accel')}
+        least |= {k: v for k, v in values.items() if k in ('gyro_walk', 'accel_walk', 'travel')}
+        least |= dict.fromkeys(('along', 'along_hard', 'side', 'side_turn', 'up'), LEAST_ROAD**2)
+        least |= dict.fromkeys(('fix', 'fix_up'), (LEAST_FIX / fix_sigma)**2)
+        least |= dict.fromkeys(('slow', 'slow_up'), LEAST_FIX**2)
+        return cls(leg, imu, _priors(config, grade), use, root, still, floor, least,
+                   Levels(values), {k: max(v, values[k]) for k, v in shaken(imu).items()})
+
+    def sums(self, state: State) -> 'Sums':
+        """Return the preintegrated sums about a state."""
+        leg, c = self.leg, state.constants
+        delay = c[ODO_DELAY]
+        intervals, points = preintegrate(
+            self.imu, state.gyro_bias[:-1], state.accel_bias[:-1], c[GYRO_SCALE],
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward,
+            leg.t_fix[self.use] - c[GNSS_DELAY])
+        return Sums(state, intervals, points)
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Preintegrated sums with the state they were made about."""
+
+    about: State
+    intervals: Intervals
+    points: Points
+
+    def _apart(self, state):
+        a, b = state, self.about
+        gyro = (a.gyro_bias - b.gyro_bias)[:-1]
+        gyro = gyro + (a.constants[GYRO_SCALE] - b.constants[GYRO_SCALE]) * (
+            self.intervals.mean_rate * [0.0, 0.0, 1.0])
+        return gyro, (a.accel_bias - b.accel_bias)[:-1], a.constants - b.constants
+
+    def near(self, state):
+        """Return intervals for a state nearby, and what they leave to be taken in."""
+        gyro, accel, c = self._apart(state)
+        if not (gyro.any() or accel.any()):
+            return self.intervals, 0.0, c[ODO_DELAY], c[GNSS_DELAY]
+        return self.intervals.shifted(gyro, accel), gyro, c[ODO_DELAY], c[GNSS_DELAY]
+
+    def hold_at(self, state) -> bool:
+        """Tell whether a state is near enough for first order."""
+        gyro, accel, c = self._apart(state)
+        return bool(np.abs(gyro).max() < NEAR_GYRO and np.abs(accel).max() < NEAR_ACCEL
+                    and max(abs(c[ODO_DELAY]), abs(c[GNSS_DELAY])) < NEAR_TIME
+                    and np.abs(c[:3]).max() < NEAR_FORWARD)
+
+
+def at_rest(imu, leg, still) -> dict:
+    """Return white noise levels of gyro and accelerometer as standstills show them."""
+    turn = np.add.reduceat(imu.turn, imu.key[:-1])
+    dt = np.diff(imu.t)[:, None]
+    force = np.add.reduceat((imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt, imu.key[:-1])
+    T = np.diff(imu.t[imu.key])[:, None]
+    inside = still[:-1] & still[1:]
+    rest = np.flatnonzero(inside)
+    runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    sums, freedom = np.zeros(2), 0
+    for run in runs:
+        if len(run) < 3:
+            continue
+        # the second difference knows no bias, no drift; its variance is six times that of one
+        for i, x in enumerate((turn, force)):
+            d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
+            sums[i] += (d**2).sum() / 3
+        freedom += len(run) - 2
+    if freedom < LEAST_REST:
+        return {}
+    return {'gyro': float(sums[0] / freedom), 'accel': float(sums[1] / freedom)}
+
+
+def shaken(imu) -> dict:
+    """
+    Return white noise levels of gyro and accelerometer as neighbouring samples show them.
+
+    What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
+    down from.
+    """
+    dt = np.diff(imu.t)
+    rate = imu.turn / dt[:, None]
+    out = {}
+    for name, x in (('gyro', rate), ('accel', imu.f_b)):
+        jump = np.median((np.diff(x, axis=0)**2).sum(axis=1)) / 2.366     # of chi2 with 3
+        out[name] = float(jump / 2 * np.median(dt))
+    return out
+
+
+def _priors(config, grade) -> Priors:
+    sigma = np.full(M, np.inf)
+    sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
+    sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
+    sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
+    sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade]
+    sigma[HEADING] = 1.0
+    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), np.full(3, max(grade.accel_bias, 1e-6)),
+                  sigma, np.zeros(M))

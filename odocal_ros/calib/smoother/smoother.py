@@ -1,0 +1,115 @@
+"""The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
+
+import numpy as np
+
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.chain import NotPositive, solve
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.outcome import outcome, refused
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
+from odocal_ros.calib.smoother.start import first_state
+from odocal_ros.calib.smoother.state import State
+from odocal_ros.reasons import Code, Reason
+
+FEWEST_FIXES, SHORTEST = 10, 20.0     # s
+ROUGH = 3              # iterations to tell starts apart and slow fix errors from white ones
+UNSURE = 0.1           # rad: a heading from accelerations worse than this is one of several
+
+
+def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
+    """
+    Estimate scale, yaw and pitch mounting of a leg from all its samples.
+
+    Parameters
+    ----------
+    leg : SmootherLeg
+        Screened samples.
+    config : Config
+        Grade, lever arms' and delays' sigmas, limits.
+    trace : callable, optional
+        Called with each pass of the iteration, for benchmarks.
+
+    Returns
+    -------
+    MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
+
+    """
+    few = _too_little(leg)
+    if few:
+        return refused([few], leg.scale_unit)
+    problem = Problem.of(leg, config)
+    try:
+        best = best_fit(problem, config, trace)
+    except (NotPositive, np.linalg.LinAlgError) as error:
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}')],
+                       leg.scale_unit)
+    if not best.settled:
+        sigma = np.sqrt(np.diag(best.solved.covariance))[:3]
+        move = np.abs(best.solved.step_border[:3] / sigma).max()
+        return refused([Reason(Code.NOT_CONVERGED, f'after {best.iterations} iterations the '
+                               f'estimate still moves by {move:.2g} sigmas')], leg.scale_unit)
+    return outcome(leg, problem, best, config)
+
+
+def best_fit(problem, config, trace=None):
+    """Return the likeliest fit of those from several starts, slow fix errors judged."""
+    fits = []
+    start = first_state(problem.leg, problem.imu, problem.priors)
+    starts = [start]
+    if start.yaw_sigma > UNSURE:
+        yaw = config.imu.nominal_yaw
+        starts.append(first_state(problem.leg, problem.imu, problem.priors,
+                                  0.0 if np.isnan(yaw) else yaw))
+    for one in starts:
+        sigma = float(np.sqrt(np.median(problem.leg.covariance_n[:, 0, 0])))
+        wide = max(1.0, (one.fix_spread / sigma)**2)
+        levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
+        fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
+    best = max(fits, key=lambda f: f.likelihood)
+    asked = config.gnss.correlation_time
+    if are_slow(problem, best, asked):
+        return with_slow_errors(problem, best, asked, trace)
+    return fit(problem, best.state, best.levels, about=best, trace=trace)
+
+
+def _too_little(leg):
+    inside = (leg.t_fix >= leg.t_begin) & (leg.t_fix <= leg.t_stop)
+    length = min(leg.t_stop, leg.t_imu[-1]) - max(leg.t_begin, leg.t_imu[0])
+    if inside.sum() < FEWEST_FIXES or length < SHORTEST:
+        return Reason(Code.SCALE_NOT_DETERMINED, f'{int(inside.sum())} fixes in {length:.0f} s: '
+                      'too little for the smoother')
+    return None
+
+
+def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
+    """
+    Return the covariance of the constants at a given state, covariance only.
+
+    Parameters
+    ----------
+    leg, config : SmootherLeg, Config
+        As for ``smooth``.
+    truth : State
+        Values of all unknowns, at the times of ``keyframe_times``.
+    levels : Levels
+        Noise levels.
+
+    Returns
+    -------
+    (M, M) covariance in the order of CONSTANTS, ln K first: the inverse of the information that
+    the rows hold there, beliefs in lever arms and delays included.
+
+    """
+    problem = Problem.of(leg, config)
+    equations = Equations(problem, truth, problem.sums(truth))
+    return solve(equations.at(levels).normal()).covariance
+
+
+def keyframe_times(leg: SmootherLeg, config):
+    """Return the times of the keyframes of a leg, s: (N,)."""
+    problem = Problem.of(leg, config)
+    return problem.imu.t[problem.imu.key]

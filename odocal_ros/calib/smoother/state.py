@@ -1,0 +1,91 @@
+"""
+The unknowns of the smoother: a state at each keyframe, and constants of the leg.
+
+A block of the chain is [position, velocity, attitude error, gyro bias, accelerometer bias, travel
+error, (slow fix error)]; the attitude error phi turns the estimate: C_nb = exp(phi) C_hat. The
+travel error is that of the odometer's reading at the keyframe (quantisation: bounded), in scale
+units. The constants are the border.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
+
+Floats = NDArray[np.float64]
+P, V, PHI, BG, BA = (slice(3 * i, 3 * i + 3) for i in range(5))
+E = 15                       # travel error
+SLOW = slice(16, 19)         # slow part of the fix error, ENU, where there is one
+BARE, WITH_SLOW = 16, 19     # unknowns of a block
+
+# the border
+CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
+             'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
+             'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
+             'odometer_delay', 'gnss_delay', 'gyro_scale_z', 'heading_offset')
+LN_K, YAW, PITCH = 0, 1, 2
+ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
+ODO_DELAY, GNSS_DELAY, GYRO_SCALE, HEADING = 9, 10, 11, 12
+M = len(CONSTANTS)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    Values of all unknowns.
+
+    t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the Imu, m, m/s.   C_nb : (N, 3, 3).
+    gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
+    slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
+    """
+
+    t: Floats
+    p_n: Floats
+    v_n: Floats
+    C_nb: Floats
+    gyro_bias: Floats
+    accel_bias: Floats
+    travel_error: Floats
+    slow_n: Floats
+    constants: Floats
+
+    @property
+    def scale(self) -> float:
+        """Return K."""
+        return float(np.exp(self.constants[LN_K]))
+
+    @property
+    def forward(self) -> Floats:
+        """Return the forward axis in b: (3,)."""
+        return forward_b(self.constants[YAW], self.constants[PITCH])
+
+    @property
+    def C_bv(self) -> Floats:
+        """Return the rotation from vehicle to body axes, roll 0: (3, 3)."""
+        return C_bv(self.constants[YAW], self.constants[PITCH])
+
+    def moved(self, step, step_constants) -> 'State':
+        """Return the state with an increment of every unknown: (N, n), (M,)."""
+        slow = self.slow_n + step[:, SLOW] if step.shape[1] > BARE else self.slow_n
+        return replace(
+            self, p_n=self.p_n + step[:, P], v_n=self.v_n + step[:, V],
+            C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],
+            accel_bias=self.accel_bias + step[:, BA],
+            travel_error=self.travel_error + step[:, E], slow_n=slow,
+            constants=self.constants + step_constants)
+
+
+def C_bv(yaw, pitch):
+    """Return the rotation from vehicle to body axes for mounting angles, rad, roll 0."""
+    return matrix_from_rpy([0.0, pitch, yaw]).T
+
+
+def C_bv_gradient(yaw, pitch):
+    """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    by_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
+    by_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
+    return by_yaw, by_pitch

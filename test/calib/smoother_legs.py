@@ -1,0 +1,61 @@
+"""Simulated legs as the smoother sees them, and their truth at its keyframes."""
+
+from functools import cache
+
+from drives import settings
+import numpy as np
+
+from odocal_ros.calib.smoother import keyframe_times, smoother_leg
+from odocal_ros.calib.smoother.state import C_bv, GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
+from odocal_ros.leg_run import LegRun
+from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.screen import screen
+from odocal_ros.sim import motion, sensors
+from odocal_ros.sim.noise import random_walk, stream
+from odocal_ros.sim.options import SIM_GRADES
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+
+@cache
+def made(**options):
+    """Return a drive, its settings and its leg for the smoother."""
+    drive = simulate(SimOptions(**({'scenario': 'town', 'imu_rate': 50.0} | options)))
+    config = settings(drive, None, verdict__max_yaw_sigma=0.0087)
+    return drive, config, leg_of(drive.leg(), config)
+
+
+def leg_of(leg, config):
+    """Return the smoother's view of a leg."""
+    inputs, _ = screen(leg, config)
+    run = LegRun(leg, inputs, config, [], None)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, run.rough, config.leg.standstill)
+    return smoother_leg(inputs, config, run.origin, run.fixes_n, spans, run.rough)
+
+
+def truth(drive, config, leg) -> State:
+    """Return the true state at the keyframes of a leg; Imu and odometer at the axle."""
+    o = drive.options
+    t = keyframe_times(leg, config)
+    since = t + (drive.truth.start_ns - o.start_ns) * 1e-9
+    state = drive.motion.at(since)
+    to_n = C_en(leg.origin.latitude, leg.origin.longitude).T @ C_en(state.latitude,
+                                                                    state.longitude)
+    C_nb = to_n @ motion.attitude(state) @ C_bv(o.yaw, o.pitch).T
+    v_n = np.einsum('kij,kj->ki', to_n, motion.velocity_n(state))
+    p_n = leg.origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
+    constants = np.zeros(M)
+    constants[[LN_K, YAW, PITCH, ODO_DELAY, GNSS_DELAY]] = (
+        np.log(o.scale), o.yaw, o.pitch, o.odometer_delay, o.fix_delay)
+    return State(t, p_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
+                 np.zeros((len(t), 3)), constants)
+
+
+def _biases(drive, since):
+    o, grade = drive.options, SIM_GRADES[drive.options.imu_grade]
+    n = len(sensors.stamps(drive.motion.duration, o.imu_rate)[0])
+    k = np.clip(np.round(since * o.imu_rate).astype(int), 0, n - 1)
+    return ((first + random_walk(stream(o.seed, name), walk, o.imu_rate, (n, 3)))[k]
+            for first, name, walk in (
+                (drive.truth.gyro_bias, 'gyro walk', grade.gyro_bias_walk),
+                (drive.truth.accel_bias, 'accelerometer walk', grade.accel_bias_walk)))

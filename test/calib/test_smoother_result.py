@@ -1,0 +1,150 @@
+"""The smoother's results on simulated legs: near the truth, from any start, refused where due."""
+
+from dataclasses import replace
+from functools import cache
+
+from drives import changed
+import numpy as np
+import pytest
+from smoother_legs import leg_of, made, truth
+
+from odocal_ros.calib.budget import total_covariance
+from odocal_ros.calib.combine import combine_method
+from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.reasons import Code, Verdict
+
+SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
+
+
+@cache
+def result(**options):
+    """Return the smoother's result of a short town drive."""
+    drive, config, leg = made(**(SHORT | options))
+    return drive, smooth(leg, config)
+
+
+def off(drive, method):
+    """Return errors of scale (relative) and yaw, rad, in sigmas."""
+    scale, yaw = method.estimates['scale_factor'], method.estimates['yaw_mounting_angle']
+    return np.array([(scale.value - drive.truth.scale) / scale.sigma,
+                     (yaw.value - drive.truth.yaw) / yaw.sigma])
+
+
+def codes(method):
+    return {r.code for r in method.reasons}
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'fix_noise': 'rtk'}, {'seed': 2, 'slope': np.deg2rad(4.0)},
+    {'antenna_lever_arm': (0.5, -0.3, 1.2), 'imu_lever_arm': (1.0, 0.2, 0.3),
+     'odometer_lever_arm': (0.0, 0.8, -0.3)},
+    {'outliers': 0.02, 'outlier_size': 30.0}, {'odometer_delay': 0.05},
+    {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
+def test_scale_and_yaw_are_within_their_sigmas(options):
+    drive, method = result(**options)
+    assert method.verdict is not Verdict.REJECTED
+    # 3.3 sigmas: one in a thousand; seeds are fixed
+    assert np.abs(off(drive, method)).max() < 3.3
+    assert method.estimates['scale_factor'].sigma / drive.truth.scale < 3e-4
+    assert method.estimates['yaw_mounting_angle'].sigma < np.deg2rad(0.02)
+
+
+def test_an_unknown_delay_is_found():
+    _, method = result(odometer_delay=0.05)
+    delay = method.estimates['odometer_delay']
+    assert delay.value == pytest.approx(0.05, abs=4 * delay.sigma)
+    assert delay.sigma < 0.005
+
+
+@pytest.mark.parametrize('start', ['scale', 'nothing stands', 'in motion'])
+def test_where_it_starts_from_does_not_matter(start):
+    _, config, leg = made(**SHORT)
+    if start == 'scale':
+        other = replace(leg, rough_scale=1.3 * leg.rough_scale)
+        same = leg
+    else:
+        # the same samples, with and without a hint of what stands; sigmas differ by that hint
+        same = replace(leg, t_begin=25.0 if start == 'in motion' else leg.t_begin,
+                       standstills=np.empty((0, 2)))
+        other = replace(same, rough_scale=0.7 * leg.rough_scale)
+    a, b = smooth(same, config), smooth(other, config)
+    for name in ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'):
+        one, two = a.estimates[name], b.estimates[name]
+        assert abs(one.value - two.value) < 0.1 * one.sigma, name
+
+
+@pytest.mark.parametrize('yaw_deg', [40.0, -135.0])
+def test_a_large_mounting_angle_needs_no_guess(yaw_deg):
+    drive, method = result(yaw=np.deg2rad(yaw_deg))
+    assert np.abs(off(drive, method)).max() < 3.3
+    _, near = result()
+    assert method.estimates['yaw_mounting_angle'].sigma == pytest.approx(
+        near.estimates['yaw_mounting_angle'].sigma, rel=0.1)
+    assert Code.YAW_FAR_FROM_NOMINAL in codes(method) or abs(yaw_deg) > 90
+
+
+def test_slow_errors_of_fixes_are_seen_and_widen_the_scale():
+    drive, slow = result(fix_noise='correlated')
+    _, white = result()
+    assert slow.details['noise']['correlation_time'] > 0
+    assert white.details['noise']['correlation_time'] == 0.0
+    assert slow.estimates['scale_factor'].sigma > 1.5 * white.estimates['scale_factor'].sigma
+    assert np.abs(off(drive, slow)).max() < 3.3
+
+
+def test_stated_sigma_is_the_bound_at_the_truth():
+    drive, config, leg = made(**SHORT)
+    _, method = result()
+    noise = dict(method.details['noise'])
+    tau = noise.pop('correlation_time')
+    covariance = bound(leg, config, truth(drive, config, leg),
+                       Levels({k: v**2 for k, v in noise.items()}, tau))
+    sigma = np.sqrt(np.diag(covariance))
+    scale = method.estimates['scale_factor']
+    # linearised at the estimate or at the truth: the same but for heavy tails
+    assert scale.sigma / scale.value == pytest.approx(sigma[0], rel=0.03)
+    assert method.estimates['yaw_mounting_angle'].sigma == pytest.approx(sigma[1], rel=0.03)
+
+
+def test_sources_add_up_to_the_sigma():
+    _, method = result()
+    total = np.sqrt(np.diag(total_covariance(method.sources)))
+    scale = method.estimates['scale_factor']
+    assert total[0] == pytest.approx(scale.sigma / scale.value, rel=1e-3)
+    assert total[1] == pytest.approx(method.estimates['yaw_mounting_angle'].sigma, rel=1e-3)
+
+
+def test_legs_combine():
+    _, one = result()
+    _, two = result(seed=2)
+    both = combine_method('smoother', [one, two])
+    assert both.estimates['scale_factor'].sigma < one.estimates['scale_factor'].sigma
+    assert both.estimates['gyro_bias_z'].value == two.estimates['gyro_bias_z'].value
+
+
+def test_an_even_drive_straight_on_tells_no_yaw():
+    drive, config, leg = made(scenario='straight', duration=300.0, imu_grade='industrial')
+    middle = replace(leg, t_begin=40.0, t_stop=145.0, standstills=np.empty((0, 2)))
+    method = smooth(middle, config)
+    assert method.estimates['yaw_mounting_angle'].value is None
+    assert Code.YAW_NOT_DETERMINED in codes(method)
+    scale = method.estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3.3 * scale.sigma
+
+
+def test_too_little_is_refused():
+    _, config, leg = made(**SHORT)
+    method = smooth(replace(leg, t_fix=leg.t_fix[:5], fixes_n=leg.fixes_n[:5],
+                            covariance_n=leg.covariance_n[:5]), config)
+    assert method.estimates['scale_factor'].value is None
+    assert Code.SCALE_NOT_DETERMINED in codes(method)
+
+
+def test_an_imu_worse_than_its_grade_is_said():
+    drive, config, _ = made(**SHORT)
+    rng = np.random.default_rng(5)
+    shaking = changed(drive.imu, f_i=lambda f: f + 0.1 * rng.standard_normal(f.shape))
+    method = smooth(leg_of(replace(drive.leg(), imu=shaking), config), config)
+    assert Code.IMU_WORSE_THAN_GRADE in codes(method)
+    assert np.abs(off(drive, method)).max() < 3.3
