@@ -9,7 +9,7 @@ import textwrap
 from odocal_ros.errors import BadUsage
 
 HELP = 'predicted sigmas of a drive not yet driven'
-NOT_YET = ('wheels', 'smoother')
+NOT_PREDICTED = ('wheels', 'smoother')
 NOISE = {'white': 0.0, 'correlated': 60.0}
 SHOWN = 1e-3       # share of a variance below which a source is not worth a line
 
@@ -146,7 +146,7 @@ def as_json(before, sigmas, found) -> dict:
             'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
                           for name, e in method.estimates.items() if name != 'scale_ratio'},
             'budget': method.details.get('budget', {})}},
-        'methods_not_in_this_version': list(NOT_YET),
+        'methods_not_predicted': list(NOT_PREDICTED),
         'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
                     for c in found]}
 
@@ -174,7 +174,7 @@ def _methods(before):
     shown = [_shown(p, before.sigma(p)) for p in PARAMETERS]
     return [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}',
             f'  {"two_point":<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}',
-            f'  ({" and ".join(NOT_YET)}: not in this version)']
+            f'  ({" and ".join(NOT_PREDICTED)}: not predicted)']
 
 
 def _shown(parameter, sigma):

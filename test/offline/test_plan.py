@@ -48,7 +48,7 @@ def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
     for parameter in ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'):
         whole = math.sqrt(sum(row[parameter]**2 for row in budget.values()))
         assert estimates[parameter]['sigma'] == pytest.approx(whole, rel=1e-9)
-    assert answer['methods_not_in_this_version'] == ['wheels', 'smoother']
+    assert answer['methods_not_predicted'] == ['wheels', 'smoother']
 
 
 def test_changes_are_computed_not_told(capsys):
