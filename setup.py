@@ -37,6 +37,7 @@ setup(
         'pyproj>=3.6',
         'PyYAML>=6',
         'rosbags>=0.11',
+        'scipy>=1.11',
         'tqdm>=4',
     ],
     extras_require={
@@ -53,7 +54,6 @@ setup(
             'mypy>=1.8',
             'pytest>=7.4',
             'ruff>=0.6',
-            'scipy>=1.11',
         ],
     },
     entry_points={'console_scripts': [

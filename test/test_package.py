@@ -23,7 +23,8 @@ XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
         'jinja2': ('python3-jinja2', 'jinja2'),
         'matplotlib': ('python3-matplotlib', 'matplotlib'), 'pyproj': ('python3-pyproj', 'pyproj'),
-        'rosbags': ('python3-rosbags-pip', 'rosbags'), 'tqdm': ('python3-tqdm', 'tqdm')}
+        'rosbags': ('python3-rosbags-pip', 'rosbags'),
+        'scipy': ('python3-scipy', 'scipy'), 'tqdm': ('python3-tqdm', 'tqdm')}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 
