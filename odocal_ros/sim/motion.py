@@ -1,9 +1,9 @@
 """
 True motion of a vehicle on the WGS 84 ellipsoid, from a speed and a turn-rate profile.
 
-The rear axle's centre moves along the vehicle's x axis, always (no sideslip). Speed and turn rate
-are piecewise polynomials, so travel and yaw are exact; position is their integral by four-point
-Gauss rule between breaks, good to 1e-8 m over tens of kilometres.
+The rear axle's centre moves along the vehicle's x axis, but for a sway to the side and up if asked
+for. Speed, turn rate and sway are piecewise polynomials, so travel and yaw are exact; position is
+their integral by four-point Gauss rule between breaks, good to 1e-8 m over tens of kilometres.
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from odocal_ros.nav.earth import (
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Profile
 
+STEADY = Profile([0.0, 1.0], [[0.0]])     # no sway
 NODE_STEP = 0.1   # s; at 0.5 rad/s a four-point Gauss rule is then below round-off
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(4)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(4)[1] / 2
@@ -69,15 +70,22 @@ class State:
     longitude: np.ndarray        # rad
     height: np.ndarray           # m
     turned: np.ndarray           # rad, integral of the turn rate against Earth about v's z axis
+    sway: np.ndarray             # (n, 2) m/s, velocity along v's y and z axes: no wheel rolls it
+    sway_acceleration: np.ndarray   # (n, 2) m/s^2
 
 
 class Motion:
-    """The true drive: ``at(t)`` gives its state at any times between 0 and ``duration``."""
+    """
+    The true drive: ``at(t)`` gives its state at any times between 0 and ``duration``.
+
+    sway : velocities along v's y and z axes (m/s), of a vehicle that slides and heaves.
+    """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,
-                 hills: Hills | None = None) -> None:
+                 hills: Hills | None = None, sway: tuple[Profile, ...] = (STEADY, STEADY)) -> None:
         self.speed, self.yaw_rate, self.start = speed, yaw_rate, start
-        self.hills = hills or Hills()
+        self.hills, self.sway = hills or Hills(), sway
+        self._jolt = [profile.derivative() for profile in sway]
         self._acceleration, self._travel = speed.derivative(), speed.integral()
         self._yaw_acceleration, self._turn = yaw_rate.derivative(), yaw_rate.integral()
         self.duration = max(speed.end, yaw_rate.end)
@@ -104,12 +112,15 @@ class Motion:
             slope_rate=by_s * speed, slope_acceleration=by_s2 * speed**2 + by_s * acceleration,
             latitude=latitude0 + latitude, longitude=self._longitude[node] + longitude,
             height=height0 + up,
-            turned=self._turned[node] + turned + longitude * np.sin(latitude0 + latitude / 2))
+            turned=self._turned[node] + turned + longitude * np.sin(latitude0 + latitude / 2),
+            sway=np.stack([profile(t) for profile in self.sway], -1),
+            sway_acceleration=np.stack([profile.mean(t) for profile in self._jolt], -1))
 
     def _place_nodes(self) -> None:
         steps = np.arange(0.0, self.duration, NODE_STEP)
-        breaks = np.concatenate([self.speed.breaks, self.yaw_rate.breaks, [self.duration]])
-        self._nodes = nodes = np.unique(np.concatenate([steps, breaks]))
+        breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
+        nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
+        self._nodes = nodes = nodes[nodes <= self.duration]
         east, north, up, turned = self._stretch(nodes[:-1], np.diff(nodes))
         self._height = _running(self.start.height, up)
         middle = (self._height[1:] + self._height[:-1]) / 2
@@ -130,10 +141,12 @@ class Motion:
         for x, w in zip(GAUSS_X, GAUSS_W, strict=True):
             at = t + x * h
             yaw, slope = self.start.yaw + self._turn(at), self.hills(self._travel(at))[0]
-            ds = w * h * self.speed(at)
-            level = ds * np.cos(slope)
+            ds, side, rise = (w * h * p(at) for p in (self.speed, *self.sway))
+            level = ds * np.cos(slope) - rise * np.sin(slope)
             for total, part in zip(sums, (
-                    level * np.cos(yaw), level * np.sin(yaw), ds * np.sin(slope),
+                    level * np.cos(yaw) - side * np.sin(yaw),
+                    level * np.sin(yaw) + side * np.cos(yaw),
+                    ds * np.sin(slope) + rise * np.cos(slope),
                     w * h * self.yaw_rate(at) * np.cos(slope)), strict=True):
                 total += part
         return sums
@@ -162,9 +175,11 @@ def attitude(state: State):
 
 def velocity_n(state: State):
     """Return the velocity over ground of v's origin in ENU, m/s: (n, 3)."""
-    level = state.speed * np.cos(state.slope)
-    return np.stack([level * np.cos(state.yaw), level * np.sin(state.yaw),
-                     state.speed * np.sin(state.slope)], -1)
+    return np.einsum('nij,nj->ni', attitude(state), _velocity_v(state))
+
+
+def _velocity_v(state):
+    return np.concatenate([state.speed[:, None], state.sway], axis=1)
 
 
 def inertial_v(state: State, lever_arm_v):
@@ -185,7 +200,8 @@ def inertial_v(state: State, lever_arm_v):
                       state.slope_acceleration)
     w_nv = np.stack([yr * s, -gr, yr * c], -1)
     dw_nv = np.stack([ya * s + yr * c * gr, -ga, ya * c - yr * s * gr], -1)
-    a_v = np.stack([state.acceleration, state.speed * yr * c, state.speed * gr], -1)
+    a_v = np.concatenate([state.acceleration[:, None], state.sway_acceleration], axis=1)
+    a_v = a_v + np.cross(w_nv, _velocity_v(state))
 
     earth = earth_rate_n(state.latitude)
     transport = transport_rate_n(state.latitude, state.height, v_n)

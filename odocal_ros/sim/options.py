@@ -58,6 +58,9 @@ class SimOptions:
     slip_walk: float = 0.0                 # m/sqrt(s) while moving
     slip_events: float = 0.0               # per hour of motion
     slip_size: float = 0.1                 # m spun in each event
+    start_slip: float = 0.0                # share of the way rolled that is spun at each start
+    start_slip_time: float = 5.0           # s from each start on
+    sway: float = 0.0                      # m/s of side and up while moving, white at 10 Hz
 
     fix_rate: float = 5.0                  # Hz
     fix_noise: str = 'white'               # white, correlated or rtk
@@ -86,11 +89,12 @@ FINE = 0.001   # m/pulse of the paper's odometer: a coarser pulse would hide 1e-
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'scale', 'nominal_scale',
             'track_width', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
-                'slip_events', 'slip_size', 'outliers', 'outlier_size', 'seed')
+                'slip_events', 'slip_size', 'start_slip', 'start_slip_time', 'sway', 'outliers',
+                'outlier_size', 'seed')
 # largest size, and how a person gives it: rad inside, degrees on the command line
-LIMITS = {'outliers': 0.5, 'wheel_difference': 0.5, 'odometer_delay': 10.0, 'fix_delay': 10.0,
-          'duration': 36_000.0, 'imu_rate': 10_000.0, 'odometer_rate': 10_000.0,
-          'fix_rate': 1000.0, 'heading_rate': 1000.0}
+LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
+          'odometer_delay': 10.0, 'fix_delay': 10.0, 'duration': 36_000.0, 'imu_rate': 10_000.0,
+          'odometer_rate': 10_000.0, 'fix_rate': 1000.0, 'heading_rate': 1000.0}
 ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0, 'yaw': 180.0,
           'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}
 MOST_SAMPLES = 20_000_000   # of one topic; more would not fit in memory

@@ -20,11 +20,13 @@ from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, Hills, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
+from odocal_ros.sim.profile import Profile
 from odocal_ros.sim.routes import ROUTES
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
 SCENARIOS = tuple(DEFAULTS)
+SWAY_STEP = 0.1      # s between draws of the sway
 FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
          'speed': OdometerForm('rate', 0, '1'),
          'angle': OdometerForm('cumulative', 0, 'm/rad')}
@@ -73,7 +75,16 @@ def motion_of(options: SimOptions) -> Motion:
     route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
-    return Motion(route.speed, route.yaw_rate, start, Hills(options.slope))
+    sway = {'sway': _sway(route.speed, options)} if options.sway else {}
+    return Motion(route.speed, route.yaw_rate, start, Hills(options.slope), **sway)
+
+
+def _sway(speed, options):
+    """Return velocities to the side and up: straight lines between draws, less below 1 m/s."""
+    breaks = np.round(np.arange(0.0, speed.end + SWAY_STEP, SWAY_STEP), 9)
+    size = options.sway * np.clip(np.abs(speed(breaks)), 0.0, 1.0)
+    draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
+    return tuple(Profile(breaks, np.stack([x[:-1], np.diff(x) / SWAY_STEP], -1)) for x in draws)
 
 
 def simulate(options: SimOptions | None = None) -> Drive:

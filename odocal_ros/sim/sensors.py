@@ -39,6 +39,7 @@ WHITE_SHARE = 0.2        # of the correlated sigma: receiver noise on top
 SIGMA_FLOOR = 0.001      # m; no receiver reports zero
 SLIP_TIME = 1.0          # s that a slip event takes
 AT_REST = 1e-9           # m/s
+AT_BREAK = 1e-6          # s
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0):
@@ -160,7 +161,20 @@ def slip(state, options: SimOptions, side: str = 'L'):
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for at in rng.choice(state.t[moving], spins):
             spun += options.slip_size * np.clip((state.t - at) / SLIP_TIME, 0.0, 1.0)
+    if options.start_slip:
+        spun += options.start_slip * _way_after_starts(state, moving, options.start_slip_time)
     return spun
+
+
+def _way_after_starts(state, moving, seconds):
+    """Return the metres rolled within so many seconds after each start, summed up: (n,)."""
+    starts = np.flatnonzero(moving & ~np.roll(moving, 1)) - 1    # the last sample at rest
+    starts = starts[starts >= 0]
+    since = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1
+    if not len(starts):
+        return np.zeros(len(moving))
+    fresh = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + AT_BREAK)
+    return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * fresh)
 
 
 def fixes(motion: Motion, options: SimOptions) -> FixSamples:

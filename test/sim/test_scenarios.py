@@ -136,3 +136,17 @@ def test_every_choice_is_filled_in():
 def test_what_cannot_be_driven_is_said(change, told):
     with pytest.raises(BadUsage, match=told):
         simulate(replace(SimOptions(), **change))
+
+
+def test_sway_is_as_large_as_said_and_no_wheel_rolls_it():
+    (motion, state), (bare, plain) = (states('town', sway=x) for x in (0.05, 0.0))
+    fast = state.speed > 1.0
+    # draws lie at the 10 Hz of these states; 5 sigma of a variance
+    n = 2 * fast.sum()
+    assert state.sway[fast].var() / 0.05**2 == pytest.approx(1, rel=5 * np.sqrt(2 / n))
+    assert (state.sway[state.speed == 0] == 0).all()
+    assert (plain.sway == 0).all()
+    assert np.array_equal(state.travel, plain.travel)
+    # a tenth of a second each: 0.05 m/s sqrt(0.1 s t) of random walk, here with 5 sigma
+    aside = (state.latitude - plain.latitude) * 6.36e6
+    assert 0.0 < np.abs(aside).max() < 5 * 0.05 * np.sqrt(0.1 * motion.duration)

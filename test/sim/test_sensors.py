@@ -14,7 +14,7 @@ from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, 
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import resolved, SimOptions
 from odocal_ros.sim.profile import chain, hold, ramp
-from odocal_ros.sim.scenarios import simulate
+from odocal_ros.sim.scenarios import motion_of, simulate
 
 TOWN = SimOptions(scenario='town', duration=200.0, imu_rate=50.0)
 MANY = 60_000
@@ -219,6 +219,24 @@ def test_slip_spins_only_while_moving_and_as_much_as_said():
     assert events == pytest.approx(round(events), abs=1e-9)
     assert 1 <= events <= 38
     assert np.diff(spun).min() >= 0
+
+
+def test_a_wheel_slips_after_each_start_and_not_elsewhere():
+    options = resolved(replace(TOWN, start_slip=0.005, start_slip_time=5.0))
+    drive = motion_of(options)
+    _, t = sensors.stamps(drive.duration, 50.0, sensors.ODOMETER_PHASE)
+    state = drive.at(t)
+    spun = sensors.slip(state, options)
+    moving = state.speed > sensors.AT_REST
+    starts = t[1:][moving[1:] & ~moving[:-1]]
+    assert len(starts) > 1
+    for start in starts:
+        at = np.searchsorted(t, start) - 1       # the last sample at rest; 5 s are 250 samples
+        way, slipped = (x[at + 250] - x[at] for x in (state.travel, spun))
+        assert slipped == pytest.approx(0.005 * way, rel=1e-9)
+        stop = at + 251 + np.flatnonzero(~moving[at + 251:])[0]
+        assert np.ptp(spun[at + 250:stop]) == 0.0
+    assert spun[0] == 0.0
 
 
 @pytest.mark.parametrize(('noise', 'sigma'), [('white', 1.5), ('rtk', 0.02), ('white', 0.7)])
