@@ -52,7 +52,7 @@ def test_derivatives_of_the_motion(perfect, where):
     sums = problem.sums(state)
     J, _ = Equations(problem, state, sums).jacobians(BARE)
     column = {'begin': 0, 'end': BARE, 'constants': 2 * BARE}[where]
-    for i in range(M - 1 if where == 'constants' else BARE):
+    for i in range(M if where == 'constants' else BARE):
         h = {E: 1.0}.get(i, 1e-5) if where != 'constants' else 1e-5
         # every second keyframe moves: each interval sees one end move only
         moves = (np.arange(len(state.t)) % 2 == (0 if where == 'begin' else 1))
@@ -80,7 +80,7 @@ def test_derivatives_of_the_fixes(perfect):
     problem = replace(problem, leg=leg)
     state = _shaken(state)
     J, Jc = Equations(problem, state, problem.sums(state)).fixes.jacobians(BARE)
-    for i in range(BARE + M - 1):
+    for i in range(BARE + M):
         h = 1e-4
 
         def raw(size, i=i):

@@ -44,12 +44,6 @@ class SmootherLeg:
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
     doubt_t: Floats = _none()
     doubt_sigma: Floats = _none()        # scale units
-    t_velocity: Floats = _none()         # GNSS velocity, antenna's
-    velocity_n: Floats = _none(3)        # m/s
-    velocity_variance: Floats = _none(3)
-    t_heading: Floats = _none()          # outside heading of b's x axis
-    yaw_n: Floats = _none()              # rad, ENU
-    yaw_variance: Floats = _none()       # rad^2, of an error common to the leg
 
 
 def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:

@@ -13,7 +13,6 @@ from odocal_ros.calib.smoother.state import (
     CONSTANTS,
     GNSS_ARM,
     GYRO_SCALE,
-    HEADING,
     LN_K,
     ODO_ARM,
     PITCH,
@@ -32,7 +31,7 @@ UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
 OPTIONAL = [i for i, name in enumerate(CONSTANTS)
-            if i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
+            if i not in (LN_K, YAW, PITCH, GYRO_SCALE)]
 
 
 def refused(reasons, scale_unit, details=None) -> MethodResult:

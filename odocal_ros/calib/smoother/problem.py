@@ -14,7 +14,6 @@ from odocal_ros.calib.smoother.state import (
     GNSS_ARM,
     GNSS_DELAY,
     GYRO_SCALE,
-    HEADING,
     M,
     ODO_ARM,
     ODO_DELAY,
@@ -159,6 +158,5 @@ def _priors(config, grade) -> Priors:
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade]
-    sigma[HEADING] = 1.0
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), np.full(3, max(grade.accel_bias, 1e-6)),
                   sigma, np.zeros(M))

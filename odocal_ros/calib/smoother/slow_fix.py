@@ -14,6 +14,7 @@ from odocal_ros.calib.smoother.estimate import Fit, fit
 
 BIN = 2.0                      # s over which residuals are averaged
 ALIKE, SURE = 0.15, 4.0        # correlation of neighbouring bins; its sigmas
+SMOOTHED = 0.2                 # of the stated sigma: a fix so much better was filtered
 TIMES = (15.0, 60.0, 240.0)    # s, tried
 SLOW_SHARE, WHITE_SHARE = 0.9, 0.2    # of the variance, to start from
 FIRST, TRIAL = 5, 3            # iterations with the middle time, with each other
@@ -47,6 +48,8 @@ def are_slow(problem, first: Fit, asked: float) -> bool:
     """
     if not np.isnan(asked):
         return asked > 0.0
+    if first.levels['fix'] < SMOOTHED**2:
+        return True
     t = problem.leg.t_fix[problem.use]
     alike, sigma = correlation(t, first.weighted.fix_r[:, :2])
     return alike > max(ALIKE, SURE * sigma)

@@ -1,0 +1,75 @@
+"""
+How long the smoother takes, and how much memory, on simulated town drives.
+
+    python benchmarks/smoother_speed.py [--cells NAME ...] [--seed 1]
+
+One process, one thread. Printed for each cell: time to simulate and to screen (what reading and
+cleaning a bag costs comes on top), wall and processor time of ``smooth``, iterations, the most
+memory the process has held so far. Goals (issue 5): ten minutes at 100 Hz under 3 s, an hour at
+200 Hz under 20 s and 1 GiB in all. Run it on an idle machine.
+"""
+
+import argparse
+import os
+import resource
+import time
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+CELLS = {
+    'ten minutes': {'duration': 600.0, 'imu_rate': 100.0},
+    'ten minutes, RTK': {'duration': 600.0, 'imu_rate': 100.0, 'fix_noise': 'rtk'},
+    'ten minutes, slow fix errors': {'duration': 600.0, 'imu_rate': 100.0,
+                                     'fix_noise': 'correlated'},
+    'an hour': {'duration': 3600.0, 'imu_rate': 200.0},
+}
+
+
+def run(name, options, seed):
+    """Print one line of figures."""
+    from odocal_ros.calib.smoother import smooth, smoother_leg
+    from odocal_ros.config import Config, with_settings
+    from odocal_ros.leg_run import LegRun
+    from odocal_ros.nav.standstill import standstills
+    from odocal_ros.screen import screen
+    from odocal_ros.sim.scenarios import SimOptions, simulate
+    from odocal_ros.sim.truth import settings
+
+    t0 = time.perf_counter()
+    drive = simulate(SimOptions(scenario='town', seed=seed, **options))
+    t1 = time.perf_counter()
+    config = with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
+                                      for group, keys in settings(drive).items()
+                                      for key, v in keys.items()})
+    leg = drive.leg()
+    inputs, _ = screen(leg, config)
+    prepared = LegRun(leg, inputs, config, [], None)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, prepared.rough,
+                        config.leg.standstill)
+    ready = smoother_leg(inputs, config, prepared.origin, prepared.fixes_n, spans, prepared.rough)
+    t2, cpu = time.perf_counter(), time.process_time()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result = smooth(ready, config)
+    wall, cpu = time.perf_counter() - t2, time.process_time() - cpu
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    scale = result.estimates['scale_factor']
+    off = (scale.value / drive.truth.scale - 1) * 1e6
+    print(f'{name:<30} simulate {t1 - t0:5.1f} s  screen {t2 - t1:5.2f} s  smooth {wall:6.2f} s '
+          f'(cpu {cpu:6.2f} s, {result.details["iterations"]} iterations)  most memory '
+          f'{most / 1024:6.0f} MiB (before: {before / 1024:.0f})  scale {off:+.0f} +- '
+          f'{scale.sigma / scale.value * 1e6:.0f} ppm', flush=True)
+
+
+def main():
+    """Run the cells."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument('--cells', nargs='*', default=list(CELLS), choices=list(CELLS))
+    parser.add_argument('--seed', type=int, default=1)
+    args = parser.parse_args()
+    for name in args.cells:
+        run(name, CELLS[name], args.seed)
+
+
+if __name__ == '__main__':
+    main()
