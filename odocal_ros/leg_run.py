@@ -24,6 +24,8 @@ from odocal_ros.screen import imu_gap
 from odocal_ros.two_point_run import two_point
 from odocal_ros.wheels_run import wheels
 
+# methods that begin with the alignment: what it had to say is said of them
+ALIGNED = ('two_point', 'wheels')
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
@@ -70,7 +72,7 @@ class LegRun:
         self.nominal = nominal_scale(config, inputs.scale_unit)
         self.rough = rough_scale(inputs.travel, inputs.t_fix, self.fixes_n,
                                  self.fix_sigma) or self.nominal
-        self.alignment = alignment
+        self.alignment, self.about_alignment = alignment, ()
         self.lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
 
     def result(self) -> LegResult:
@@ -80,7 +82,10 @@ class LegRun:
         self._prepare()
         methods, paths = {}, {}
         for name in self._asked():
-            methods[name], paths[name] = METHODS[name](self)
+            method, paths[name] = METHODS[name](self)
+            if name in ALIGNED:
+                method = replace(method, reasons=(*self.about_alignment, *method.reasons))
+            methods[name] = method
         self.reasons += disagreements(methods)
         estimates, _ = choose(methods, self.config.method)
         scale = estimates.get('scale_factor')
@@ -160,9 +165,8 @@ class LegRun:
         self.spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, self.rough,
                                  config.leg.standstill)
         if self.alignment is None:
-            self.alignment, why = align(inputs, self.spans, self.rough, self.fixes_n,
-                                        self.origin, config)
-            self.reasons += why
+            self.alignment, self.about_alignment = align(
+                inputs, self.spans, self.rough, self.fixes_n, self.origin, config)
         self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
         self.track = self.reckon(inputs.travel)
         self.wheel_slips = self._faults()
