@@ -40,7 +40,7 @@ def codes(method):
     {'antenna_lever_arm': (0.5, -0.3, 1.2), 'imu_lever_arm': (1.0, 0.2, 0.3),
      'odometer_lever_arm': (0.0, 0.8, -0.3)},
     {'outliers': 0.02, 'outlier_size': 30.0}, {'odometer_delay': 0.05},
-    {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
+    {'odometer': 'speed', 'speed_noise': 0.05}, {'sway': 0.05}, {'start_slip': 0.005}], ids=str)
 def test_scale_and_yaw_are_within_their_sigmas(options):
     drive, method = result(**options)
     assert method.verdict is not Verdict.REJECTED

@@ -52,7 +52,8 @@ class Equations:
         leg = problem.leg
         intervals, gyro_change, delay_change, fix_change = sums.near(state)
         self.motion = Motion(leg, state, intervals, (gyro_change, delay_change))
-        self.noise = interval_noise(self.motion, leg, spread)
+        self.noise = interval_noise(
+            self.motion, leg, self.still[:-1] & self.still[1:], spread)
         self.fixes = Fixes(leg, state, sums.points, intervals.mean_rate, problem.use, fix_change)
         self.root = problem.root
         self._jacobians = {}

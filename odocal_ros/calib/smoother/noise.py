@@ -24,6 +24,7 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 HARD = 0.5          # m/s^2 along: above it, a wheel may slip
 TURNING = 0.05      # rad/s: above it, a vehicle may slide sideways
+AT_REST = 1e-3      # m that an odometer at rest may err by in a second
 SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
 GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
 GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
@@ -67,8 +68,14 @@ class IntervalNoise:
         return Q
 
 
-def interval_noise(motion, leg, spread=None) -> IntervalNoise:
-    """Return the noises of a motion; ``spread``, (K, 3): factors on the odometer's (slips)."""
+def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
+    """
+    Return the noises of a motion.
+
+    rest : (K,) bool, intervals that stand: their odometer has a small noise that is given, for
+        what stands says nothing of what moves.
+    spread : (K, 3) factors on the odometer's variances along, to the side and up (slips).
+    """
     K, T = len(motion.T), motion.T[:, 0]
     force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
     C = motion.C
@@ -102,10 +109,11 @@ def interval_noise(motion, leg, spread=None) -> IntervalNoise:
     spread = np.ones((K, 3)) if spread is None else spread
     for name, axis, where in (('along', 0, ~hard), ('along_hard', 0, hard), ('side', 1, ~turning),
                               ('side_turn', 1, turning), ('up', 2, np.ones(K, bool))):
-        root = share * where * np.sqrt(spread[:, axis])
+        root = share * (where & ~rest) * np.sqrt(spread[:, axis])
         add(name, [(D, (axes[:, axis] * root[:, None])[:, :, None])], 1)
-    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component),
-                         _extra(motion, leg))
+    extra = _extra(motion, leg)
+    extra[rest, D] += AT_REST**2
+    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component), extra)
 
 
 def hard_and_turning(motion):
