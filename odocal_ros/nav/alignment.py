@@ -33,6 +33,7 @@ class Alignment:
     heading_source : where the heading is from; ``course`` holds the mounting angle itself.
     heading_shared : its error is the same in every leg.
     standstill : begin and end, s, of the standstill used, None when aligned in motion.
+    gyro_scale_sigma : relative error of the gyro's scale.
     """
 
     t: float
@@ -46,6 +47,7 @@ class Alignment:
     heading_source: str
     heading_shared: bool
     standstill: tuple[float, float] | None = None
+    gyro_scale_sigma: float = 0.0
 
     @property
     def heading_separable(self) -> bool:
@@ -188,7 +190,8 @@ def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro
     bias_n, sigma_n = _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade)
     sigma_b = np.sqrt(np.einsum('ni,n->i', C_nb**2, sigma_n**2))
     return Alignment(level.t, C_nb, transpose(C_nb) @ bias_n, level.level_sigma, float(yaw_sigma),
-                     sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill)
+                     sigma_b, gyro_noise, grade.gyro_bias_walk, source, shared, level.standstill,
+                     grade.gyro_scale_error)
 
 
 def _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade):

@@ -79,6 +79,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     state = motion.at(t)
     C_vi = imu_rotation(options)
     w_v, f_v = inertial_v(state, options.imu_lever_arm)
+    w_i = w_v @ C_vi * (1 + options.gyro_scale_error)
     gyro, accel = imu_errors(options, len(t))
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     variance = np.full(len(t), np.nan)
@@ -86,7 +87,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
         q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
         variance = np.full(len(t), options.orientation_sigma**2)
     stamp = options.start_ns + ns
-    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_v @ C_vi + gyro,
+    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_i + gyro,
                       f_v @ C_vi + accel, q_ni, variance)
 
 

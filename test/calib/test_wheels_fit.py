@@ -124,6 +124,41 @@ def test_outliers_neither_pull_nor_widen():
     assert scale.sigma == pytest.approx(before.sigma, rel=0.2)
 
 
+@pytest.mark.parametrize('late', [0.1, -0.1])
+def test_late_fixes_of_a_centimetre_move_nothing(late):
+    options = TOWN | {'fix_noise': 'rtk', 'imu_grade': 'industrial', 'seed': 3}
+    _, _, right = fitted(**options)
+    _, _, method = fitted(**options, fix_delay=late)
+    a, b = (m.estimates['scale_factor'] for m in (right, method))
+    # the fixes' noise is the same, but they are of other places; linear in the latency they
+    # would be off by 4 sigmas
+    assert abs(b.value - a.value) < a.sigma
+    assert method.details['fix_latency_seen'] == pytest.approx(late, abs=3e-3)   # 2 cm at 12 m/s
+
+
+@pytest.mark.parametrize('error', [0.02, -0.02])
+def test_a_gyro_that_reads_too_much_is_seen_through(error):
+    # twice what a consumer's gyro is believed to
+    made, leg, method = fitted(**TOWN, gyro_scale_error=error)
+    for name, true in truth(made, leg).items():
+        estimate = method.estimates[name]
+        if estimate.value is not None:
+            assert abs(estimate.value - true) < 4 * estimate.sigma, name
+    seen = method.details['gyro_scale_seen']
+    assert abs(seen['value'] - error) < 4 * seen['sigma']
+    assert seen['sigma'] < 2e-3
+
+
+def test_where_fixes_tell_no_turn_the_width_is_no_better_than_the_gyro():
+    _, config, leg = leg_of(**TOWN, seed=4)
+    errors = 150.0 * np.random.default_rng(1).standard_normal(leg.fixes_n.shape)
+    loose = replace(leg, covariance_n=leg.covariance_n * 1e4, fixes_n=leg.fixes_n + errors)
+    firm = replace(loose, alignment=replace(loose.alignment, gyro_scale_sigma=0.0))
+    with_scale, without = (fit_wheels(x, config).estimates['track_width'] for x in (loose, firm))
+    added = np.sqrt(with_scale.sigma**2 - without.sigma**2) / with_scale.value
+    assert 0.005 < added < 0.01     # of 1 % less what the scale of the way makes up for
+
+
 def test_sources_add_up_to_the_sigma():
     made, config, leg = leg_of(**TOWN)
     solution, method = solve(leg, config), fit_wheels(leg, config)
@@ -145,7 +180,7 @@ def test_rows_are_the_derivatives_of_what_is_stated():
         return np.array([*np.log([scale, *wheel_factors(scale, ratio)]),
                          -(state.heading + step[2]), state.width + step[5]])
 
-    step = 1e-5 * np.eye(7)
+    step = 1e-5 * np.eye(9)
     by = np.stack([(stated(x) - stated(-x)) / 2e-5 for x in step], -1)
     assert_allclose(_rows(solution), by, atol=1e-8)
 

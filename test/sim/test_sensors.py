@@ -353,3 +353,10 @@ def test_heading_topic_is_of_the_body_frame_and_the_orientation_of_the_sensors()
     # the sensor's own x axis points to the side
     off = wrap(yaw(drive.imu.q_ni) - yaw(drive.heading.q_ni))
     assert abs(off) > 1.0
+
+
+def test_a_gyro_scale_error_is_on_all_rates():
+    options = resolved(replace(TOWN, imu_grade='perfect'))
+    right, wrong = (simulate(o).imu.w_i for o in (options, replace(options,
+                                                                   gyro_scale_error=0.01)))
+    assert_allclose(wrong, 1.01 * right, rtol=1e-12)

@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.wheels.model import Equations, OFFSET, RATIO, SCALE, WIDTH
+from odocal_ros.calib.wheels.model import (
+    Equations,
+    GYRO,
+    LATENCY,
+    OFFSET,
+    PARAMETERS,
+    RATIO,
+    SCALE,
+    WIDTH,
+)
 
 TINY = 1e-13      # of the largest variance: keeps a covariance solvable
 
@@ -15,10 +24,11 @@ class Fit:
     """
     A solved step.
 
-    step : (7,).   normal : (7, 7) its inverse covariance.   B : (7, 3N) observations to step.
+    step : (9,).   normal : (9, 9) its inverse covariance.   B : (9, 3N) observations to step.
     use : (3N,) observations used, u of them.   P : (u, u) inverse covariance less what the
-    parameters take up.   left : (u,) V^-1 times what is left.   phi, phi_sigma : (N + 1,) rad,
-    drift of the heading at the nodes.
+    parameters take up.   left : (u,) V^-1 times what is left.   phi : (N + 1,) rad, drift
+    of the heading at the nodes but for the gyro's scale.   phi_sigma : (N + 1,) rad, of that and
+    the gyro's scale together.
     """
 
     step: NDArray[np.float64]
@@ -31,26 +41,40 @@ class Fit:
     phi_sigma: NDArray[np.float64]
 
 
-def least_squares(V, r, X, L, Q, use, weight, value) -> Fit:
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """
+    Drift of the heading at the nodes.
+
+    L : (3N, N + 1) what it makes of the observations.   Q : (N + 1, N + 1) its covariance, but for
+    the gyro's scale.   by_gyro_scale : (N + 1,) what that makes of it.
+    """
+
+    L: NDArray[np.float64]
+    Q: NDArray[np.float64]
+    by_gyro_scale: NDArray[np.float64]
+
+
+def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
     """
     Solve r = X step + e, cov e = V, with beliefs; and the drift, whose share of e is L phi.
 
     Parameters
     ----------
-    V, r, X : (3N, 3N), (3N,), (3N, 7) arrays
+    V, r, X : (3N, 3N), (3N,), (3N, 9) arrays
         Covariance, residuals, derivatives.
-    L, Q : (3N, N + 1), (N + 1, N + 1) arrays
-        What the drift makes of the observations, and its covariance.
+    drift : Drift
+        Of the heading.
     use : (3N,) bool array
         Observations to use.
-    weight, value : (7,) arrays
+    weight, value : (9,) arrays
         Inverse variance and value of what is believed of each step.
 
     """
     V = V[np.ix_(use, use)]
     root = np.linalg.inv(np.linalg.cholesky(V + TINY * np.diag(V).max() * np.eye(len(V))))
     inverse = root.T @ root
-    Xu, ru, LQ = X[use], r[use], L[use] @ Q
+    Xu, ru, LQ = X[use], r[use], drift.L[use] @ drift.Q
     right = Xu.T @ inverse
     normal = right @ Xu + np.diag(weight)
     covariance = np.linalg.inv(normal)
@@ -59,17 +83,20 @@ def least_squares(V, r, X, L, Q, use, weight, value) -> Fit:
     B[:, use] = covariance @ right
     P = inverse - right.T @ covariance @ right
     left = inverse @ (ru - Xu @ step)
-    variance = np.diag(Q) - np.einsum('ij,ij->j', LQ, P @ LQ)
+    variance = np.diag(drift.Q) - np.einsum('ij,ij->j', LQ, P @ LQ)
+    both = -(covariance[GYRO] @ right) @ LQ     # covariance of the drift and the gyro's scale
+    variance += drift.by_gyro_scale * (covariance[GYRO, GYRO] * drift.by_gyro_scale + 2 * both)
     return Fit(step, normal, B, use, P, left, LQ.T @ left, np.sqrt(np.maximum(variance, 0.0)))
 
 
 def design(eq: Equations):
-    """Return the derivatives of the observations by the parameters, (3N, 7)."""
+    """Return the derivatives of the observations by the parameters, (3N, 9)."""
     n = len(eq.turn)
-    X = np.zeros((3 * n, 7))
+    X = np.zeros((3 * n, len(PARAMETERS)))
     for axis in range(2):
         rows = slice(axis * n, (axis + 1) * n)
         X[rows, :3] = eq.by[:, axis, :3]
         X[rows, 3 + axis] = 1.0
-    X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET]] = eq.turn_by
+        X[rows, LATENCY], X[rows, GYRO] = eq.by[:, axis, 4:].T
+    X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET, GYRO]] = eq.turn_by
     return X

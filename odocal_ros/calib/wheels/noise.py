@@ -83,7 +83,7 @@ def walk_root(moving):
 
 def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, slip, config):
     """
-    Return all parts but the fixes' own errors.
+    Return all parts but the fixes' own errors, their latency and the gyro's scale.
 
     since : s, from when on the gyro errs.   slip : m^2/s, variance rate of each wheel's slip.
     """
@@ -104,7 +104,6 @@ def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, s
 
     yaw_rate = np.diff(eq.yaw) / np.diff(bins.edges)
     parts += [
-        Part('fix_latency', stacked(eq.velocity * config.gnss.time_sigma)[:, None], shared=True),
         Part('antenna_lever_arm', np.stack([stacked(eq.lever[:, :, i]) for i in range(3)], -1)
              * config.gnss.lever_arm_sigma, shared=True),
         Part('odometer_delay', stacked(eq.late, -state.width * yaw_rate)[:, None]

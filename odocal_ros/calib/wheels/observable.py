@@ -3,8 +3,8 @@
 import numpy as np
 
 from odocal_ros.calib.two_point import PITCH_PRIOR
-from odocal_ros.calib.wheels.estimate import Solution
 from odocal_ros.calib.wheels.model import PARAMETERS
+from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
@@ -39,7 +39,7 @@ def without_turns(solution: Solution):
     """
     n = len(solution.eq.turn)
     use = solution.fit.use & (np.arange(3 * n) < 2 * n)
-    V = sum(p.whole() for p in solution.parts)
+    V = solution.covariance()
     X = solution.X[use][:, :5]
     normal = X.T @ np.linalg.solve(V[np.ix_(use, use)], X)
     start = normal[3:, 3:]

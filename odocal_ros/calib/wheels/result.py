@@ -4,9 +4,9 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, HEIGHT_UNKNOWN, total_covariance
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.wheels.estimate import Solution, solve
+from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
-from odocal_ros.calib.wheels.model import HEADING, RATIO, SCALE, WIDTH
+from odocal_ros.calib.wheels.model import GYRO, HEADING, LATENCY, RATIO, SCALE, WIDTH
 from odocal_ros.calib.wheels.observable import (
     correlation,
     HEADING_LIMIT,
@@ -17,6 +17,7 @@ from odocal_ros.calib.wheels.observable import (
     width_told,
     without_turns,
 )
+from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.earth import A
@@ -100,9 +101,9 @@ def refused(leg, reason) -> MethodResult:
 
 
 def _rows(solution):
-    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, 7)."""
+    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, 9)."""
     ratio = np.exp(solution.state.log_ratio)
-    rows = np.zeros((5, 7))
+    rows = np.zeros((5, len(solution.beliefs)))
     rows[:3, SCALE] = 1.0
     rows[1, RATIO], rows[2, RATIO] = -1 / (1 + ratio), ratio / (1 + ratio)
     rows[3, HEADING] = -1.0
@@ -128,6 +129,9 @@ def _sources(leg, solution: Solution):
     # what was believed beforehand is a source too: of the width given, of a surveyed start
     beliefs = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.beliefs)
     keep = solution.beliefs > 0
+    for name, column in (('fix_latency', LATENCY), ('gyro_scale', GYRO)):
+        sources.append(Source(name, rows @ beliefs[:, [column]], True))
+        keep[column] = False
     sources.append(Source('beliefs', rows @ beliefs[:, keep]))
     heading = np.zeros((5, 1))
     heading[3] = leg.alignment.heading_sigma
@@ -167,12 +171,6 @@ def _gyro_bias(leg, solution):
     return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
 
 
-def _latency(solution, config):
-    """Return the latency of the fixes that their run against speed speaks of, s."""
-    root = next(p.root for p in solution.parts if p.name == 'fix_latency')
-    return float(root[solution.fit.use, 0] @ solution.fit.left * config.gnss.time_sigma)
-
-
 def _details(leg, solution: Solution, covariance, sources, scale, config):
     state, noise = solution.state, solution.noise
     condition, ratio_sigma = without_turns(solution)
@@ -194,7 +192,9 @@ def _details(leg, solution: Solution, covariance, sources, scale, config):
         'fixes': {'used': solution.kept, 'dropped': solution.dropped,
                   'white_share': noise.white, 'slow_share': noise.slow,
                   'correlation_time': noise.time},
-        'fix_latency_seen': _latency(solution, config),
+        'fix_latency_seen': state.latency,      # s by which stamps are late
+        'gyro_scale_seen': {'value': state.gyro_scale, 'sigma': float(np.sqrt(
+            covariance[GYRO, GYRO]))},
         'slip_walk': float(np.sqrt(solution.slip)),
         'heading_source': leg.alignment.heading_source,
         'heading_drift': {'t': solution.bins.edges, 'rad': state.phi[:, 2]},

@@ -1,0 +1,65 @@
+"""What is believed of the wheels' parameters before the drive speaks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.wheels.leg import WheelLeg
+from odocal_ros.calib.wheels.model import (
+    GYRO,
+    LATENCY,
+    OFFSET,
+    PARAMETERS,
+    RATIO,
+    State,
+    WIDTH,
+)
+from odocal_ros.calib.wheels.noise import ANY_WIDTH
+
+EQUAL = 0.01         # of wheels whose ratio nothing tells
+WIDE = 10.0          # m, sigma of a track width of which nothing is known
+GUESS = 0.8          # m, sigma of that of a car
+WIDTH_SIGMA = 0.02   # of a track width given: taped, and tyres are wide
+FIRM = 1e-7          # s, relative: the least sigma of latency and gyro scale, 0 asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """
+    Sigmas known beforehand.
+
+    width : m, as configured, 0 unknown.   turn_rate : wheels' turns are used.
+    latency : s.   gyro_scale : relative.
+    """
+
+    width: float
+    turn_rate: bool
+    latency: float
+    gyro_scale: float
+
+    def steps(self, leg: WheelLeg, state: State, told, rounds):
+        """Return inverse variances and values, (9,) each, as steps from a state."""
+        weight, value = np.zeros((2, len(PARAMETERS)))
+        given = self.width or ANY_WIDTH
+        loose = WIDE if told else GUESS if rounds > 2 else WIDTH_SIGMA * given
+        weight[WIDTH] = 1 / (WIDTH_SIGMA * given if self.width else loose)**2
+        value[WIDTH] = given - state.width
+        # without turns the fixes leave it open, and the mean of both hangs on its square
+        weight[RATIO] = 1.0 if self.turn_rate else 1 / EQUAL**2
+        value[RATIO] = -state.log_ratio
+        weight[OFFSET] = 1e-6
+        value[OFFSET] = -state.offset
+        weight[LATENCY] = 1 / max(self.latency, FIRM)**2
+        value[LATENCY] = -state.latency
+        weight[GYRO] = 1 / max(self.gyro_scale, FIRM)**2
+        value[GYRO] = -state.gyro_scale
+        if leg.start.surveyed:
+            variance = np.diag(leg.start.covariance_n)[:2]
+            weight[3:5] = 1 / np.maximum(variance, 1e-8)
+            value[3:5] = leg.start.position_n[:2] - state.start_n[:2]
+        return weight, value
+
+    def nuisances(self, X):
+        """Return the covariance that latency and gyro scale add to rows of derivatives, (k, k)."""
+        X = X[:, [LATENCY, GYRO]] * [self.latency, self.gyro_scale]
+        return X @ X.T

@@ -1,0 +1,187 @@
+"""The rounds in which the equations of the wheels are linearised, noise judged, and solved."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.wheels.beliefs import Beliefs, WIDTH_SIGMA
+from odocal_ros.calib.wheels.height import solve_height
+from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_slip, white_share
+from odocal_ros.calib.wheels.least_squares import design, Drift, least_squares
+from odocal_ros.calib.wheels.model import (
+    equations,
+    GYRO,
+    HEADING,
+    LATENCY,
+    OFFSET,
+    RATIO,
+    SCALE,
+    WIDTH,
+)
+from odocal_ros.calib.wheels.noise import (
+    drift_covariance,
+    known_parts,
+    Part,
+    phi_loading,
+    tilted,
+    unknown_width,
+    walk_root,
+)
+from odocal_ros.calib.wheels.solution import Solution
+
+ROUNDS = 5           # of relinearisation, at most
+SETTLED = 0.01       # sigmas: smaller steps are none
+LEAST_TURN = 0.05    # rad rms: less is no turn
+TURNED = 10.0        # times what the gyro may have drifted: turns that tell the track width
+FAR_BIN = 5.0        # sigmas of a bin against all others: a run of bad fixes
+
+
+class Rounds:
+    """The rounds of relinearisation over one leg."""
+
+    def __init__(self, leg, config, bins, turn_rate, width):
+        self.leg, self.config, self.turn_rate = leg, config, turn_rate
+        self.bins, self.width = bins, width
+        self.beliefs = Beliefs(width, turn_rate, config.gnss.time_sigma,
+                               leg.alignment.gyro_scale_sigma)
+        self.since = leg.start.t if leg.alignment.heading_source == 'fixed' else leg.alignment.t
+        n = len(bins.edges) - 1
+        self.bad = np.zeros(n, bool)
+        self.slip, self.told, self.rounds = 0.0, False, 0
+
+    def run(self, state, fixes):
+        """Return the solution from a first state."""
+        again, dropped = False, 0
+        for k in range(ROUNDS):
+            eq = equations(self.leg, self.bins, state, self.since)
+            height = solve_height(self.leg, eq, self.bins, state, self.since)
+            solution, step = self._round(eq, state, height, judge=k == 1 or again)
+            state, again = solution.state, self.bad.sum() > dropped
+            dropped = self.bad.sum()
+            if k > 1 and not again and np.all(np.abs(step) < SETTLED):
+                break
+        return replace(solution, dropped=fixes - solution.kept,
+                       settled=bool(np.all(np.abs(step) < 10 * SETTLED)))
+
+    def _round(self, eq, state, height, judge):
+        leg, n = self.leg, len(eq.turn)
+        L = phi_loading(eq, state.width)
+        r = np.concatenate([eq.residual[:, 0], eq.residual[:, 1], eq.turn]) + L @ state.phi[:, 2]
+        X = design(eq)
+        self._judge_slip(eq, state, r, X, judge)
+        parts = known_parts(leg, eq, self.bins, state, self.since, self.slip, self.config)
+        parts.append(Part('pitch', np.concatenate(
+            [eq.by[:, 0, 3], eq.by[:, 1, 3], 0 * eq.turn])[:, None] * height.pitch_sigma))
+        parts.append(tilted(eq, state, height.tilt_variance))
+        if not (self.width or self.told):
+            parts.append(unknown_width(eq, self._drift(eq)))
+        known = sum(p.whole() for p in parts)
+        if judge or self.rounds == 0:
+            self._judge_fixes(eq, state, r, X, known, judge)
+        fix = np.zeros((3 * n, 3 * n))
+        fix[:2 * n, :2 * n] = self.noise.covariance
+        parts.append(Part('fix_noise', covariance=fix))
+        V = known + fix
+        fit = self._fit(V, r, X, self._used(n), state, L, eq)
+        if judge and self._drop_bins(fit, n):
+            fit = self._fit(V, r, X, self._used(n), state, L, eq)
+        # else the gyro's own drift would pass for turns, and the width for nothing
+        self.told = self._turns_tell(eq, V, r, X, state, L)
+        widen = float(fit.step[WIDTH]) if self.told else 0.0
+        self.rounds += 1
+        new = _stepped(state, fit, height, widen)
+        step = fit.step / np.sqrt(np.diag(np.linalg.inv(fit.normal)))
+        kept = int((~self.bad)[self.bins.of_fix].sum())
+        return Solution(new, self.bins, eq, fit, fix[:, fit.use] @ fit.left, X,
+                        self._steps(state)[0], tuple(parts), height, self.noise, self.slip,
+                        kept, 0, self._bias(fit, L, eq), self.told, False), \
+            step[[SCALE, RATIO, HEADING]]
+
+    def _turns_tell(self, eq, V, r, X, state, L):
+        """Tell whether the turns are far above what the gyro may have drifted."""
+        if not self.turn_rate:
+            return False
+        way = np.append(0.0, np.cumsum(eq.length))
+        away = eq.yaw - np.polyval(np.polyfit(way, eq.yaw, 1), way)     # a ratio makes a line
+        turned = np.sqrt((away**2).mean())
+        if turned > TURNED * np.sqrt(np.diag(self._drift(eq)).mean()):
+            return True
+        if self.rounds == 0 or turned < LEAST_TURN:
+            return False
+        level = self._used(len(eq.turn))        # the fixes alone may hold the drift
+        level[2 * len(eq.turn):] = False
+        drift = self._fit(V, r, X, level, state, L, eq).phi_sigma
+        return bool(turned > TURNED * np.sqrt((drift**2).mean()))
+
+    def _drift(self, eq):
+        return drift_covariance(self.leg.alignment, self.bins, eq, self.since)
+
+    def _used(self, n):
+        level = self.bins.filled & ~self.bad
+        return np.concatenate([level, level, np.full(n, self.turn_rate)])
+
+    def _fit(self, V, r, X, use, state, L, eq):
+        drift = Drift(L, self._drift(eq), eq.by_gyro_scale)
+        return least_squares(V, r, X, drift, use, *self._steps(state))
+
+    def _steps(self, state):
+        return self.beliefs.steps(self.leg, state, self.told, self.rounds)
+
+    def _bias(self, fit, L, eq):
+        """Return the gyro's bias about the vertical beyond that of the alignment, and sigma."""
+        variance = self.leg.alignment.gyro_bias_sigma**2
+        up = eq.phi_axes[:, 2]
+        toward = up[-1] / max(np.linalg.norm(up[-1]), 1e-9)
+        c = L[fit.use] @ (-up * variance) @ toward      # with what is observed
+        left = toward**2 @ variance - c @ fit.P @ c
+        return float(c @ fit.left), float(np.sqrt(max(left, 0.0)))
+
+    def _drop_bins(self, fit, n):
+        """Leave out bins that stray from what all others say; tell whether there are new ones."""
+        z = np.zeros(3 * n)
+        z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
+        far = (np.hypot(z[:n], z[n:2 * n]) > FAR_BIN) & ~self.bad
+        if not far.any() or (self.bad | far).mean() > 0.3:
+            return False
+        self.bad |= far
+        return True
+
+    def _judge_slip(self, eq, state, r, X, judge):
+        if not ((judge or self.rounds == 0) and self.turn_rate):
+            return      # at first too: else the drift would take the slip upon itself
+        n = len(eq.turn)
+        turn = slice(2 * n, 3 * n)
+        known = sum(p.whole()[turn, turn] for p in known_parts(
+            self.leg, eq, self.bins, state, self.since, 0.0, self.config))
+        walk = walk_root(eq.moving)
+        known = known + self.beliefs.nuisances(X[turn])
+        columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
+        if self.width:      # given, and so no free column: its belief is part of what is known
+            known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
+            columns = columns[:, [0, 2]]
+        self.slip = judge_slip(r[turn], columns, known, 2 * walk @ walk.T)
+
+    def _judge_fixes(self, eq, state, r, X, known, judge):
+        leg, bins, n = self.leg, self.bins, len(eq.turn)
+        level = slice(0, 2 * n)
+        k = np.array([SCALE, HEADING, 3, 4])
+        white = white_share(leg.t_fix, eq.detail[:, :2], leg.covariance_n, bins)
+        good = self._used(n)[level]
+        known = known[level, level] + self.beliefs.nuisances(X[level])
+        known += np.diag(np.where(good, 0.0, 1e12))     # dropped bins say nothing
+        self.noise = judge_fixes(
+            r[level], X[level][:, k], known, bins, leg.t_fix, leg.covariance_n, white,
+            self.config.gnss.correlation_time if judge else 0)
+
+
+def _stepped(state, fit, height, widen):
+    """Return the state after a step."""
+    step = fit.step
+    return replace(
+        state, scale=state.scale * float(np.exp(np.clip(step[SCALE], -0.5, 0.5))),
+        log_ratio=state.log_ratio + float(np.clip(step[RATIO], -0.5, 0.5)),
+        heading=state.heading + float(step[HEADING]), width=max(state.width + widen, 0.1),
+        offset=state.offset + float(step[OFFSET]), pitch=height.pitch,
+        start_n=np.append(state.start_n[:2] + step[3:5], height.start),
+        phi=np.column_stack([height.phi, fit.phi]), latency=state.latency + float(step[LATENCY]),
+        gyro_scale=state.gyro_scale + float(np.clip(step[GYRO], -0.3, 0.3)))

@@ -1,0 +1,48 @@
+"""What the estimator of the wheels comes to: the state, and how the observations make it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.wheels.height import Height
+from odocal_ros.calib.wheels.judge_noise import FixNoise
+from odocal_ros.calib.wheels.least_squares import Fit
+from odocal_ros.calib.wheels.model import Bins, Equations, GYRO, LATENCY, State
+from odocal_ros.calib.wheels.noise import Part
+
+NUISANCES = [LATENCY, GYRO]      # estimated, believed beforehand, and no result
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """
+    The estimate: state, and how the observations make it.
+
+    residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, 9).
+    beliefs : (9,) inverse variance known beforehand.   parts : of the covariance.
+    kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
+    against that of the alignment.   width_told : the drive turns enough for the track width.
+    """
+
+    state: State
+    bins: Bins
+    eq: Equations
+    fit: Fit
+    residual: NDArray[np.float64]
+    X: NDArray[np.float64]
+    beliefs: NDArray[np.float64]
+    parts: tuple[Part, ...]
+    height: Height
+    noise: FixNoise
+    slip: float
+    kept: int
+    dropped: int
+    bias_z: tuple[float, float]
+    width_told: bool
+    settled: bool
+
+    def covariance(self):
+        """Return the covariance of the observations, what is believed of nuisances and all."""
+        X = self.X[:, NUISANCES]
+        return sum(p.whole() for p in self.parts) + X / self.beliefs[NUISANCES] @ X.T
