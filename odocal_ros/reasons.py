@@ -56,6 +56,8 @@ class Code(Enum):
                                      'imu.gyro_scale.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
+    STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg; what was driven '
+                                  'until the recording broke off was used.')
     COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
     FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
                                      'the receiver and the sky.')

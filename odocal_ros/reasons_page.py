@@ -67,6 +67,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'more. Sigmas that come from the grade are then too small.',
         Code.GYRO_SIGN: 'Where the fixes turn left the gyro turns right.',
         Code.BAG_TRUNCATED: 'A recording was not ended properly. What the file holds was read.',
+        Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '
+        'before its stop mark: a node or a computer that was killed, or a bag stopped too early. '
+        'The leg was taken to end at the last sample that all topics have, where the vehicle need '
+        'not stand.',
         Code.COVARIANCE_UNKNOWN: 'Fixes come without a covariance, or with zero or NaN in it; '
         '`gnss.default_sigma` was taken.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '

@@ -9,6 +9,7 @@ import numpy as np
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import screen
 
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
@@ -82,6 +83,17 @@ def marked_legs(bag) -> list[tuple[int, int]]:
         if values.get('leg_event') not in DROPPED and start > 0:
             legs.append((start, stop))
     return sorted(legs)
+
+
+def open_ended(spans, marks) -> list[tuple[Reason, ...]]:
+    """
+    Return a note for each leg that was marked at its start and not at its end.
+
+    spans : (start, stop) of the legs.   marks : as ``marked_legs`` gives them.
+    """
+    starts = {start for start, stop in marks if not stop}
+    return [(Reason(Code.STOP_MARK_MISSING, OPEN_LEG),) if start in starts else ()
+            for start, _ in spans]
 
 
 def dropped_legs(bag) -> bool:

@@ -101,7 +101,13 @@ def _legs_of(path, args, asked, config, journal):
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.leg import LegRecorder
     from odocal_ros.messages import make_reader
-    from odocal_ros.offline.legs import dropped_legs, find_legs, marked_legs, OPEN_LEG
+    from odocal_ros.offline.legs import (
+        dropped_legs,
+        find_legs,
+        marked_legs,
+        open_ended,
+        OPEN_LEG,
+    )
     from odocal_ros.offline.phases import Phase
     from odocal_ros.offline.topics import choose_topics
     quiet = args.quiet or args.json
@@ -131,7 +137,8 @@ def _legs_of(path, args, asked, config, journal):
         if any(not stop for _, stop in marks):
             _tell(args, f'{bag.name}: {OPEN_LEG}')
         spans = find_legs(recorder, bag, asked, marks, config)
-        notes = tuple(n for n in bag.notes if not isinstance(n, str))
+        seen = tuple(n for n in bag.notes if not isinstance(n, str))
+        notes = [seen + note for note in open_ended(spans, marks)]
         for note in bag.notes:
             if isinstance(note, str):
                 _tell(args, note)
@@ -153,8 +160,8 @@ def _calibrated(recorder, spans, config, notes, name, args):
             if len(spans) > 1:
                 phase((number - 1) / len(spans), f'calibrating leg {number} of {len(spans)}')
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            results.append(replace(calibrate(leg, config, notes=notes, holdout=args.holdout),
-                                   bag=name))
+            results.append(replace(calibrate(leg, config, notes=notes[number - 1],
+                                             holdout=args.holdout), bag=name))
     return results
 
 

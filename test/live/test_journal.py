@@ -137,6 +137,7 @@ def test_a_killed_leg_is_replayed_from_its_mark(domain, tmp_path, moment_s):
         assert round(leg['start'] * 1e3) == round(left.start_ns * 1e-6)
         assert leg['stop'] - leg['start'] > 10 * (moment_s - left.lost_s - 1.0)
         assert 'the leg has no stop mark' in left.text
+        assert 'STOP_MARK_MISSING' in {r['code'] for r in leg['reasons']}
 
 
 def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, tmp_path):

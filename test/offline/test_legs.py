@@ -9,7 +9,8 @@ import pytest
 from odocal_ros.config import Config
 from odocal_ros.errors import BadUsage
 from odocal_ros.leg import LegRecorder
-from odocal_ros.offline.legs import find_legs, LegSpan, marked_legs, parse_leg
+from odocal_ros.offline.legs import find_legs, LegSpan, marked_legs, open_ended, parse_leg
+from odocal_ros.reasons import Code
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 S = 10**9
@@ -68,6 +69,8 @@ def test_marks_of_the_node_are_found_and_cancelled_legs_are_not():
         ('3', 30 * S, 0, 'started'), ('3', 30 * S, 40 * S, 'stopped'),
         ('3', 30 * S, 40 * S, 'undone'), ('4', 50 * S, 0, 'started')])
     assert marked_legs(bag) == [(5 * S, 9 * S), (50 * S, 0)]
+    ended, broken_off = open_ended([(5 * S, 9 * S), (50 * S, 70 * S)], marked_legs(bag))
+    assert (ended, [r.code for r in broken_off]) == ((), [Code.STOP_MARK_MISSING])
 
 
 def test_legs_of_two_runs_of_the_node_are_kept_apart():
