@@ -2,27 +2,42 @@
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
+from odocal_ros.live.restored import Restored
 from odocal_ros.output.summary import sentence
 from odocal_ros.reasons import Verdict
 
 MOST_REASONS = 3
 
 
-def outcome(calibration: Calibration, leg: LegResult | None = None,
-            leg_id: int = 0) -> tuple[bool, str]:
+def outcome(calibration: Calibration, leg: LegResult | None = None, leg_id: int = 0,
+            good: str = '', advice: str = '') -> tuple[bool, str]:
     """
     Return the answer that carries a result: values, verdict, legs, what to do better.
 
+    good, advice : which quantities are good enough, and what to do next, as the status says them.
     A rejected calibration is no success: a script must not take its values for good.
     """
     text = sentence(calibration)
-    reasons = _worth_telling(calibration)
     if leg is not None and len(calibration.legs) > 1:
         text = f'leg {leg_id}, {leg.distance:.0f} m, {leg.verdict.value}; all legs {text}'
-    for reason in reasons[:MOST_REASONS]:
-        text = (f'{text.rstrip(".")}. {reason.code.name}: {reason.text.rstrip(".")}. '
-                f'{reason.remedy}')
-    return calibration.verdict is not Verdict.REJECTED, text
+    parts = [text, good]
+    for reason in _worth_telling(calibration)[:MOST_REASONS]:
+        parts += [f'{reason.code.name}: {reason.text}', reason.remedy]
+    if advice and advice not in parts:
+        parts.append(f'Next: {advice}')
+    return calibration.verdict is not Verdict.REJECTED, _sentences(parts)
+
+
+def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:
+    """Return the answer that carries a restored result; ``unit`` is that of its scale."""
+    return result.valid, _sentences([f'no leg is running; {result.words(unit)}', good,
+                                     'Next: drive a leg to renew it'])
+
+
+def _sentences(parts) -> str:
+    """Return sentences one after the other, each ended once."""
+    *before, last = filter(None, parts)
+    return ' '.join([*(f'{part.rstrip(".")}.' for part in before), last])
 
 
 def _worth_telling(calibration: Calibration) -> list:

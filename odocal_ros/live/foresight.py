@@ -11,25 +11,24 @@ import math
 
 import numpy as np
 
-from odocal_ros.align import HEADING_LIMIT
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.planned_drive import AT_REST, PlannedDrive
 from odocal_ros.calib.predict import metres_to_go, predict, Prediction, Sigmas
-from odocal_ros.config import Config, with_settings
+from odocal_ros.config import Config
 from odocal_ros.errors import BadData
 from odocal_ros.leg import Leg
 from odocal_ros.leg_profile import fix_figures, profile_of
+from odocal_ros.live.ability import stated_variance, with_heading
 from odocal_ros.live.outlook import Outlook, Prospect
+from odocal_ros.live.wheels_so_far import sources_of, with_wheels
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.screen import screen
 
-SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 REST = 10.0          # s of standstill at the end that is foreseen
 FARTHEST = 2e4       # m: who must drive on for more needs something else
 MOST_ROWS = 1000     # of the drive that a prediction is made from
-EXACT = 1e-6         # rad, of a heading that is said to be known exactly
 NEAR_NS = 1_000_000_000
-SHARE = 0.01         # of the variance: a source of less is not told
 
 
 class Abandoned(Exception):
@@ -91,11 +90,16 @@ def outlook_of(leg: Leg, fix_rate: float, config: Config,
         if metres is None and not why:
             metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST)
             why = f'no {FARTHEST / 1000:.0f} km more bring it to what is asked'
-        return Prospect(sigma, asked, metres, _sources(now, parameter), why)
+        return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
 
     limits = config.verdict
-    return Outlook(prospect(SCALE, limits.max_scale_sigma),
-                   prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)))
+    outlook = Outlook(
+        prospect(SCALE, limits.max_scale_sigma),
+        prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)),
+        now.method.estimates[PITCH].sigma)
+    if not wanted():
+        raise Abandoned
+    return with_wheels(outlook, leg, config)
 
 
 def _yaw_limit(now: Prediction, asked: float) -> str:
@@ -110,36 +114,13 @@ def _yaw_limit(now: Prediction, asked: float) -> str:
     return ''
 
 
-def _sources(now: Prediction, parameter: str) -> tuple[tuple[str, float], ...]:
-    """Return the sources of a parameter's error that matter, the largest first."""
-    row = now.method.parameters.index(parameter)
-    sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in now.method.sources}
-    least = SHARE * sum(size**2 for size in sizes.values())
-    return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > least),
-                        key=lambda source: -source[1]))
-
-
 def _heading_found(leg: Leg, config: Config) -> Config:
     """Return config with the heading source, and its sigma, that the alignment will find."""
-    asked = config.alignment
-    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT)
-    if source == 'auto' and not math.isnan(asked.heading):
-        source = 'fixed'
-    if source == 'fixed' and math.isnan(asked.heading):
-        source = 'course'
+    variances = {}
     for slot, name in ((leg.heading, 'heading_topic'), (leg.imu, 'imu_orientation')):
-        if source not in ('auto', name):
-            continue
-        sent = (slot.stamp_ns <= leg.start_ns + NEAR_NS) & ~np.isnan(slot.yaw_variance) & (
-            np.linalg.norm(slot.q_ni, axis=1) > 0.5)
-        stated = float(np.median(slot.yaw_variance[sent][-100:])) if sent.any() else math.inf
-        if stated <= HEADING_LIMIT**2:
-            source, sigma = name, math.sqrt(stated) if stated > 0 else sigma
-        elif source == name:
-            source = 'course'
-    # what is still 'auto' is a gyrocompass or the course, as the prediction itself decides
-    return with_settings(config, {'alignment.heading_source': source,
-                                  'alignment.heading_sigma': sigma})
+        before = slot.stamp_ns <= leg.start_ns + NEAR_NS
+        variances[name] = stated_variance(slot.q_ni[before], slot.yaw_variance[before])
+    return with_heading(config, variances)
 
 
 def _quantum(leg: Leg, config: Config) -> float:

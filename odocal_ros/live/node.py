@@ -115,8 +115,7 @@ class Calibrator(Node):
                 if not self.operation.session.open_leg:
                     self.recording.forget(self.config.leg.preroll)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
-                self.outlets.show_diagnostics(self.recording,
-                                              self.config.diagnostic_updater.use_fqn)
+                self.outlets.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):
                 self.operation.show_status()
 

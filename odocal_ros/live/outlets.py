@@ -8,11 +8,14 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from odocal_ros.config import Config
 from odocal_ros.live import outputs, params
 from odocal_ros.live.recording import Recording
-from odocal_ros.live.status import calibration_status, input_status, Situation
+from odocal_ros.live.situation import Situation
+from odocal_ros.live.status import calibration_status, input_status
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -32,6 +35,7 @@ class Outlets:
                        for name in ('dead_reckoning', 'reference')]
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._setting = False
+        self._before = self.results()    # what holds while no leg is kept: restored, or nothing
 
     @property
     def setting_results(self) -> bool:
@@ -47,13 +51,19 @@ class Outlets:
         return self._node.get_parameter('result.scale_factor').value
 
     def set_results(self, calibration) -> None:
-        """Set all ``result.*`` at once: one event, never half a result."""
+        """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
         stamp = outputs.iso(self._node.get_clock().now().nanoseconds)
+        results = params.as_results(calibration, stamp) if calibration else self._before
         self._setting = True
         try:
-            self._node.set_parameters_atomically(params.result_parameters(calibration, stamp))
+            self._node.set_parameters_atomically(
+                [Parameter(name, value=value) for name, value in results.items()])
         finally:
             self._setting = False
+
+    def forget_restored(self) -> None:
+        """Let go of a result that came with the start."""
+        self._before = dict(params.RESULTS)
 
     def show_paths(self, messages) -> None:
         """Publish dead reckoning and reference of a leg."""
@@ -65,24 +75,31 @@ class Outlets:
         """Return the resolved name of ``~/status``."""
         return self._status.topic_name
 
-    def show_status(self, recording: Recording, **known) -> DiagnosticArray:
-        """Publish ``~/status`` and return it; ``known`` are further fields of ``Situation``."""
+    def situation(self, recording: Recording, **known) -> Situation:
+        """Return what is so just now; ``known`` are the fields that are not read off here."""
         config, progress = known['config'], recording.progress
-        situation = Situation(
+        return Situation(
             missing=recording.inputs.missing(config), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
             max_speed=progress.max_speed, still_s=progress.still_s(),
-            heard=recording.heard(), **known)
-        array = self._array([calibration_status(situation)])
+            two_wheels=recording.two_wheels(), heard=recording.heard(),
+            restored=known['session'].restored_since(), **known)
+
+    def show_status(self, now: Situation) -> DiagnosticArray:
+        """Publish ``~/status`` and return it."""
+        array = self._array([calibration_status(now)])
         self._status.publish(array)
         return array
 
-    def show_diagnostics(self, recording: Recording, use_fqn: bool) -> None:
+    def show_diagnostics(self, recording: Recording, config: Config) -> None:
         """Publish the health of each input."""
-        node = self._node.get_fully_qualified_name() if use_fqn else self._node.get_name()
+        node = (self._node.get_fully_qualified_name() if config.diagnostic_updater.use_fqn
+                else self._node.get_name())
         now_ns = self._steady.now().nanoseconds
+        needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([
-            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(), now_ns)
+            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
+                         one in needed, now_ns)
             for slot, one in recording.inputs.by_slot.items()
             if slot != 'heading' or one.reader is not None]))
 

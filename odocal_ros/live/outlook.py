@@ -36,11 +36,37 @@ class Prospect:
 
 
 @dataclass(frozen=True)
+class WheelsOutlook:
+    """
+    What the way so far tells of two wheels by themselves; None: it does not tell them.
+
+    left_right, track_width : relative sigmas, of the worse wheel and of the width.
+    fault : what is wrong with a wheel, for people.
+    """
+
+    left_right: float | None
+    track_width: float | None
+    fault: str = ''
+
+
+@dataclass(frozen=True)
 class Outlook:
-    """What is foreseen of a leg that ends where the vehicle is."""
+    """
+    What is foreseen of a leg that ends where the vehicle is.
+
+    pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
+    """
 
     scale: Prospect
     yaw: Prospect
+    pitch: float | None = None
+    wheels: WheelsOutlook | None = None
+
+    def sigma(self, quantity: str) -> float | None:
+        """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
+        if quantity in ('scale', 'yaw'):
+            return getattr(self, quantity).sigma
+        return self.pitch if quantity == 'pitch' else getattr(self.wheels, quantity, None)
 
     def words(self) -> str:
         """Return it as a sentence: what is enough, what more makes it so, what never will be."""

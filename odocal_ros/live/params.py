@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.config import Config, Setting, SETTINGS, with_settings
 from odocal_ros.errors import BadConfig
+from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Verdict
 
 SCALE = 'm/pulse, m/rad or 1'
@@ -18,6 +19,7 @@ ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'r
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
 PREFIX = 'result.'
+NO_STAMP = 'an unknown date'
 
 
 def _result_defaults() -> dict:
@@ -110,18 +112,30 @@ def declare_results(node: Node) -> None:
             node.set_parameters([Parameter(name, value=float(value))])
 
 
-def result_parameters(calibration: Calibration | None, stamp: str) -> list[Parameter]:
-    """Return the ``result.*`` parameters of a calibration; None gives those of a fresh start."""
+def as_results(calibration: Calibration, stamp: str) -> dict:
+    """Return the values of ``result.*`` that a calibration makes."""
     values = dict(RESULTS)
-    if calibration is not None:
-        for name in ESTIMATES:
-            estimate = calibration.estimates.get(name) or Estimate(None, None, '')
-            values[PREFIX + name] = _number(estimate.value)
-            values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
-        values[PREFIX + 'legs'] = len(calibration.legs)
-        values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
-        values[PREFIX + 'stamp'] = stamp
-    return [Parameter(name, value=value) for name, value in values.items()]
+    for name in ESTIMATES:
+        estimate = calibration.estimates.get(name) or Estimate(None, None, '')
+        values[PREFIX + name] = _number(estimate.value)
+        values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
+    values[PREFIX + 'legs'] = len(calibration.legs)
+    values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
+    values[PREFIX + 'stamp'] = stamp
+    return values
+
+
+def restored_from(results: dict) -> Restored | None:
+    """Return the result that ``result.*`` hold, None where they hold none."""
+    estimates = {}
+    for name, unit in ESTIMATES.items():
+        value, sigma = (None if math.isnan(x) else x for x in (
+            results[PREFIX + name], results[PREFIX + name + '_sigma']))
+        estimates[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
+    if all(e.value is None for e in estimates.values()):
+        return None
+    return Restored(estimates, results[PREFIX + 'legs'], results[PREFIX + 'valid'],
+                    results[PREFIX + 'stamp'] or NO_STAMP)
 
 
 def _number(value) -> float:

@@ -5,10 +5,12 @@ Light estimates from the blocks as they come; nothing here enters a result.
 """
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.config import Config
+from odocal_ros.live.ability import Heard, stated_variance
 from odocal_ros.nav.earth import radii
 from odocal_ros.samples import OdometerForm
 
@@ -165,12 +167,14 @@ class Progress:
         self._path = FixPath()
         self._zero = 0.0
         self._scale = 0.0
+        self._last: dict = {}        # slot -> newest block
 
     def feed(self, slot: str, block, config: Config, form, found_scale: float) -> None:
         """Take a block as it went into the recorder."""
         if not len(block.stamp_ns):
             return
         self.clocks.feed(slot, block)
+        self._last[slot] = block
         if slot == 'odometer' and form is not None:
             self._scale = nominal_scale(config, form, found_scale)
             travel = self._travel.setdefault(slot, Travel(form))
@@ -179,6 +183,19 @@ class Progress:
             speed = self._path.feed(block, config.gnss.min_status)
             if not self._scale:
                 self.max_speed = max(self.max_speed, speed)
+
+    def heard_before(self) -> Heard:
+        """Return what came so far that says what a leg can tell."""
+        fix = self._last.get('fix')
+        place = Heard({})
+        if fix is not None and np.isfinite(fix.latitude[-1]):
+            place = Heard({}, latitude=float(fix.latitude[-1]),
+                          height=bool(np.isfinite(fix.height[-1])))
+        sent = {name: self._last.get(slot) for slot, name in (
+            ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
+        variances = {name: np.inf if block is None else stated_variance(
+            block.q_ni, block.yaw_variance) for name, block in sent.items()}
+        return replace(place, variances=variances, still_s=self.still_s())
 
     def begin_leg(self) -> None:
         """Count distance and speed from here."""

@@ -1,6 +1,7 @@
 """The side of the node that listens: inputs, recorder, and what is seen while driving."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
@@ -9,6 +10,7 @@ from rclpy.node import Node
 
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder, SLOTS
+from odocal_ros.live.ability import Heard
 from odocal_ros.live.inputs import Input, Inputs
 from odocal_ros.live.progress import Progress
 from odocal_ros.samples import Samples
@@ -98,6 +100,14 @@ class Recording:
         for source in self.inputs.by_slot.values():
             source.take()
             source.health.forget()
+
+    def two_wheels(self) -> bool:
+        """Return whether the right wheel is heard by itself."""
+        return self.recorder.newest_ns('odometer_right') > 0
+
+    def heard_before(self) -> Heard:
+        """Return what came so far that says what a leg can tell."""
+        return replace(self.progress.heard_before(), two_wheels=self.two_wheels())
 
     def rates_hz(self) -> dict[str, float]:
         """Return the rate of each topic by its stamps."""

@@ -10,6 +10,7 @@ from enum import Enum
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
+from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Verdict
 
 
@@ -54,6 +55,7 @@ class Session:
         self.config = Config()
         self.legs: list[KeptLeg] = []
         self.calibration: Calibration | None = None
+        self.restored: Restored | None = None   # from start-up, in force while no leg is kept
         self.trouble = ''
         self._last_id = 0
 
@@ -133,11 +135,18 @@ class Session:
                           'before ~/reset')
         dropped, self.legs = self.legs, []
         self.calibration, self.state, self.trouble = None, State.IDLE, ''
+        self.restored = None
         return dropped
 
     def dropped(self, leg: KeptLeg) -> None:
         """Show a leg as undone."""
         self._touch(leg, 'undone')
+
+    def restored_since(self) -> str:
+        """Return the stamp of the restored result while it is in force, else empty."""
+        if self.restored is None or self.calibration is not None or self.legs:
+            return ''
+        return self.restored.stamp
 
     def verdict(self) -> str:
         """Return the verdict in force, empty before the first."""

@@ -16,6 +16,7 @@ PPM = 1e6
 SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
@@ -40,7 +41,13 @@ def screen(calibration: Calibration, styled: bool = False) -> str:
 
 def sentence(calibration: Calibration) -> str:
     """Return the result as one line: verdict, values with sigma, legs."""
-    estimates = calibration.estimates
+    used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
+    legs = f'{used} of {len(calibration.legs)} leg{"s" * (len(calibration.legs) != 1)} good'
+    return f'{calibration.verdict.value}: {values_in_words(calibration.estimates)}; {legs}'
+
+
+def values_in_words(estimates: dict[str, Estimate]) -> str:
+    """Return scale, angles and, where they are known, those of two wheels, with sigmas."""
     scale = known(estimates, 'scale_factor')
     parts = []
     if scale.value is None:
@@ -48,14 +55,16 @@ def sentence(calibration: Calibration) -> str:
     else:
         counts = f' ({inverse(scale)})' if scale.unit in COUNTS else ''
         parts.append(f'scale factor {_with_unit(scale)}{counts}')
+    for name, word in WHEELS.items():
+        wheel = known(estimates, name)
+        if wheel.value is not None:
+            parts.append(f'{word} {_with_unit(wheel)}')
     for name, word in ANGLES.items():
         angle = known(estimates, name)
         parts.append(f'{word} mounting ' + (
             'not determined' if angle.value is None else
             f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg'))
-    used = sum(leg.verdict is not Verdict.REJECTED for leg in calibration.legs)
-    legs = f'{used} of {len(calibration.legs)} leg{"s" * (len(calibration.legs) != 1)} good'
-    return f'{calibration.verdict.value}: {", ".join(parts)}; {legs}'
+    return ', '.join(parts)
 
 
 def known(estimates: dict[str, Estimate], name: str) -> Estimate:

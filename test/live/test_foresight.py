@@ -13,10 +13,11 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live import foresight, watch
 from odocal_ros.live.foresight import Abandoned, DriveSoFar, outlook_of
+from odocal_ros.live.guidance import hint
 from odocal_ros.live.outlook import as_keys, Outlook, Prospect
 from odocal_ros.live.session import Session
+from odocal_ros.live.situation import Situation
 from odocal_ros.live.sketch import MOST, Sketch
-from odocal_ros.live.status import hint, Situation
 from odocal_ros.live.watch import EVERY_NS, Watch
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline import calibrate
@@ -367,15 +368,16 @@ def said(outlook, **more):
 
 
 @pytest.mark.parametrize(('outlook', 'still_s', 'text'), [
-    (None, 0.0, 'stand still at the end point, then call ~/stop_leg'),
-    (None, 5.0, 'call ~/stop_leg'),
+    (None, 0.0, 'stand still 10 s at the end point, then call ~/stop_leg'),
+    (None, 5.0, 'stand still 5 s more, then call ~/stop_leg'),
+    (None, 10.0, 'call ~/stop_leg'),
     (Outlook(MORE, YAW), 5.0, 'scale would be good to 1820 ppm now; 240 m more bring it to '
      'the asked 1000 ppm; enough: yaw 0.286 deg (asked 0.498)'),
-    (Outlook(GOOD, YAW), 5.0, 'enough: scale 430 ppm (asked 1000); enough: yaw 0.286 deg (asked '
+    (Outlook(GOOD, YAW), 10.0, 'enough: scale 430 ppm (asked 1000); enough: yaw 0.286 deg (asked '
      '0.498); call ~/stop_leg'),
     (Outlook(GOOD, NO_YAW), 0.0, 'enough: scale 430 ppm (asked 1000); yaw: no drive brings it '
-     'below its heading (1 deg); stand still at the end point, then call ~/stop_leg'),
-    (Outlook(replace(MORE, metres=None, why='no 20 km more bring it to what is asked'), YAW), 5.0,
+     'below its heading (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
+    (Outlook(replace(MORE, metres=None, why='no 20 km more bring it to what is asked'), YAW), 10.0,
      'scale 1820 ppm: no 20 km more bring it to what is asked; enough: yaw 0.286 deg (asked '
      '0.498); call ~/stop_leg'),
     (Outlook(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; 240 m more '
@@ -387,7 +389,8 @@ def test_the_hint_says_what_is_enough_and_what_more_it_takes(outlook, still_s, t
 
 def test_the_least_leg_comes_first():
     assert said(Outlook(GOOD, YAW), distance_m=60.0, max_speed=1.0) == (
-        '40 m more, drive faster than 2.78 m/s')
+        'drive 40 m more, faster than 2.78 m/s (10 km/h); then stand still 10 s and call '
+        '~/stop_leg')
 
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():

@@ -1,0 +1,54 @@
+"""The computation under way, and those who wait for what it brings."""
+
+from collections.abc import Callable
+
+from rclpy.task import Future
+
+from odocal_ros.live import answers
+from odocal_ros.live.worker import Worker
+
+
+class Computing:
+    """
+    At most one job that counts; what a dropped one brings is thrown away.
+
+    ``failed(trouble)`` hears of a job that raised; ``done()`` is called after each that counted.
+    """
+
+    def __init__(self, worker: Worker, failed: Callable[[str], None],
+                 done: Callable[[], None]) -> None:
+        self._worker, self._failed, self._done = worker, failed, done
+        self._job: object | None = None
+        self._waiting: list[Future] = []
+
+    def submit(self, job, take) -> None:
+        """Run a job in the worker and hand its result to ``take``."""
+        self._job = token = object()
+
+        def then(result, error):
+            if token is not self._job:
+                return
+            self._job = None
+            if error is None:
+                take(result)
+            else:
+                self._failed(answers.one_line(error))
+            self._done()
+
+        self._worker.submit(job, then)
+
+    def drop(self) -> None:
+        """Let the job count no more."""
+        self._job = None
+
+    def promise(self) -> Future:
+        """Return a future that the next answer will be set on."""
+        future = Future()
+        self._waiting.append(future)
+        return future
+
+    def answer(self, success: bool, text: str) -> None:
+        """Answer all who wait."""
+        waiting, self._waiting = self._waiting, []
+        for future in waiting:
+            future.set_result((success, text))

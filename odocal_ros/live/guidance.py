@@ -1,0 +1,152 @@
+"""What to do next, in metres, seconds and manoeuvres: one text for status and answers."""
+
+from odocal_ros.calib.choice import ABOUT, deciding
+from odocal_ros.live import quantities
+from odocal_ros.live.session import State
+from odocal_ros.live.situation import Situation
+from odocal_ros.reasons import Code, Verdict
+
+REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
+KMH = 3.6
+DRIVE = 'drive '
+STRAIGHT = 'go straight on at speed until left and right wheel are told apart'
+TURNS = 'turn by about 90 deg in all, or more, for the track width'
+
+
+def hint(now: Situation) -> str:
+    """Return what is missing, or what to do next."""
+    session, state = now.session, now.session.state
+    if state is State.COMPUTING:
+        return 'the answer of ~/stop_leg comes in a moment'
+    if state is State.FAILED:
+        return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
+                if session.open_leg else 'call ~/reset')
+    if now.missing:
+        return now.missing[0]
+    if now.clocks:
+        return clocks_differ(now.clocks)
+    if state is State.RECORDING:
+        return _while_recording(now)
+    if state is State.IDLE:
+        return _before_start(now.still_s)
+    return after_result(now)
+
+
+def clocks_differ(clocks: list[tuple[str, float]]) -> str:
+    """Return the sentence about clocks that differ from the Imu's."""
+    seen = ', '.join(f'{slot} stamps are {abs(s):.3g} s {"ahead of" if s > 0 else "behind"} the '
+                     "Imu's" for slot, s in clocks)
+    return f'CLOCKS_DIFFER: {seen}. {Code.CLOCKS_DIFFER.remedy}'
+
+
+def quantities_ok(now: Situation) -> dict[str, str]:
+    """Return which quantities are good enough: of the leg that is recorded, else of the result."""
+    session = now.session
+    if session.state is State.RECORDING:
+        return quantities.of_outlook(now.outlook, now.config, now.two_wheels)
+    if session.state is State.COMPUTING:
+        return quantities.nothing_known()
+    if session.calibration is not None:
+        return quantities.of_calibration(session.calibration, now.config, now.two_wheels)
+    if session.restored is not None:
+        return quantities.of_estimates(session.restored.estimates, now.config, now.two_wheels,
+                                       session.restored.valid)
+    return quantities.nothing_known()
+
+
+def metres_to_go(now: Situation) -> float:
+    """Return the metres that the leg still lacks to leg.min_distance, 0 outside of one."""
+    if now.session.state is not State.RECORDING:
+        return 0.0
+    return max(0.0, now.session.config.leg.min_distance - now.distance_m)
+
+
+def seconds_to_stand(now: Situation) -> float:
+    """Return the seconds of standstill still wanted: before the start, or at the end of a leg."""
+    if now.session.state is State.RECORDING or not now.session.busy:
+        return max(0.0, REST_S - now.still_s)
+    return 0.0
+
+
+def manoeuvres(now: Situation) -> list[str]:
+    """Return what the leg still lacks in driving, besides metres and standstill."""
+    if now.session.state is not State.RECORDING:
+        return []
+    wants, least = [], now.session.config.leg.min_speed
+    if now.max_speed < least:
+        wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
+    if now.two_wheels and 'wheels' in deciding(now.session.config.method):
+        wants += _of_two_wheels(now)
+    return wants
+
+
+def _of_two_wheels(now):
+    """Return what the wheels need; before the first look only what any drive needs."""
+    config = now.session.config
+    wheels = None if now.outlook is None else now.outlook.wheels
+    asked = quantities.QUANTITIES['left_right'].limit(config)
+    wants = []
+    if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= asked):
+        wants.append(STRAIGHT)
+    if not config.odometer.track_width and (wheels is None or wheels.track_width is None):
+        wants.append(TURNS)
+    return wants
+
+
+def _before_start(still_s: float) -> str:
+    if still_s < REST_S:
+        return f'stand still {REST_S:.0f} s before ~/start_leg ({still_s:.0f} s so far)'
+    return 'call ~/start_leg'
+
+
+def _while_recording(now: Situation) -> str:
+    wheels = None if now.outlook is None else now.outlook.wheels
+    if wheels is not None and wheels.fault:
+        return f'{wheels.fault}; call ~/cancel_leg'
+    metres, wants = metres_to_go(now), manoeuvres(now)
+    slow = now.max_speed < now.session.config.leg.min_speed
+    if metres > 0 or slow:
+        if metres > 0:
+            wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
+        return ', '.join(wants) + f'; then stand still {REST_S:.0f} s and call ~/stop_leg'
+    if now.outlook is None:
+        return '; '.join([*wants, _end(now)])
+    parts = [now.outlook.words(), *wants]
+    return '; '.join(parts + ([_end(now)] if now.outlook.complete else []))
+
+
+def _end(now: Situation) -> str:
+    """Return how to end the leg."""
+    if now.still_s < now.session.config.leg.standstill:
+        return f'stand still {REST_S:.0f} s at the end point, then call ~/stop_leg'
+    left = seconds_to_stand(now)
+    return (f'stand still {left:.0f} s more, then ' if left >= 1 else '') + 'call ~/stop_leg'
+
+
+def after_result(now: Situation) -> str:
+    """Return what would help most after a result, and what would help the other quantities."""
+    reasons = now.session.calibration.reasons if now.session.calibration else ()
+    config = now.config
+    lacking = config.verdict.min_legs - len(now.session.legs)
+    if lacking > 0:
+        return f'drive {lacking} more leg{"s" * (lacking > 1)}'
+    order = list(Verdict)
+    grave = sorted((r for r in reasons if r.code.gravity is not Verdict.ACCEPTED),
+                   key=lambda r: -order.index(r.code.gravity))
+    if grave:
+        return grave[0].remedy
+    saved = config.output.autosave or now.saved
+    text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
+    notes = _notes(reasons, quantities_ok(now))
+    return '; '.join([text, *notes])
+
+
+def _notes(reasons, ok):
+    """Return the remedies of what is not OK and yet no reason against the result."""
+    wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
+              if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
+    told = {}
+    for r in reasons:
+        if ABOUT.get(r.code) in wanted:
+            told[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None
+    return list(told)

@@ -1,0 +1,191 @@
+"""A leg's way from its stop mark to the answer: closed, computed, combined, told, saved."""
+
+from collections.abc import Callable
+from functools import partial
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.task import Future
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config
+from odocal_ros.leg import LegRecorder
+from odocal_ros.live import answers, jobs
+from odocal_ros.live.ability import Ability
+from odocal_ros.live.computing import Computing
+from odocal_ros.live.filing import Filing
+from odocal_ros.live.guidance import after_result, quantities_ok
+from odocal_ros.live.journal import Journal
+from odocal_ros.live.outlets import Outlets
+from odocal_ros.live.params import restored_from
+from odocal_ros.live.quantities import words
+from odocal_ros.live.recording import Recording
+from odocal_ros.live.session import Session, State
+from odocal_ros.live.situation import Situation
+from odocal_ros.live.watch import Watch
+from odocal_ros.live.worker import Worker
+
+PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
+
+class LegWay:
+    """
+    A leg's way from mark to answer; the operator's commands are in ``Operation``.
+
+    Nothing blocks: the heavy work runs in the worker thread, and ``tick`` takes over what it has
+    done.
+    """
+
+    def __init__(self, node, recording: Recording, outlets: Outlets, journal: Journal,
+                 config: Callable[[], Config]) -> None:
+        self.session = Session()
+        self.session.restored = restored_from(outlets.results())
+        self._recording, self._outlets, self._config = recording, outlets, config
+        self._journal = journal
+        self._log, self._clock = node.get_logger(), node.get_clock()
+        self._worker = Worker()
+        self._watch = Watch(self._worker, self._log)
+        recording.tap = self._watch.feed
+        self._computing = Computing(self._worker, self._fail, self.show_status)
+        self._ability: Ability | None = None  # of the leg last started
+        self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
+        self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
+        self._distance_m = 0.0                # of the leg last touched
+        self._filing = Filing(self._worker, self._log, self.show_status)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    def tick(self) -> None:
+        """Take over what the worker has done and what time has brought."""
+        self._worker.poll()
+        self.pump()
+        if self._recording.time_jumped:
+            self._start_time_anew()
+        self._stop_when_too_long()
+        self._close_when_complete()
+        if self.session.state is State.RECORDING:
+            self._watch.look(self._recording.newest_imu_ns)
+        self._journal.tick(self._config(), self.session.busy)
+
+    def pump(self) -> None:
+        """Decode what has arrived."""
+        self._recording.pump(self._config(), self._outlets.scale_factor())
+
+    def close(self) -> None:
+        """Let the worker end."""
+        self._watch.end()
+        self._worker.close()
+
+    def _start_time_anew(self) -> None:
+        """Drop what was recorded on the old time; a running leg cannot go on."""
+        if self.session.state is State.RECORDING or self._close_by_ns is not None:
+            text = f'time jumped: leg {self.session.leg_id} is cancelled; start it again'
+            self._log.warning(text)
+            self._drop_leg(text)
+        else:
+            self._log.warning('time jumped: the samples so far are dropped')
+        self._recording.start_anew()
+        self._journal.start_anew()
+
+    def situation(self) -> Situation:
+        """Return what is so just now."""
+        session = self.session
+        recording = session.state is State.RECORDING
+        if recording:
+            self._distance_m = self._recording.progress.distance_m()
+        end_ns = session.stop_ns or self._recording.newest_imu_ns
+        return self._outlets.situation(
+            self._recording, session=session, saved=self._filing.saved,
+            distance_m=self._distance_m,
+            config=session.config if session.busy else self._config(),
+            ability=self._ability if recording else None, outlook=self._watch.outlook,
+            journal=self._journal.folder, journal_trouble=self._journal.trouble,
+            duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
+
+    def show_status(self) -> None:
+        """Publish the status as it is now."""
+        array = self._outlets.show_status(self.situation())
+        self._journal.hear(self.session, array)
+
+    # a leg's way
+
+    def _mark_ns(self) -> int:
+        """Return the stamp of the newest Imu sample: marks are on the sensors' own clock."""
+        self.pump()
+        return self._recording.newest_imu_ns
+
+    def _stop_when_too_long(self) -> None:
+        session = self.session
+        if session.state is not State.RECORDING:
+            return
+        gone_s = (self._recording.newest_imu_ns - session.start_ns) * 1e-9
+        if gone_s > session.config.leg.max_duration:
+            self._log.warning(
+                f'leg {session.leg_id} is longer than leg.max_duration and is stopped')
+            self._end_leg()
+
+    def _end_leg(self) -> None:
+        mark_ns = self._mark_ns()
+        self._distance_m = self._recording.progress.distance_m()
+        self.session.stop(mark_ns)
+        self._watch.end()
+        self._close_by_ns = self._steady.now().nanoseconds + round(PATIENCE_S * 1e9)
+        self.show_status()
+        self._close_when_complete()
+
+    def _close_when_complete(self) -> None:
+        """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
+        if self._close_by_ns is None:
+            return
+        late = self._steady.now().nanoseconds > self._close_by_ns
+        if late or self._recording.passed(self.session.stop_ns):
+            self._close_by_ns = None
+            self._journal.end()
+            self._snapshot = self._recording.snapshot()
+            self._compute(self._snapshot)
+
+    def _compute(self, samples: LegRecorder) -> None:
+        session = self.session
+        kept = [leg.result for leg in session.legs]
+        self._computing.submit(partial(jobs.compute, samples, session.start_ns, session.stop_ns,
+                             kept, session.config), self._take_leg)
+
+    def _fail(self, trouble: str) -> None:
+        self.session.fail(trouble)
+        self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
+        remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
+                  'it') if self.session.open_leg else 'call ~/reset'
+        self._computing.answer(False, f'failed: {trouble}; {remedy}')
+
+    def _take_leg(self, outcome) -> None:
+        result, calibration, paths = outcome
+        self.session.finish(result, calibration)
+        self._snapshot, self._distance_m = None, result.distance
+        success, text = self._take_result(calibration, paths, result)
+        if success and self._config().output.autosave:
+            self._save(calibration)
+
+    def _take_result(self, calibration, paths, leg=None) -> tuple[bool, str]:
+        """Publish a result and answer those who wait for it."""
+        self._outlets.set_results(calibration)
+        self._outlets.show_paths(paths)
+        now = self.situation()
+        success, text = answers.outcome(calibration, leg, self.session.leg_id,
+                                        words(quantities_ok(now)), after_result(now))
+        self._log.info(text)
+        self._computing.answer(success, text)
+        return success, text
+
+    def _drop_leg(self, text: str) -> None:
+        self.session.cancel()
+        self._watch.end()
+        self._close_by_ns = self._snapshot = None
+        self._computing.drop()
+        self.show_status()
+        self._journal.end()
+        self._computing.answer(False, text)
+
+    def _save(self, calibration: Calibration, asked: bool = False) -> Future:
+        """Write the result files in the worker; the future has the answer."""
+        inputs = self._recording.inputs
+        return self._filing.save(calibration, self.session.config, inputs.topics,
+                                 inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
+                                 asked)

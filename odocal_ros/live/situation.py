@@ -1,0 +1,39 @@
+"""What is so just now: everything that status, hint and answers are made from."""
+
+from dataclasses import dataclass, field
+
+from odocal_ros.config import Config
+from odocal_ros.live.ability import Ability
+from odocal_ros.live.outlook import Outlook
+from odocal_ros.live.session import Session, State
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """One moment of the node; in a leg the config is the one frozen into it."""
+
+    session: Session
+    config: Config
+    missing: list[str] = field(default_factory=list)
+    clocks: list[tuple[str, float]] = field(default_factory=list)
+    rates_hz: dict[str, float] = field(default_factory=dict)
+    results: dict = field(default_factory=dict)  # result.* parameters
+    restored: str = ''                           # when they were made, of a saved result
+    distance_m: float = 0.0
+    duration_s: float = 0.0
+    max_speed: float = 0.0
+    still_s: float = 0.0
+    two_wheels: bool = False                     # the right wheel is heard by itself
+    ability: Ability | None = None               # of the leg that is recorded
+    outlook: Outlook | None = None               # of the leg that is recorded
+    saved: str = ''
+    journal: str = ''                            # folder of the newest leg's journal
+    journal_trouble: str = ''                    # why it cannot be written
+    heard: bool = True                           # any message on any topic so far
+
+    @property
+    def state(self) -> str:
+        """Return the state as published: idle with an input missing is ``waiting``."""
+        if self.session.state is State.IDLE and self.missing:
+            return 'waiting'
+        return self.session.state.value

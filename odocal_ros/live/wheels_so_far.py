@@ -1,0 +1,63 @@
+"""What the method wheels makes of the way so far: run on the sketch of a leg, as it will be."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.choice import deciding
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.config import Config, with_settings
+from odocal_ros.leg import Leg
+from odocal_ros.live.outlook import Outlook, Prospect, WheelsOutlook
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code, Verdict
+
+SHARE = 0.01         # of the variance: a source of less is not told
+FAULTS = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
+
+
+def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
+    """
+    Return an outlook with what two wheels tell so far; scale and yaw too, where that is better.
+
+    leg : the way so far. One counter, or a method that takes the mean of both, changes nothing.
+    """
+    if not len(leg.odometer_right.stamp_ns) or 'wheels' not in deciding(config.method):
+        return outlook
+    result = calibrate(leg, with_settings(config, {'method': 'wheels'}))
+    fault = next((f'{r.code.name}: {r.text}. {r.remedy}' for r in result.reasons
+                  if r.code in FAULTS), '')
+    method = result.methods.get('wheels')
+    if method is None or method.verdict is Verdict.REJECTED:
+        return replace(outlook, wheels=WheelsOutlook(None, None, fault))
+    left, right, width = (_relative(method.estimates[name]) for name in (
+        'scale_factor_left', 'scale_factor_right', 'track_width'))
+    apart = None if left is None or right is None else max(left, right)
+    return replace(
+        outlook, wheels=WheelsOutlook(apart, width, fault),
+        scale=_better(outlook.scale, method, 'scale_factor',
+                      _relative(method.estimates['scale_factor'])),
+        yaw=_better(outlook.yaw, method, 'yaw_mounting_angle',
+                    method.estimates['yaw_mounting_angle'].sigma))
+
+
+def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
+    """Return the sources of a parameter's error that matter, the largest first."""
+    row = method.parameters.index(parameter)
+    sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
+    least = SHARE * sum(size**2 for size in sizes.values())
+    return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > least),
+                        key=lambda source: -source[1]))
+
+
+def _better(prospect: Prospect, method, parameter, sigma):
+    """Return a prospect by the method, which is the one that gives the result, if it is better."""
+    if sigma is None or prospect.sigma is not None and prospect.sigma <= sigma:
+        return prospect
+    return replace(prospect, sigma=sigma, sources=sources_of(method, parameter),
+                   metres=0.0 if sigma <= prospect.asked else prospect.metres)
+
+
+def _relative(estimate: Estimate) -> float | None:
+    value, sigma = estimate.value, estimate.sigma
+    return None if not value or sigma is None else sigma / abs(value)
