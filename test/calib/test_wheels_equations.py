@@ -10,7 +10,7 @@ import pytest
 from wheel_legs import wheel_leg
 
 from odocal_ros.calib.wheels.first import near_neighbours
-from odocal_ros.calib.wheels.judge_noise import evidence, judge_slip, slow_means
+from odocal_ros.calib.wheels.judge_noise import evidence, inverse_root, judge_slip, slow_means
 from odocal_ros.calib.wheels.leg import C_bv, wheel_factors
 from odocal_ros.calib.wheels.model import equations, make_bins, State
 from odocal_ros.calib.wheels.noise import walk_root
@@ -136,7 +136,7 @@ def test_evidence_is_the_restricted_likelihood_written_out():
         return -0.5 * (-np.linalg.slogdet(V)[1] + np.linalg.slogdet(normal)[1] + left @ V @ left)
 
     sizes = np.array([0.0, 0.1, 2.0, 50.0])
-    found = evidence(r, X, known, shape, sizes)       # but for ln det known
+    found = evidence(r, X, inverse_root(known), shape, sizes)       # but for ln det known
     expected = np.array([written_out(s) for s in sizes])
     assert_allclose(found - found[0], expected - expected[0])
     assert_allclose(found[0] - expected[0], np.linalg.slogdet(known)[1] / 2)

@@ -88,8 +88,8 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
     belief = -0.5 * (np.log(white + SLOW) / BELIEF)**2
     belief += np.log(np.where(SLOW > 0, (1 - WHITE_BELIEF) / (len(SLOW) - 1), WHITE_BELIEF))
     cut = np.ix_(use, use)
-    log = np.array([belief + evidence(r[use], X[use], (known + W)[cut], S[cut], SLOW)
-                    for S in shapes])
+    white_root = inverse_root((known + W)[cut])
+    log = np.array([belief + evidence(r[use], X[use], white_root, S[cut], SLOW) for S in shapes])
     p = np.exp(log - log.max())
     p /= p.sum()
     best = np.unravel_index(np.argmax(p), p.shape)
@@ -105,32 +105,34 @@ def judge_slip(r, X, known, walk):
     r, X : (N,), (N, p) of the turn equation.  known, walk : (N, N) covariance of all else, and of
     slips of 1 m/sqrt(s).
     """
-    log = evidence(r, X, known, walk, SLIPS**2)
+    log = evidence(r, X, inverse_root(known), walk, SLIPS**2)
     log += np.log(np.where(SLIPS > 0, (1 - WHITE_BELIEF) / (len(SLIPS) - 1), WHITE_BELIEF))
     p = np.exp(log - log.max())
     return float(p @ SLIPS**2 / p.sum())
 
 
-def evidence(r, X, known, shape, sizes):
+def inverse_root(covariance):
+    """Return the inverse of the Cholesky root of a covariance, (n, n)."""
+    tiny = 1e-13 * np.diag(covariance).max()
+    return np.linalg.inv(np.linalg.cholesky(covariance + tiny * np.eye(len(covariance))))
+
+
+def evidence(r, X, root, shape, sizes):
     """
     Return the restricted log likelihood of r = X b + e, cov e = known + size shape, by size.
 
     But for ln det known. In the axes in which both are diagonal: a size costs next to nothing.
+    root : inverse_root(known).
     """
-    L = np.linalg.cholesky(known + 1e-13 * np.diag(known).max() * np.eye(len(known)))
-    half = np.linalg.solve(L, shape)
-    values, axes = np.linalg.eigh(np.linalg.solve(L, half.T))
-    r, X = axes.T @ np.linalg.solve(L, r), axes.T @ np.linalg.solve(L, X)
-    out = np.empty(len(sizes))
-    for i, size in enumerate(sizes):
-        d = 1 + size * np.maximum(values, 0.0)
-        half, e = X / np.sqrt(d)[:, None], r / np.sqrt(d)
-        length = np.linalg.norm(half, axis=0)
-        Q, R = np.linalg.qr(half / length)
-        fitted = Q.T @ e
-        out[i] = -0.5 * (np.log(d).sum() + 2 * np.log(np.abs(np.diag(R)) * length).sum()
-                         + e @ e - fitted @ fitted)
-    return out
+    values, axes = np.linalg.eigh(root @ shape @ root.T)
+    d = 1 + sizes[:, None] * np.maximum(values, 0.0)             # (sizes, n)
+    e, half = axes.T @ (root @ r) / np.sqrt(d), (axes.T @ (root @ X)) / np.sqrt(d)[..., None]
+    length = np.linalg.norm(half, axis=1)
+    Q, R = np.linalg.qr(half / length[:, None])
+    fitted = (e[:, None] @ Q)[:, 0]
+    pivots = np.abs(np.diagonal(R, axis1=1, axis2=2)) * length
+    return -0.5 * (np.log(d).sum(axis=1) + 2 * np.log(pivots).sum(axis=1)
+                   + (e**2).sum(axis=1) - (fitted**2).sum(axis=1))
 
 
 def slow_means(begin, end, time):
