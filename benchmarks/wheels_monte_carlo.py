@@ -101,11 +101,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('--drives', type=int, default=200, help='drives a cell')
     parser.add_argument('--processes', type=int, default=1)
-    parser.add_argument('--cell', default='', help="cells whose name holds this, e.g. 'town'")
+    parser.add_argument('--cell', default='', help="the cell of this name, else those "
+                        "whose name holds it, e.g. 'town'")
     parser.add_argument('--file', type=Path, default=Path('/tmp/wheels_monte_carlo.jsonl'))
     args = parser.parse_args()
     have = _read(args.file)
-    wanted = [i for i, name in enumerate(CELLS) if args.cell in name]
+    wanted = [i for i, name in enumerate(CELLS) if args.cell == name] or [
+        i for i, name in enumerate(CELLS) if args.cell in name]
     with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
         for number in wanted:
             name = list(CELLS)[number]
