@@ -11,7 +11,7 @@ from odocal_ros.calib.wheels.ranges import ranges_of
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
 from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.nav.rotations import quat_from_rotvec, quat_multiply
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
 from odocal_ros.reasons import Code, Reason
 
 ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
@@ -82,18 +82,25 @@ def _path(run, leg, method):
     e = method.estimates
     if e['scale_factor_left'].value is None:
         return run.path(method.details['f'])
-    if e['gyro_bias_z'].value is not None:
-        drift = e['gyro_bias_z'].value - run.alignment.gyro_bias[2]
-        leg = replace(leg, left=_straightened(run, run.inputs.travel_left, drift, leg.t_start),
-                      right=_straightened(run, run.inputs.travel_right, drift, leg.t_start))
+    drift = 0.0 if e['gyro_bias_z'].value is None else (
+        e['gyro_bias_z'].value - run.alignment.gyro_bias[2])
+    error = method.details['gyro_scale_seen']['value']      # 0 where the leg tells nothing of it
+    if drift or error:
+        since = leg.start.t if run.alignment.heading_source == 'fixed' else run.alignment.t
+        leg = replace(leg, **{side: _straightened(run, travel, drift, error, since)
+                              for side, travel in (('left', run.inputs.travel_left),
+                                                   ('right', run.inputs.travel_right))})
     values = [e[name].value for name in ('scale_factor_left', 'scale_factor_right',
                                          'heading_error')]
     return lambda t: positions(leg, t, *values, method.details['pitch']['value'])
 
 
-def _straightened(run, travel, drift, t_start):
-    """Return the track of a wheel without a drift of the heading, rad/s, since the start."""
+def _straightened(run, travel, drift, error, since):
+    """Return the track of a wheel without drift, rad/s, and scale error of the gyro."""
     t, q_nb = run.epochs
+    x = matrix_from_quat(q_nb)[..., 0]
+    yaw = np.unwrap(np.arctan2(x[:, 1], x[:, 0]))
     turn = np.zeros((len(t), 3))
-    turn[:, 2] = -drift * (t - t_start)
+    turn[:, 2] = -drift * (t - since) - error / (1 + error) * (
+        yaw - np.interp(since, t, yaw))
     return dead_reckon(t, quat_multiply(quat_from_rotvec(turn), q_nb), travel)

@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, settings
+import drives
+from drives import drive, everything_said
 import numpy as np
 import pytest
 
@@ -13,6 +14,10 @@ from odocal_ros.sim.sensors import wheel_scales
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; seeds are fixed
 WHEELS = ('scale_factor', 'scale_factor_left', 'scale_factor_right')
+
+
+def settings(made, **changes):
+    return drives.settings(made, **{'method': 'wheels'} | changes)
 
 
 @pytest.fixture(scope='module')
@@ -45,7 +50,7 @@ def test_both_factors_the_angle_and_the_width_come_out(made, result):
 def test_the_result_is_that_of_the_wheels_and_names_it(made, result):
     whole = combine([result], settings(made))
     assert {whole.estimates[name].method for name in WHEELS} == {'wheels'}
-    assert whole.estimates['pitch_mounting_angle'].method == 'two_point'   # wheels give none
+    assert 'pitch_mounting_angle' not in whole.estimates                   # wheels give none
     assert set(whole.methods) == {'two_point', 'wheels'}
 
 
@@ -73,6 +78,13 @@ def test_corrected_factors_bring_the_track_to_the_fixes(made, result):
     assert result.before.rms > 20.0
     assert result.after.rms < 2 * np.sqrt(2) * made.options.fix_sigma
     assert result.after.mean < result.after.rms < result.after.max
+
+
+def test_a_gyro_that_turns_too_far_bends_no_corrected_track():
+    # 1 % of 360 deg is 3.6 deg: tens of metres
+    made = drive(**ROUTE | {'imu_grade': 'consumer'}, seed=7, gyro_scale_error=0.01)
+    result = calibrate(made.leg(), settings(made))
+    assert result.after.rms < 2 * np.sqrt(2) * made.options.fix_sigma
 
 
 def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made):
