@@ -172,6 +172,8 @@ def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
         return ('',)
     if not (left and right):
         raise BadConfig('odometer.left and odometer.right belong together: set both or neither')
+    if left == right:
+        raise BadConfig(f'odometer.left and odometer.right are both {left!r}: name two wheels')
     return (left, right) if slot == 'odometer' else ('',)
 
 

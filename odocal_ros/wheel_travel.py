@@ -45,6 +45,10 @@ def wheels(leg, config, rows, found) -> Wheels:
                             'no mean, so the left wheel is taken alone'))
         return Wheels(left, None, None, t_left, doubt_left)
     samples, t = rows('odometer_right')
+    if not len(t):
+        found.append(Reason(Code.WHEEL_DEAD, 'the right wheel sends no usable value between the '
+                            'marks: what follows is the left wheel alone'))
+        return Wheels(left, None, None, t_left, doubt_left)
     right, t_right, doubt_right = _one(samples, t, form_right, config, found, 'right')
     mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
     return Wheels(mean, left, right, np.append(t_left, t_right),

@@ -167,6 +167,12 @@ def test_two_wheels_in_one_message():
         assert [block.value.tolist() for _, block in pairs] == [[1], [2]]
 
 
+def test_one_joint_is_not_two_wheels():
+    with pytest.raises(BadConfig, match="both 'l': name two wheels"):
+        read('odometer', [make.joints(1, ['l', 'r'], [1, 2])],
+             config(odometer__left='l', odometer__right='l'))
+
+
 def test_two_wheels_on_two_topics():
     settings_ = config(odometer__left='topic', odometer__right='topic')
     assert one('odometer', [make.whole(1)], settings_)[0].value.tolist() == [1]

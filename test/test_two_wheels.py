@@ -117,6 +117,14 @@ def test_a_right_wheel_that_never_speaks_is_dead(made):
     assert not said
 
 
+def test_a_right_wheel_that_sends_no_number_is_dead(made):
+    right = replace(made.odometer_right, value=np.full(len(made.odometer_right.value), np.nan))
+    inputs, said = screened(replace(made.leg(), odometer_right=right), made)
+    assert 'right wheel sends no usable value' in said[Code.WHEEL_DEAD]
+    assert inputs.travel_right is None
+    assert len(inputs.travel.t)
+
+
 def test_wheels_of_other_rates_offsets_and_ends_meet_where_both_are(made):
     """Linear between rows: the mean errs by at most a(dt/2)^2/2 + a count, here 3 m/s^2, 0.1 s."""
     right = take(made.odometer_right, slice(101, 5001, 2))

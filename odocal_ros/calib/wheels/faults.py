@@ -51,6 +51,9 @@ def broken_wheels(left, right, imu, between) -> tuple[Reason, ...]:
         return (Reason(Code.WHEEL_DEAD, f'the {SIDES[weak]} wheel does not count '
                        f'({way[weak]:.6g} against {way.max():.6g} of the '
                        f'{SIDES[1 - weak]} one): the mean of both is no travel'),)
+    if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
+        return (Reason(Code.WHEEL_DEAD, 'the right wheel counts what the left one counts, to the '
+                       'last digit: one counter is sent twice'),)
     held = [_held(two, steps, k) for k in (0, 1)]
     hung = np.any(held, axis=0)
     turn = np.diff(two.turn)
