@@ -189,6 +189,49 @@ def test_a_slip_of_one_wheel_is_named_with_place_and_size(side, size):
     assert abs(slips.end[0] - 121.5) < 0.5
 
 
+@pytest.mark.parametrize(('length', 'told'), [(8.0, True), (18.0, False)])
+def test_a_long_slip_is_seen_whole_and_no_wheel_is_blamed_without_evidence(length, told):
+    """Acceleration tells of a slip's begin and end; over many seconds it drifts too far."""
+    options = TOWN | {'seed': 3}
+    (reason,), slips = faults(options, left=spun(options, 100.0, length, 0.5 * length))
+    assert reason.text.startswith('the left wheel spins' if told else 'one of the wheels parts')
+    # scrub in turns may be a hundredth of the track width times the turn of 90 deg: 3 cm
+    assert abs(abs(slips.size[0]) - 0.5 * length) < 0.1
+    assert abs(slips.begin[0] - 100.0) < 0.2 * length
+    assert abs(slips.end[0] - 100.0 - length) < 0.2 * length
+
+
+@pytest.mark.parametrize('side', ['left', 'right'])
+def test_a_wheel_that_slips_on_and_on_is_said(side):
+    """A hundredth from 150 s on, where about half the way is driven: no place stands out."""
+    options = TOWN | {'seed': 3}
+    t = prepared(**options)[0].travel_left.t
+
+    def slips_on(s):
+        return s + np.floor(0.01 * np.maximum(s - s[np.searchsorted(t, 150.0)], 0.0))
+    (reason,), slips = faults(options, **{side: slips_on})
+    assert reason.code is Code.WHEEL_SLIP
+    assert '% (+-' in reason.text
+    assert ('more' if side == 'right' else 'less') in reason.text
+    assert not len(slips.t)
+
+
+def test_one_counter_sent_twice_is_no_second_wheel():
+    assert 'one counter is sent twice' in said_of_copies()[Code.WHEEL_DEAD]
+    options = TOWN | {'seed': 3}
+    inputs = prepared(**options)[0]
+    copied = np.floor(inputs.travel_left.s / 2)      # in another resolution: not to the digit
+    reasons, _ = faults(options, right=lambda s: copied, rough=4 / 3, track_width=1.6)
+    assert 'as if one counter were sent twice' in {r.code: r.text for r in reasons}[
+        Code.WHEEL_DEAD]
+
+
+def said_of_copies():
+    made = drive(**TOWN, seed=3)
+    leg = replace(made.leg(), odometer_right=made.odometer)
+    return {r.code: r.text for r in screen(leg, settings(made))[1]}
+
+
 def test_slips_by_the_dozen_are_counted():
     options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 8}
     at = np.arange(60.0, 240.0, 30.0)

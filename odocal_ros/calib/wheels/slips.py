@@ -12,23 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.slip import acceleration, excess_way, PINS, STEP as SLIP_STEP
-from odocal_ros.calib.wheels.pair import pair, robust_fit, runs
+from odocal_ros.calib.wheels.pair import pair, runs
+from odocal_ros.calib.wheels.whole_drive import (
+    changed,
+    fitted,
+    MEAN,
+    signals_of,
+    SURE,
+    swapped,
+    unlike,
+)
 from odocal_ros.reasons import Code, Reason
 
 STEP = 0.1            # s, grid
-CELL = 10             # steps of a cell in the fit
-MEAN = 10             # steps the difference is averaged over at each end of a window
-GAPS = (10, 30, 80)   # steps between the ends: slips of up to 1, 3, 8 s are seen whole
-SURE = 6.0            # sigmas: a drive has some thousand windows, and sigmas have tails
+GAPS = (10, 30, 80, 200)   # steps between the ends: slips of up to 1, 3, 8, 20 s are seen whole
 BLUR = 0.005          # m, what two tyres on real ground may do in any window, 1 sigma
 TURN_DOUBT = 0.01     # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
-TRACK = 3.0           # m, sigma of a track width that is not told
-LATE = 0.05           # s, sigma of the delay between wheels, and of wheels to Imu
-LOAD = 2e-3           # s^2/m, sigma of the change of rolling radius by sideways acceleration
 CHANCE = 5.0          # log of the odds at which a wheel is named
 BEFORE = 1.0          # s each side of a slip that acceleration is looked at
 QUIET = 0.1           # rad, turn within which acceleration tells the wheel
-NARROW = 0.1          # m: a track of less is no track
+SHARE = 4             # of a slip's half, what the mean must at least part from the Imu by
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +91,16 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     two = pair(left, right, imu, between, STEP, doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
-    signals = _signals(two, metres_per_unit)
-    x, covariance = _fitted(two, signals, metres_per_unit)
+    signals = signals_of(two, metres_per_unit)
+    x, covariance = fitted(two, signals, metres_per_unit)
     if x is None or x[0] <= 0:
         return (), NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
-    reasons = _swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right)
-    reasons += _unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
+    reasons = swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
+                       track_width)
+    reasons += unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
+    reasons += changed(two, signals, metres_per_unit)
     apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
     width = track_width or abs(x[1]) * per_right
     events = _events(two, apart, per_right * (1 + ratio) / 2, width)
@@ -105,61 +110,6 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
     slips = _slips(events, wheel)
     return reasons + _slip_reason(slips), slips
-
-
-def _signals(two, metres_per_unit):
-    """
-    Return what the right way is made of, at the edges: (n, 6).
-
-    The left way, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
-    Imu's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
-    """
-    half = MEAN // 2
-    mean = (two.left + two.right) / 2
-    speed = _smooth(np.gradient(mean, two.step), half)
-    rate = _smooth(np.gradient(two.turn, two.step), half)
-    load = np.append(0.0, np.cumsum(metres_per_unit * (speed**2 * rate)[1:] * two.step))
-    return np.stack([two.left, two.turn, two.t - two.t[0], speed, rate, load], -1)
-
-
-def _smooth(x, reach):
-    padded = np.pad(x, reach, mode='edge')
-    return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
-
-
-def _fitted(two, signals, metres_per_unit):
-    """Return the coefficients of the signals by cells of a second, and their covariance."""
-    at = np.arange(0, len(two.t), CELL)
-    A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
-    keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)]
-    keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * two.quantum
-    if keep.sum() < 20:
-        return None, None
-    width = TRACK / metres_per_unit
-    prior = np.array([np.inf, width, np.inf, LATE, LATE * 1.5 / metres_per_unit, LOAD])
-    floor = 0.4 * two.quantum + 1e-3 / metres_per_unit
-    x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
-    return x, covariance
-
-
-def _swapped(width, sigma):
-    if width + SURE * sigma > 0 or width > -NARROW:
-        return ()
-    return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
-                   f'difference of the wheels give a track width of {width:.2f} m, +-'
-                   f'{sigma:.2g} m'),)
-
-
-def _unlike(ratio, width, limit):
-    """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
-    if max(ratio, 1 / ratio) <= 1 + limit:
-        return ()
-    # the mean count weighs each wheel by its counts a metre
-    off = (ratio / (1 + ratio) - 0.5) * width
-    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as much '
-                   'as the left one: the scale is that of the mean count, which stands for a '
-                   f'point {abs(off):.2f} m {"right" if off > 0 else "left"} of the middle of '
-                   'the axle'),)
 
 
 def _events(two, apart, quantum_m, width):
@@ -242,7 +192,9 @@ def _which(two, mean, imu, track, latitude, event):
         return 0
     sigma = np.median(np.abs(excess[straight])) / 0.6745 + 1e-3
     odds = excess[at] * size / sigma**2
-    return int(np.sign(odds)) if abs(odds) > CHANCE else 0
+    # where it parts by far less than the half, the slip begins or ends elsewhere
+    told = abs(odds) > CHANCE and abs(excess[at]) > abs(size) / 2 / SHARE
+    return int(np.sign(odds)) if told else 0
 
 
 def _slips(events, wheel):

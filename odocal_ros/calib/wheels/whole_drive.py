@@ -1,0 +1,100 @@
+"""
+Two wheels over the whole drive: how their ways follow from each other, the turn and the load.
+
+The right wheel's way is that of the left one, the track width times the turn, and little more.
+What this says of the drive as a whole: exchanged, one counter sent twice, unlike counts, a ratio
+that changes on the way.
+"""
+
+import numpy as np
+
+from odocal_ros.calib.wheels.pair import robust_fit
+from odocal_ros.reasons import Code, Reason
+
+SURE = 6.0            # sigmas
+MEAN = 10             # steps that speed and turn rate are averaged over
+CELL = 10             # steps of a cell in the fit
+TRACK = 3.0           # m, sigma of a track width that is not told
+LATE = 0.05           # s, sigma of the delay between wheels, and of wheels to Imu
+LOAD = 2e-3           # s^2/m, sigma of the change of rolling radius by sideways acceleration
+NARROW = 0.1          # m: a track of less is no track
+CHANGE = 2e-3         # of the wheels' ratio from half to half of the way: tyres warm up alike
+
+
+def signals_of(two, metres_per_unit):
+    """
+    Return what the right way is made of, at the edges: (n, 6).
+
+    The left way, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
+    Imu's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
+    """
+    half = MEAN // 2
+    mean = (two.left + two.right) / 2
+    speed = _smooth(np.gradient(mean, two.step), half)
+    rate = _smooth(np.gradient(two.turn, two.step), half)
+    load = np.append(0.0, np.cumsum(metres_per_unit * (speed**2 * rate)[1:] * two.step))
+    return np.stack([two.left, two.turn, two.t - two.t[0], speed, rate, load], -1)
+
+
+def _smooth(x, reach):
+    padded = np.pad(x, reach, mode='edge')
+    return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
+
+
+def fitted(two, signals, metres_per_unit):
+    """Return the coefficients of the signals by cells of a second, and their covariance."""
+    at = np.arange(0, len(two.t), CELL)
+    A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
+    keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)]
+    keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * two.quantum
+    if keep.sum() < 20:
+        return None, None
+    width = TRACK / metres_per_unit
+    prior = np.array([np.inf, width, np.inf, LATE, LATE * 1.5 / metres_per_unit, LOAD])
+    prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
+    floor = 0.4 * two.quantum + 1e-3 / metres_per_unit
+    x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
+    return x, covariance
+
+
+def swapped(width, sigma, track_width):
+    if abs(width) + SURE * sigma < max(NARROW, track_width / 2):
+        return (Reason(Code.WHEEL_DEAD, 'both wheels count alike in turns, too: turn and '
+                       f'difference of the wheels give a track width of {width:.3f} m, +-'
+                       f'{sigma:.2g} m, as if one counter were sent twice'),)
+    if width + SURE * sigma > 0 or width > -NARROW:
+        return ()
+    return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
+                   f'difference of the wheels give a track width of {width:.2f} m, +-'
+                   f'{sigma:.2g} m'),)
+
+
+def changed(two, signals, metres_per_unit):
+    """Say that the ratio of the wheels is not the same in both halves of the way."""
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
+    middle = int(np.searchsorted(way, way[-1] / 2))
+    late = np.where(np.arange(len(way)) > middle, two.left - two.left[middle], 0.0)
+    x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
+    if x is None or x[0] <= 0:
+        return ()
+    change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
+    if abs(change) <= max(CHANGE, SURE * sigma):
+        return ()
+    return (Reason(Code.WHEEL_SLIP, f'from the first half of the way to the second, at '
+                   f't = {two.t[middle]:.0f} s, the right wheel comes to count '
+                   f'{100 * abs(change):.2f} % (+-{100 * sigma:.2f}) '
+                   f'{"more" if change > 0 else "less"} on the way of the left one, against the '
+                   'gyro: a wheel that slips all along, or loses air. The factors are a mean of '
+                   'both, beyond their sigmas'),)
+
+
+def unlike(ratio, width, limit):
+    """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
+    if max(ratio, 1 / ratio) <= 1 + limit:
+        return ()
+    # the mean count weighs each wheel by its counts a metre
+    off = (ratio / (1 + ratio) - 0.5) * width
+    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as much '
+                   'as the left one: the scale is that of the mean count, which stands for a '
+                   f'point {abs(off):.2f} m {"right" if off > 0 else "left"} of the middle of '
+                   'the axle'),)
