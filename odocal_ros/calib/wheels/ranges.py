@@ -55,7 +55,8 @@ def ranges_of(wheels, heading_sigma: float | None = None) -> Ranges:
     elif heading_sigma:
         heading, reason = min(2 * heading_sigma, np.pi), 'twice the sigma of the heading'
     else:
-        heading, reason = HEADING_RANGE, 'no error of the heading is stated: 10 deg'
+        heading, reason = HEADING_RANGE, ('heading and mounting angle turn the track alike, and '
+                                          'the angle is not stated: 10 deg')
     # an odd number has zero among its levels
     n = wheels.levels if wheels.levels < 3 else next_prime_power(wheels.levels, odd=True)
     return Ranges(np.array([scale, scale, heading]), (why, why, reason), (n, n, n))
