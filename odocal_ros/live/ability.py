@@ -30,11 +30,12 @@ class Heard:
     What came before the start mark.
 
     variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
-    none is sent.   latitude : rad.   height : the fixes carry one.
+    none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
+    latitude : rad.   height : the fixes carry one.
     """
 
     variances: dict[str, float]
-    still_s: float = 0.0
+    rested_s: float = 0.0
     latitude: float = 0.7
     height: bool = True
     two_wheels: bool = False
@@ -66,7 +67,7 @@ def ability(config: Config, heard: Heard) -> Ability:
             (False, 'the pitch, since the fixes carry no height')]
     if heard.two_wheels:
         told += _of_two_wheels(config, methods)
-    weak = '' if heard.still_s >= config.leg.standstill else (
+    weak = '' if heard.rested_s >= config.leg.standstill else (
         'level and gyro bias come from the drive itself, since it starts without a standstill')
     return Ability(tuple(text for can, text in told if can),
                    tuple(text for can, text in told if not can), weak)
@@ -95,7 +96,7 @@ def _of_two_wheels(config, methods):
 
 def _alignment(config, heard):
     """Return the alignment that a drive straight on from here will have."""
-    rest = heard.still_s if heard.still_s >= config.leg.standstill else 0.0
+    rest = heard.rested_s if heard.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
                        latitude=heard.latitude)

@@ -35,7 +35,8 @@ class Operation(LegWay):
         self._journal.begin(session, self._recording.inputs.topics)
         self._recording.progress.begin_leg()
         self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
-        self._ability = ability(session.config, self._recording.heard_before())
+        self._ability = ability(session.config, self._recording.heard_before(
+            session.config.leg.preroll))
         self.show_status()
         text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
                 f'{hint(self.situation())}. As configured, {self._ability.words()}')

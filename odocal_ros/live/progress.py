@@ -16,6 +16,7 @@ from odocal_ros.samples import OdometerForm
 
 STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
 FASTEST = 100.0        # m/s: what goes faster is a counter reset
+REST_NS = 1_000_000_000   # a shorter pause is no standstill
 CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
 CLOCK_REACH_NS = 200_000_000     # less than half of the limit, a few ticks
@@ -46,6 +47,7 @@ class Travel:
         self.newest_ns = 0
         self._last: tuple | None = None
         self._anchor = 0.0
+        self._rest = 0.0, 0      # length, s, and end of the last standstill
 
     def feed(self, block, scale: float) -> float:
         """Take a block, return the highest speed in it, m/s (0 where the scale is unknown)."""
@@ -57,6 +59,9 @@ class Travel:
         path = self.total + np.cumsum(np.abs(steps))
         for total, stamp in zip(path, stamps, strict=True):
             if total - self._anchor > STILL.get(self.form.scale_unit, 0.02):
+                rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
+                if rest_ns > REST_NS:
+                    self._rest = rest_ns * 1e-9, int(stamp)
                 self._anchor, self.moved_ns = total, int(stamp)
         self.moved_ns = self.moved_ns or int(stamps[0])
         self.newest_ns = int(stamps[-1])
@@ -85,6 +90,12 @@ class Travel:
     def still_s(self) -> float:
         """Return how long the vehicle has stood."""
         return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
+
+    def rested_s(self, since_s: float) -> float:
+        """Return how long it stands, or stood at its last standstill if that is not longer ago."""
+        length, end_ns = self._rest
+        recent = self.newest_ns - end_ns < since_s * 1e9
+        return max(self.still_s(), length if recent else 0.0)
 
 
 class FixPath:
@@ -184,8 +195,9 @@ class Progress:
             if not self._scale:
                 self.max_speed = max(self.max_speed, speed)
 
-    def heard_before(self) -> Heard:
+    def heard_before(self, preroll_s: float) -> Heard:
         """Return what came so far that says what a leg can tell."""
+        travel = self._travel.get('odometer')
         fix = self._last.get('fix')
         place = Heard({})
         if fix is not None and np.isfinite(fix.latitude[-1]):
@@ -195,7 +207,8 @@ class Progress:
             ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
         variances = {name: np.inf if block is None else stated_variance(
             block.q_ni, block.yaw_variance) for name, block in sent.items()}
-        return replace(place, variances=variances, still_s=self.still_s())
+        return replace(place, variances=variances,
+                       rested_s=travel.rested_s(preroll_s) if travel else 0.0)
 
     def begin_leg(self) -> None:
         """Count distance and speed from here."""

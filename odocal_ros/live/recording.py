@@ -105,9 +105,9 @@ class Recording:
         """Return whether the right wheel is heard by itself."""
         return self.recorder.newest_ns('odometer_right') > 0
 
-    def heard_before(self) -> Heard:
+    def heard_before(self, preroll_s: float) -> Heard:
         """Return what came so far that says what a leg can tell."""
-        return replace(self.progress.heard_before(), two_wheels=self.two_wheels())
+        return replace(self.progress.heard_before(preroll_s), two_wheels=self.two_wheels())
 
     def rates_hz(self) -> dict[str, float]:
         """Return the rate of each topic by its stamps."""

@@ -33,12 +33,15 @@ def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
     left, right, width = (_relative(method.estimates[name]) for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     apart = None if left is None or right is None else max(left, right)
-    return replace(
-        outlook, wheels=WheelsOutlook(apart, width, fault),
-        scale=_better(outlook.scale, method, 'scale_factor',
-                      _relative(method.estimates['scale_factor'])),
-        yaw=_better(outlook.yaw, method, 'yaw_mounting_angle',
-                    method.estimates['yaw_mounting_angle'].sigma))
+    scale = _better(outlook.scale, method, 'scale_factor',
+                    _relative(method.estimates['scale_factor']))
+    if scale is not outlook.scale and scale.metres:
+        # as all the fixes along the way count, no less is gained than by the length of the way
+        more = result.distance * (scale.sigma / scale.asked - 1)
+        scale = replace(scale, metres=min(scale.metres, more))
+    yaw = _better(outlook.yaw, method, 'yaw_mounting_angle',
+                  method.estimates['yaw_mounting_angle'].sigma)
+    return replace(outlook, wheels=WheelsOutlook(apart, width, fault), scale=scale, yaw=yaw)
 
 
 def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:

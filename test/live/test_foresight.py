@@ -19,6 +19,7 @@ from odocal_ros.live.session import Session
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.sketch import MOST, Sketch
 from odocal_ros.live.watch import EVERY_NS, Watch
+from odocal_ros.live.wheels_so_far import with_wheels
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline import calibrate
 from odocal_ros.samples import ImuSamples, OdometerForm, OdometerSamples, take
@@ -350,6 +351,73 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
         finished(worker)
     # the first comes with imports and goes free, the others 50 s apart: at 1, 2, 52 and 102 s
     assert len(looks) == 4
+
+
+# two wheels
+
+@pytest.fixture(scope='module')
+def two():
+    return simulate(SimOptions(scenario='town', duration=240.0, two_wheels=True, imu_rate=50.0,
+                               seed=4, imu_grade='tactical'))
+
+
+UNSURE = Prospect(0.2, 1e-3, 1e5)
+
+
+def wheels_at(two, t_stop, scale=UNSURE, **settings):
+    """Return outlook without and with the wheels, after so many seconds of the drive."""
+    whole = two.leg()
+    sketch = Sketch(whole.form)
+    for slot in ('imu', 'odometer', 'odometer_right', 'fix'):
+        rows = getattr(whole, slot)
+        sketch.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
+    config = with_settings(Config(), {'odometer.left': 'left', 'odometer.right': 'right',
+                                      'imu.grade': 'tactical'} | settings)
+    before = Outlook(scale, Prospect(None, 0.0087, None, (), 'not told'))
+    return before, with_wheels(before, sketch.leg(whole.start_ns), config)
+
+
+def test_two_wheels_are_foreseen_as_they_come_out(two):
+    whole = two.leg()
+    method = calibrate(whole, with_settings(Config(), {
+        'method': 'wheels', 'imu.grade': 'tactical'})).methods['wheels']
+    _, outlook = wheels_at(two, (whole.stop_ns - whole.start_ns) / SECOND)
+    left, right, scale = (method.estimates[f'scale_factor{x}'] for x in ('_left', '_right', ''))
+    # the sketch has a tenth of the rows: their noise is judged anew
+    assert outlook.wheels.left_right == pytest.approx(
+        max(e.sigma / e.value for e in (left, right)), rel=0.25)
+    assert outlook.scale.sigma == pytest.approx(scale.sigma / scale.value, rel=0.25)
+    assert outlook.scale.metres == 0.0
+    assert outlook.scale.sources
+    assert outlook.wheels.track_width < 0.05
+    assert (outlook.wheels.fault, outlook.yaw.why) == ('', 'not told')
+
+
+def test_the_metres_still_to_go_are_enough_and_no_more_than_the_end_points_need(two):
+    _, outlook = wheels_at(two, 25.0)
+    metres = outlook.scale.metres
+    assert 0.0 < metres < UNSURE.metres
+    few = replace(UNSURE, metres=metres / 2)
+    assert wheels_at(two, 25.0, few)[1].scale.metres == few.metres
+    speed = 10.0        # m/s, of the town
+    assert wheels_at(two, 25.0 + metres / speed)[1].scale.metres == 0.0
+
+
+def test_a_method_of_one_travel_and_a_single_counter_leave_the_outlook_alone(two, drive, config):
+    before, outlook = wheels_at(two, 60.0, method='two_point')
+    assert outlook is before
+    sketch, start_ns = sketched(drive, 60.0)
+    assert with_wheels(before, sketch.leg(start_ns), config) is before
+
+
+def test_swapped_wheels_are_said_while_it_is_driven(two):
+    leg = two.leg()
+    swapped = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
+    before = Outlook(GOOD, NO_YAW)
+    found = with_wheels(before, swapped, with_settings(Config(), {
+        'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
+    assert found.wheels.fault.startswith('WHEELS_SWAPPED')
+    assert 'Exchange odometer.left' in found.wheels.fault
 
 
 # what is said

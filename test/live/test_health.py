@@ -116,6 +116,19 @@ def test_standing_is_told_from_moving_and_a_flickering_count_is_standing():
     assert travel.still_s() == 0.0
 
 
+def test_the_last_standstill_counts_as_long_as_the_preroll_reaches_back_to_it():
+    travel = Travel(COUNTER)
+    assert travel.rested_s(600.0) == 0.0
+    t = np.arange(0, 31)
+    counts = 100 * np.concatenate([np.arange(6), np.full(10, 5), np.arange(5, 20)])
+    travel.feed(rows(t, counts), 0.02)        # stands from 5 s to 16 s, drives on to 30 s
+    assert travel.still_s() == 0.0
+    assert travel.rested_s(600.0) == pytest.approx(11.0, abs=1.0)
+    assert travel.rested_s(10.0) == 0.0
+    travel.feed(rows([31, 40], np.array([1900, 1900])), 0.02)
+    assert travel.rested_s(10.0) == pytest.approx(10.0)
+
+
 def test_fix_path_counts_steps_not_noise():
     north = 1e-7 * np.array([0.0, 1.0, 0.0, 1.0, 0.0])     # 0.6 m of jitter
     drive = np.concatenate([north, 10e-7 * np.arange(1, 11)])  # then 63.7 m in 6.4 m steps

@@ -130,6 +130,54 @@ def test_a_saved_result_comes_back_as_overrides(start, connect):
     client.until(state='waiting', scale_factor='0.0213', yaw_mounting_angle_rad='1.0')
     assert client.get('result.legs', 'result.valid', 'result.stamp') == [
         2, True, '2026-01-02T03:04:05Z']
+    status = client.status
+    assert (status['legs'], status['restored']) == ('2', '2026-01-02T03:04:05Z')
+    assert (status['scale_ok'], status['yaw_ok']) == ('no', 'no')        # no sigma came with them
+    answer = client.call('stop_leg')
+    assert answer.success
+    assert 'restored result of 2026-01-02T03:04:05Z: scale factor 0.0213' in answer.message
+    assert 'from 2 legs' in answer.message
+    assert client.call('undo_leg').message.startswith('no leg to undo')
+    assert client.call('reset').success
+    client.until(restored='', legs='0', scale_factor='nan')
+    assert not client.call('stop_leg').success
+
+
+def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(
+        start, connect, sent):
+    start('-p', 'result.scale_factor:=0.0213', '-p', 'result.scale_factor_sigma:=0.00001', '-p',
+          'result.legs:=2', '-p', 'result.valid:=true')
+    client = connect()
+    client.until(restored='an unknown date', scale_ok='yes')
+    player = Player(client.node, sent[0])
+    wait_for(player.matched, 'subscriptions')
+    player.play(part(sent[1], 0, 5), 20)
+    assert 'with the result restored of an unknown date' in client.until(state='idle')['message']
+    assert client.call('start_leg').success
+    player.play(part(sent[1], 5, 20), 20)
+    stopping = client.ask('stop_leg')
+    client.until(state='computing')
+    player.play(part(sent[1], 20, 23), 20)
+    assert 'restored' not in answer_of(stopping).message
+    assert client.until(restored='', legs='1')['scale_factor'] != '0.0213'
+    assert client.call('undo_leg').success
+    client.until(restored='an unknown date', legs='2', scale_factor='0.0213', scale_ok='yes')
+
+
+def test_an_input_that_never_spoke_is_an_error_in_the_diagnostics(start, connect, sent):
+    start()
+    client = connect()
+    imu = wait_for(lambda: client.health.get('calibrator: imu'), 'diagnostics')
+    assert imu['level'] == b'\x02'         # as diagnostic_updater has it; STALE is not ours to say
+    assert imu['message'].startswith('no Imu on /imu/data')
+    player = Player(client.node, sent[0])
+    wait_for(player.matched, 'subscriptions')
+    with player.playing(sent[1], 10):
+        good = wait_for(lambda: (h := client.health['calibrator: imu'])['level'] == b'\x00' and h,
+                        'good diagnostics')
+    assert float(good['Actual frequency (Hz)']) == pytest.approx(20, rel=0.05)
+    assert good['Events since startup'] == good['messages'] != '0'
+    wait_for(lambda: client.health['calibrator: imu']['level'] == b'\x02', 'the error of silence')
 
 
 def test_namespace_and_remaps(start, connect, sent):

@@ -174,13 +174,13 @@ def test_seconds_to_stand():
      'heading is good to 1.1 deg; nor the pitch, since the fixes carry no height'),
     ({}, {'variances': NONE | {'heading_topic': 0.001**2}},
      'this drive can tell the scale, the yaw (by the heading topic, 0.057 deg) and the pitch'),
-    ({'imu.grade': 'navigation'}, {'still_s': 600.0},
+    ({'imu.grade': 'navigation'}, {'rested_s': 600.0},
      'this drive can tell the scale, the yaw (by the gyrocompass, '),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {'two_wheels': True},
      'this drive can tell the scale, the yaw (by the configured heading, 0.11 deg), the pitch, '
      'left and right wheel and the track width (in turns)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002, 'odometer.track_width': 1.6},
-     {'two_wheels': True, 'still_s': 1.0},
+     {'two_wheels': True, 'rested_s': 1.0},
      'this drive can tell the scale, the yaw (by the configured heading, 0.11 deg), the pitch '
      'and left and right wheel; level and gyro bias come from the drive itself, since it starts '
      'without a standstill'),
@@ -191,7 +191,7 @@ def test_seconds_to_stand():
 ])
 def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, heard, said):
     monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'wheels'))
-    known = Heard(**({'variances': NONE, 'still_s': 30.0} | heard))
+    known = Heard(**({'variances': NONE, 'rested_s': 30.0} | heard))
     text = ability(with_settings(CONFIG, settings), known).words()
     assert text.startswith(said) if said.endswith(', ') else text == said
 

@@ -1,0 +1,102 @@
+"""Two wheels on one JointState topic, over DDS: what is told before, during and after a leg."""
+
+import re
+from types import SimpleNamespace
+
+from bench import answer_of, Client, NodeProcess, wait_for
+from player import part, Player, sent_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.live.guidance import TURNS
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+REST_S = 30.0            # of the drive played before the mark
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Simulate some minutes of town with two wheels that differ by 0.4 %."""
+    return simulate(SimOptions(
+        scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, fix_noise='rtk',
+        imu_grade='tactical', odometer='angle', two_wheels=True, heading=0.7, seed=4))
+
+
+@pytest.fixture(scope='module')
+def session(drive, domain, tmp_path_factory):
+    """Drive one leg; keep what the node said."""
+    folder = tmp_path_factory.mktemp('two')
+    wheels = {'left': drive.odometer, 'right': drive.odometer_right}
+    topics = {'imu': encode.imu('imu/data', drive.imu), 'fix': encode.fix('fix', drive.fix),
+              'odometer': encode.joints('odometer', wheels)}
+    sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
+                  key=lambda one: one.stamp_ns)
+    start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
+    settings = {'output.directory': folder, 'odometer.left': 'left', 'odometer.right': 'right',
+                'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': 0.002,
+                'wheels.radius': 0.3, 'imu.grade': 'tactical'}
+    node = NodeProcess(*(x for name, value in settings.items() for x in (
+        '-p', f'{name}:={value}')))
+    client, seen = Client(), SimpleNamespace()
+    try:
+        player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
+        wait_for(player.matched, 'subscriptions of the node')
+        player.play(part(sent, start_s - REST_S, start_s), SPEED)
+        seen.idle = client.until(state='idle')
+        seen.start = client.call('start_leg')
+        seen.first = client.until(state='recording')
+        player.play(part(sent, start_s, start_s + 160), SPEED)
+        seen.looked = wait_for(
+            lambda: client.status['track_width_ok'] != 'unknown' and client.status,
+            'a look at the wheels')
+        stopping = client.ask('stop_leg')
+        client.until(state='computing')
+        player.play(part(sent, start_s + 160, start_s + 163), SPEED)
+        seen.stop = answer_of(stopping)
+        seen.result = wait_for(lambda: client.status['state'] in ('calibrated', 'rejected')
+                               and client.status, 'the result')
+        yield seen
+    finally:
+        node.end()
+        client.close()
+
+
+def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
+    assert session.start.success
+    text = session.start.message
+    assert re.search(r'drive 1?\d\d m more, faster than 2.78 m/s \(10 km/h\), ', text)
+    assert TURNS in text
+    assert 'then stand still 10 s and call ~/stop_leg' in text
+    assert text.endswith(
+        'As configured, this drive can tell the scale, the yaw (by the configured heading, 0.11 '
+        'deg), the pitch, left and right wheel and the track width (in turns)')
+    assert session.first['hint'].split(', ', 1)[1] in text        # the same text in the status
+    assert session.first['can_tell'].startswith('the scale, the yaw (by')
+    assert (session.first['cannot_tell'], session.first['track_width_ok']) == ('', 'unknown')
+    assert TURNS in session.first['manoeuvres']
+
+
+def test_while_it_is_driven_each_quantity_is_yes_or_no(session):
+    seen = session.looked
+    assert seen['state'] == 'recording'
+    found = {name: seen[f'{name}_ok'] for name in (
+        'scale', 'yaw', 'pitch', 'left_right', 'track_width')}
+    assert set(found.values()) <= {'yes', 'no'}
+    assert (found['track_width'] == 'yes') == (TURNS not in seen['hint'])
+
+
+def test_the_stop_answers_with_both_wheels_and_how_good_each_quantity_is(session, drive):
+    assert session.stop.success
+    text, status = session.stop.message, session.result
+    for words in ('scale factor 0.', ', left 0.', ', right 0.', ', track width 1.', ' OK: scale'):
+        assert words in text, text
+    assert status['hint'] in text                                 # the same text in the status
+    truth = drive.truth
+    for name, true in zip(('left', 'right'), truth.wheel_scales, strict=True):
+        value, sigma = (float(status[f'scale_factor_{name}{end}']) for end in ('', '_sigma'))
+        assert abs(value - true) < 4 * sigma        # 1 in 16000 by chance
+    width, sigma = float(status['track_width_m']), float(status['track_width_sigma_m'])
+    assert abs(width - drive.options.track_width) < 4 * sigma
+    assert (status['left_right_ok'], status['track_width_ok']) == ('yes', 'yes')
+    assert 'OK: scale' in status['message']
