@@ -33,7 +33,8 @@ def session(drive, domain, tmp_path_factory):
     sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
                   key=lambda one: one.stamp_ns)
     start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
-    settings = {'output.directory': folder, 'odometer.left': 'left', 'odometer.right': 'right',
+    settings = {'output.directory': folder, 'method': 'wheels',
+                'odometer.left': 'left', 'odometer.right': 'right',
                 'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': 0.002,
                 'wheels.radius': 0.3, 'imu.grade': 'tactical'}
     node = NodeProcess(*(x for name, value in settings.items() for x in (
