@@ -52,6 +52,9 @@ class Inputs:
     t_heading: NDArray[np.float64]     # (h,)
     q_heading: NDArray[np.float64]     # (h, 4)
     heading_variance: NDArray[np.float64]  # (h,) rad^2
+    t_velocity: NDArray[np.float64]    # (v,)
+    velocity_n: NDArray[np.float64]    # (v, 3) m/s of the antenna, ENU where it is
+    velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
     fixes_rejected: int
     scale_unit: str
 
@@ -91,6 +94,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
+    velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     fix, t_fix = rows('fix')
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
@@ -114,6 +118,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,
         t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
+        t_velocity=t_velocity, velocity_n=velocity.velocity_n,
+        velocity_variance=velocity.variance_n,
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
         scale_unit=leg.form.scale_unit), tuple(found)
 

@@ -25,6 +25,8 @@ def components(w, neighbours) -> dict[str, tuple[float, float]]:
     """
     sums = _interval_components(w, neighbours)
     sums |= _fix_components(w, neighbours)
+    for rows in w.outside:
+        sums |= rows.components(neighbours)
     e = w.travel_variance
     n = w.n
     spread = np.concatenate([neighbours[:, E, E], neighbours[-1:, n + E, n + E]])

@@ -13,6 +13,12 @@ from odocal_ros.calib.smoother.chain import Normal
 from odocal_ros.calib.smoother.fixes import Fixes, heavy, weights
 from odocal_ros.calib.smoother.motion import Motion, rotvec
 from odocal_ros.calib.smoother.noise import interval_noise, Levels
+from odocal_ros.calib.smoother.outside_rows import (
+    add_rows,
+    by_interval,
+    outside_rows,
+    WeightedRows,
+)
 from odocal_ros.calib.smoother.state import (
     BA,
     BARE,
@@ -56,6 +62,8 @@ class Equations:
             self.motion, leg, self.still[:-1] & self.still[1:], spread)
         self.fixes = Fixes(leg, state, sums.points, intervals.mean_rate, problem.use, fix_change)
         self.root = problem.root
+        self.thin = problem.thin
+        self.outside = outside_rows(problem, state, sums.outside, fix_change)
         self._jacobians = {}
 
     def jacobians(self, n):
@@ -90,6 +98,9 @@ class Weighted:
         self.WJ = inverse @ self.J
         self.wr = np.einsum('kij,kj->ki', inverse, eq.motion.residual)
         self._weigh_fixes()
+        self.outside = [WeightedRows(rows, levels, eq.thin.get(rows.name, 1.0), self.n)
+                        for rows in eq.outside]
+        self.log_R += sum(rows.log_R for rows in self.outside)
         self._slow()
 
     def _weigh_fixes(self):
@@ -134,6 +145,8 @@ class Weighted:
         self.fix_r = self.fix_r + np.einsum('kij,kj->ki', self.FJ, own)
         if n == WITH_SLOW:
             self.fix_r = self.fix_r + np.einsum('kij,kj->ki', self.FJ_end, x[k + 1, SLOW])
+        for rows in self.outside:
+            rows.after(x, c)
         self.reached = self.eq.state.moved(x, c)
         return self
 
@@ -146,6 +159,8 @@ class Weighted:
         g = -np.einsum('kij,ki->kj', self.WJ, self.wr)
         self._add_pairs(out, H, g)
         self._add_fixes(out)
+        for rows in self.outside:
+            add_rows(out, rows.k, rows.J, rows.r)
         if n == WITH_SLOW:
             self._add_slow(out)
         self._add_stills(out)
@@ -174,15 +189,7 @@ class Weighted:
 
     def _add_fixes(self, out):
         n, k = self.n, self.eq.fixes.k
-        J, r = self.by_interval(self.FJ), self.by_interval(self.fix_r[:, :, None])
-        present = np.unique(k)
-        H = np.swapaxes(J, 1, 2) @ J
-        g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
-        out.diagonal[present] += H[:, :n, :n]
-        out.border[present] += H[:, :n, n:]
-        out.corner += H[:, n:, n:].sum(axis=0)
-        out.g[present] += g[:, :n]
-        out.g_border += g[:, n:].sum(axis=0)
+        present, J, r = add_rows(out, k, self.FJ, self.fix_r)
         if n == WITH_SLOW:
             B = self.by_interval(self.FJ_end)
             X = np.swapaxes(J, 1, 2) @ B
@@ -193,12 +200,7 @@ class Weighted:
 
     def by_interval(self, rows):
         """Return the rows of fixes (m, 3, c) by interval, padded: (present, 3 most, c)."""
-        k = self.eq.fixes.k
-        present, first, count = np.unique(k, return_index=True, return_counts=True)
-        place = np.arange(len(k)) - np.repeat(first, count)
-        out = np.zeros((len(present), int(count.max(initial=1)), *rows.shape[1:]))
-        out[np.repeat(np.arange(len(present)), count), place] = rows
-        return out.reshape(len(present), -1, rows.shape[2])
+        return by_interval(self.eq.fixes.k, rows)
 
     def _add_slow(self, out):
         a, q = self.decay[:, None], 1 / self.slow_drive
@@ -247,6 +249,7 @@ class Weighted:
         eq, state = self.eq, self.reached
         total = (self.wr**2).sum() + heavy(self.fix_r / np.sqrt(self.fix_weight))
         total += (state.travel_error**2).sum() / self.travel_variance
+        total += sum(rows.cost() for rows in self.outside)
         total += (state.v_n[eq.still]**2).sum() / STILL_SPEED**2
         pair = eq.still[:-1] & eq.still[1:]
         r = rotvec(state.C_nb[1:] @ transpose(state.C_nb[:-1]))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.judge import nominal_scale
+from odocal_ros.calib.smoother.outside import Heading, outside_heading, outside_velocity, Velocity
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
 
@@ -44,6 +45,8 @@ class SmootherLeg:
     antenna_arm: Floats = field(default_factory=lambda: np.zeros(3))
     doubt_t: Floats = _none()
     doubt_sigma: Floats = _none()        # scale units
+    velocity: Velocity = Velocity()
+    heading: Heading = Heading()
 
 
 def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:
@@ -77,4 +80,6 @@ def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=Non
         scale_unit=inputs.scale_unit, imu_arm=np.array(config.imu.lever_arm, float),
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
-        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma)
+        doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
+        velocity=outside_velocity(inputs, config, origin),
+        heading=outside_heading(inputs, config, origin))

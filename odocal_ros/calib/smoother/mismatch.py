@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
 
@@ -9,6 +10,7 @@ WORSE = 3.0            # times the grade's noise or bias that is another sensor
 ODD_FIXES = 0.15       # share of the fixes with little weight
 ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
 SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
+OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said to be wrong
 WIDEN = 2.0            # factor on the sigmas where the model does not hold
 
 
@@ -39,7 +41,17 @@ def mismatch(problem, fit, neighbours, config):
     if max(level['side'], level['side_turn']) > SLIDES:
         odd.append(f"the odometer's point moves sideways by "
                    f'{max(level["side"], level["side_turn"]):.2f} m in a second')
+    reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
         widen = WIDEN
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd)))
     return widen, reasons
+
+
+def _heading(heading, error):
+    """Say where the outside heading is farther from that of the drive than its sigma allows."""
+    if not len(heading.t) or abs(error) < OFF_HEADING * heading.sigma:
+        return []
+    return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
+                   f'{np.rad2deg(error):+.2f} deg from that of the drive, '
+                   f'{abs(error) / heading.sigma:.1f} times its sigma; it was given less weight')]

@@ -13,6 +13,7 @@ from odocal_ros.calib.smoother.state import (
     CONSTANTS,
     GNSS_ARM,
     GYRO_SCALE,
+    HEADING,
     LN_K,
     ODO_ARM,
     PITCH,
@@ -31,7 +32,7 @@ UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
 OPTIONAL = [i for i, name in enumerate(CONSTANTS)
-            if i not in (LN_K, YAW, PITCH, GYRO_SCALE)]
+            if i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
 
 
 def refused(reasons, scale_unit, details=None) -> MethodResult:
@@ -143,6 +144,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'f': K * state.forward,
         'noise': fit.levels.roots() | {'correlation_time': fit.levels.correlation_time},
         'iterations': fit.iterations, 'widened': float(widen),
+        'outside': _outside(leg, problem, fit, sigma),
         'posterior_to_prior': ratio,
         'gyro_scale_z': {'value': float(state.constants[GYRO_SCALE]),
                          'sigma': float(sigma[GYRO_SCALE])},
@@ -154,5 +156,20 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float(turned), 'standing': float(problem.still.sum())},
-        'track': {'t': state.t[::step], 'position_n': (state.p_n + state.C_nb @ arm)[::step]},
+        'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
+        # what dead reckoning begins with: a bias that holds for the whole leg
+        'start': {'t': float(state.t[0]), 'C_nb': state.C_nb[0],
+                  'gyro_bias': state.gyro_bias.mean(axis=0)},
     }
+
+
+def _outside(leg, problem, fit, sigma):
+    """Return what the drive says of velocity and heading from outside."""
+    out = {}
+    for rows in fit.weighted.outside:
+        out[rows.name] = {'messages': len(rows.k), 'alike': problem.thin.get(rows.name, 1.0)}
+    if 'heading' in out:
+        out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
+                           'error': float(fit.state.constants[HEADING]),
+                           'error_sigma': float(sigma[HEADING])}
+    return out

@@ -64,6 +64,12 @@ class Points:
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)
     R: Floats        # (m, 3, 3)
+    force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
+    rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
+
+    def take(self, index) -> 'Points':
+        """Return the points that an index picks."""
+        return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
 def turn(C, vectors):
@@ -230,7 +236,9 @@ class _Chunk:
         dp = self.p[j] + self.v[j] * h1 + a * h1**2 / 2
         dv = self.v[j] + (self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 2)[:, None]) * h1
         R = self.Rs[j] + self.Rs[j] @ skew(self.rate_turn[j] * share[:, None])
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R)
+        force = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * share[:, None]
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, force,
+                      self.rate_turn[j] / self.dt[j, None])
 
 
 def orthonormal(C):

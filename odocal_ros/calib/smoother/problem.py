@@ -8,12 +8,14 @@ from odocal_ros.calib.smoother.equations import Priors
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.outside_rows import first_values, used
 from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, preintegrate
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
     GNSS_ARM,
     GNSS_DELAY,
     GYRO_SCALE,
+    HEADING,
     M,
     ODO_ARM,
     ODO_DELAY,
@@ -45,6 +47,8 @@ class Problem:
     least: dict
     first_levels: Levels
     shaken: dict             # levels of gyro and accelerometer to come down from
+    outside: dict            # velocity and heading within the keyframes, where there are any
+    thin: dict               # of each, how many of its errors are one and the same
 
     @classmethod
     def of(cls, leg, config):
@@ -70,18 +74,31 @@ class Problem:
         least |= dict.fromkeys(('along', 'along_hard', 'side', 'side_turn', 'up'), LEAST_ROAD**2)
         least |= dict.fromkeys(('fix', 'fix_up'), (LEAST_FIX / fix_sigma)**2)
         least |= dict.fromkeys(('slow', 'slow_up'), LEAST_FIX**2)
-        return cls(leg, imu, _priors(config, grade), use, root, still, floor, least,
-                   Levels(values), {k: max(v, values[k]) for k, v in shaken(imu).items()})
+        outside = used(leg, t)
+        more, more_least = first_values(outside)
+        return cls(leg, imu, _priors(config, grade, leg), use, root, still, floor,
+                   least | more_least, Levels(values | more),
+                   {k: max(v, values[k]) for k, v in shaken(imu).items()}, outside, {})
 
     def sums(self, state: State) -> 'Sums':
         """Return the preintegrated sums about a state."""
         leg, c = self.leg, state.constants
         delay = c[ODO_DELAY]
+        times = [leg.t_fix[self.use] - c[GNSS_DELAY]]
+        times += [x.t - c[GNSS_DELAY] * x.from_fixes for x in self.outside.values()]
+        all_t = np.concatenate(times)
+        order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
             self.imu, state.gyro_bias[:-1], state.accel_bias[:-1], c[GYRO_SCALE],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward,
-            leg.t_fix[self.use] - c[GNSS_DELAY])
-        return Sums(state, intervals, points)
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order])
+        if not self.outside:
+            return Sums(state, intervals, points, {})
+        points = points.take(np.argsort(order, kind='stable'))
+        ends = np.cumsum([len(t) for t in times])
+        own = [points.take(slice(a, b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return Sums(state, intervals, points.take(slice(0, ends[0])),
+                    dict(zip(self.outside, own, strict=True)))
+
 
 @dataclass(frozen=True, eq=False)
 class Sums:
@@ -90,6 +107,7 @@ class Sums:
     about: State
     intervals: Intervals
     points: Points
+    outside: dict[str, Points]
 
     def _apart(self, state):
         a, b = state, self.about
@@ -152,11 +170,12 @@ def shaken(imu) -> dict:
     return out
 
 
-def _priors(config, grade) -> Priors:
+def _priors(config, grade, leg) -> Priors:
     sigma = np.full(M, np.inf)
     sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade]
+    sigma[HEADING] = leg.heading.sigma
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), np.full(3, max(grade.accel_bias, 1e-6)),
                   sigma, np.zeros(M))

@@ -12,6 +12,7 @@ from odocal_ros.calib.smoother.state import (
     GNSS_ARM,
     GNSS_DELAY,
     GYRO_SCALE,
+    HEADING,
     M,
     ODO_ARM,
     ODO_DELAY,
@@ -27,7 +28,8 @@ NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyr
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
           'fix_latency': slice(GNSS_DELAY, GNSS_DELAY + 1),
-          'gyro_scale': slice(GYRO_SCALE, GYRO_SCALE + 1)}
+          'gyro_scale': slice(GYRO_SCALE, GYRO_SCALE + 1),
+          'heading': slice(HEADING, HEADING + 1)}
 P = 3        # parameters: ln K, yaw, pitch
 
 
@@ -53,6 +55,8 @@ def shares(fit, neighbours) -> tuple[Source, ...]:
     for i, name in enumerate(INTERVAL):
         add(NAMES[name], X[:, :, w.eq.noise.component == i])
     _add_fixes(w, neighbours, add)
+    for rows in w.outside:
+        add(rows.source, rows.effects(neighbours, P))
     travel = np.concatenate([with_c[:, :, E], with_c[-1:, :, n + E]]) / np.sqrt(w.travel_variance)
     add('quantisation', travel[:, :, None])
     if n == WITH_SLOW:
@@ -65,11 +69,15 @@ def shares(fit, neighbours) -> tuple[Source, ...]:
     add('accelerometer_bias', with_c[0, :, BA] / priors.accel_bias)
     border = fit.solved.covariance[:P]
     shared = [Source(name, border[:, where] / priors.constants[where], True)
-              for name, where in SHARED.items()]
+              for name, where in SHARED.items() if name != 'heading' or _has_heading(w)]
     total = fit.solved.covariance[:P, :P]
     rest = total - sum(covariance.values()) - sum(s.effects @ s.effects.T for s in shared)
     own = [Source(name, _root(value)) for name, value in covariance.items()]
     return (*own, *shared, Source('standstill', _root(rest)))
+
+
+def _has_heading(w):
+    return any(rows.name == 'heading' for rows in w.outside)
 
 
 def _add_fixes(w, neighbours, add):

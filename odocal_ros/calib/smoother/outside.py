@@ -1,0 +1,118 @@
+"""
+What is known from outside besides fixes: the antenna's velocity, the heading of the Imu's x axis.
+
+A heading comes with one error for the whole leg (a mounting, a declination, a compass), which no
+number of messages averages out, and white noise on top; a heading that is given at the start mark
+is one such message.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.angles import wrap, yaw_from_heading
+from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.rotations import matrix_from_quat, transpose
+
+Floats = NDArray[np.float64]
+VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say
+HEADING_LIMIT = 0.5         # rad: an orientation worse than this is no heading
+HEADING_RATE = 5.0          # Hz, more says nothing new
+GIVEN = 1e-4                # rad, noise of a heading given at the mark, beside its error
+
+
+def _none(*shape):
+    return field(default_factory=lambda: np.empty((0, *shape)))
+
+
+@dataclass(frozen=True, eq=False)
+class Velocity:
+    """Velocity of the antenna, in n: (m,) s, (m, 3) m/s."""
+
+    from_fixes: ClassVar[bool] = True       # stamps are as late as those of the fixes
+    t: Floats = _none()
+    velocity_n: Floats = _none(3)
+    sigma: Floats = _none(3)
+
+    def between(self, first, last) -> 'Velocity':
+        """Return what lies between two times."""
+        pick = (self.t >= first) & (self.t <= last)
+        return Velocity(self.t[pick], self.velocity_n[pick], self.sigma[pick])
+
+
+@dataclass(frozen=True, eq=False)
+class Heading:
+    """
+    Yaw of the Imu's x axis in n: (m,) s, (m,) rad.
+
+    noise : (m,) rad.   sigma : rad, of the error that is the same through the leg.
+    """
+
+    from_fixes: ClassVar[bool] = False
+    t: Floats = _none()
+    yaw: Floats = _none()
+    noise: Floats = _none()
+    sigma: float = 1.0
+    source: str = ''
+
+    def between(self, first, last) -> 'Heading':
+        """Return what lies between two times."""
+        pick = (self.t >= first) & (self.t <= last)
+        return Heading(self.t[pick], self.yaw[pick], self.noise[pick], self.sigma, self.source)
+
+
+def outside_velocity(inputs, config, origin) -> Velocity:
+    """Return the velocity of the antenna, turned from where it is to n; empty: not asked for."""
+    if not config.gnss.use_velocity or not len(inputs.t_velocity) or not len(inputs.t_fix):
+        return Velocity()
+    variance = inputs.velocity_variance
+    known = np.isfinite(variance) & (variance > 0)
+    sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
+    C_np = _from_place(inputs, inputs.t_velocity, origin)
+    return Velocity(inputs.t_velocity, (C_np @ inputs.velocity_n[:, :, None])[:, :, 0], sigma)
+
+
+def outside_heading(inputs, config, origin) -> Heading:
+    """Return the heading that the settings ask for, else the heading topic; empty: none."""
+    asked, alignment = config.alignment.heading_source, config.alignment
+    given = not np.isnan(alignment.heading)
+    if given and asked in ('auto', 'fixed'):
+        yaw = yaw_from_heading(alignment.heading) + _convergence(inputs, np.zeros(1), origin)
+        return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN), alignment.heading_sigma,
+                       'fixed')
+    if asked in ('auto', 'heading_topic'):
+        return _sent(inputs, inputs.t_heading, inputs.q_heading, inputs.heading_variance,
+                     alignment.heading_offset, config, origin, np.eye(3), 'heading_topic')
+    if asked == 'imu_orientation':
+        return _sent(inputs, inputs.t_imu, inputs.q_ni, inputs.yaw_variance, 0.0, config, origin,
+                     transpose(inputs.C_bi), 'imu_orientation')
+    return Heading()
+
+
+def _sent(inputs, t, q, variance, offset, config, origin, C_ib, source):
+    good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    t, q, variance = t[good], q[good], variance[good]
+    if len(t) < 2 or not len(inputs.t_fix):
+        return Heading()
+    every = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / HEADING_RATE))
+    t, q, variance = t[::every], q[::every], variance[::every]
+    stated = float(np.median(variance))
+    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    if sigma > HEADING_LIMIT:
+        return Heading()
+    C = matrix_from_quat(q) @ C_ib
+    yaw = np.arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + _convergence(inputs, t, origin)
+    return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source)
+
+
+def _from_place(inputs, t, origin):
+    """Return C_np of the places at times: east and north differ from those at the origin."""
+    latitude, longitude = (np.interp(t, inputs.t_fix, inputs.geodetic[:, i]) for i in (0, 1))
+    return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
+
+
+def _convergence(inputs, t, origin):
+    C_np = _from_place(inputs, t, origin)
+    return np.arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

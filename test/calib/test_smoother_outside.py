@@ -1,0 +1,207 @@
+"""Velocity and heading from outside in the smoother."""
+
+from dataclasses import replace
+
+from drives import changed
+import numpy as np
+import pytest
+from smoother_legs import leg_of, made, truth
+
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.outside import Heading
+from odocal_ros.calib.smoother.outside_rows import alike
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import BARE, GNSS_DELAY, GYRO_SCALE, M, P
+from odocal_ros.config import with_settings
+from odocal_ros.reasons import Code
+from odocal_ros.samples import VelocitySamples
+from odocal_ros.screen import screen
+from odocal_ros.sim import motion, sensors
+
+ARMS = {'antenna_lever_arm': (0.5, -0.3, 1.2)}
+SHORT = {'duration': 200.0, 'imu_grade': 'industrial'} | ARMS
+STRAIGHT = {'scenario': 'straight', 'duration': 300.0, 'imu_grade': 'industrial'}
+SIGMA = 0.05      # m/s
+
+
+def with_velocity(drive, errors, stated=SIGMA**2):
+    """Return the drive's leg with a GNSS velocity at 5 Hz; errors: (n, 3) draws to m/s."""
+    o = drive.options
+    ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.FIX_PHASE)
+    state = drive.motion.at(t)
+    swing = np.cross(np.stack([0 * t, 0 * t, state.yaw_rate], -1), o.antenna_lever_arm)
+    v = motion.velocity_n(state) + np.einsum('kij,kj->ki', motion.attitude(state), swing)
+    v = v + errors(np.random.default_rng(7).standard_normal(v.shape))
+    stamp = o.start_ns + ns
+    return replace(drive.leg(), fix_velocity=VelocitySamples(
+        stamp, stamp, v, np.full(v.shape, stated)))
+
+
+def fitted(leg, config, **changes):
+    config = with_settings(config, {k.replace('__', '.'): v for k, v in changes.items()})
+    return smooth(leg_of(leg, config), config)
+
+
+def sigma_of(method, name='scale_factor'):
+    e = method.estimates[name]
+    return e.sigma / e.value if name == 'scale_factor' else e.sigma
+
+
+def off(drive, method):
+    scale, yaw = method.estimates['scale_factor'], method.estimates['yaw_mounting_angle']
+    return max(abs(scale.value - drive.truth.scale) / scale.sigma,
+               abs(yaw.value - drive.truth.yaw) / yaw.sigma)
+
+
+def test_rows_are_true_at_the_truth_and_so_are_their_derivatives():
+    drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
+                            heading_sigma=0.0, **ARMS)
+    config = with_settings(config, {'gnss.use_velocity': True})
+    leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+
+    def rows(there):
+        return Equations(problem, there, problem.sums(there)).outside
+
+    velocity, heading = rows(state)
+    # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
+    assert np.abs(velocity.raw).max() < 5e-3
+    # within a step of 20 ms the turn is taken to first order: (0.02 s 0.5 rad/s)^2 / 2
+    assert np.abs(heading.raw).max() < 1e-4
+    rng = np.random.default_rng(1)
+    state = state.moved(1e-3 * rng.standard_normal((len(state.t), BARE)),
+                        1e-3 * rng.standard_normal(M))
+    at_state = rows(state)
+    for i in range(BARE + M):
+        h = 1e-4
+
+        def raw(size, i=i):
+            step, c = np.zeros((len(state.t), BARE)), np.zeros(M)
+            if i < BARE:
+                step[:, i] = size
+            else:
+                c[i - BARE] = size
+            return [r.raw for r in rows(state.moved(step, c))]
+
+        for own, plus, minus in zip(at_state, raw(h), raw(-h), strict=True):
+            expected = own.J[:, :, i] if i < BARE else own.c[:, :, i - BARE]
+            # biases: as in the fixes, under constant force and up to 0.3 rad of turn; else what
+            # a turn of 1e-3 rad leaves of second order
+            loose = {3: 0.3, 4: 0.1}.get(i // 3, 2e-3)
+            if i == BARE + GNSS_DELAY:      # the arm's swing has no delay in the derivative
+                loose = 0.3
+            if i == BARE + GYRO_SCALE:      # as for the fixes: nothing within a second
+                continue
+            np.testing.assert_allclose((plus - minus) / (2 * h), expected, err_msg=str(i),
+                                       atol=loose * max(1.0, np.abs(expected).max()))
+    assert not at_state[0].J[:, :, P].any()
+
+
+def test_a_velocity_helps_and_its_size_is_found():
+    drive, config, leg = made(**SHORT)
+    without = smooth(leg, config)
+    said = fitted(with_velocity(drive, lambda e: SIGMA * e), config, gnss__use_velocity=True)
+    silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), config,
+                    gnss__use_velocity=True)
+    unasked = fitted(with_velocity(drive, lambda e: SIGMA * e), config)
+    assert off(drive, said) < 3.3
+    assert sigma_of(said) < 0.9 * sigma_of(without)
+    # the same but for how a library rounds arrays that lie elsewhere
+    assert unasked.estimates['scale_factor'].value == pytest.approx(
+        without.estimates['scale_factor'].value, rel=1e-9)
+    # 1.5 thousand draws of each: 2 % of a sigma
+    assert said.details['noise']['velocity'] == pytest.approx(1.0, abs=0.08)
+    assert silent.details['noise']['velocity'] == pytest.approx(0.5, abs=0.04)
+    assert sigma_of(silent) == pytest.approx(sigma_of(said), rel=0.02)
+    assert any(s.name == 'fix_velocity' for s in said.sources)
+
+
+def test_outliers_of_a_velocity_do_not_pull():
+    drive, config, _ = made(**SHORT)
+
+    def errors(e):
+        bad = np.arange(len(e)) % 50 == 0
+        return SIGMA * e + 5.0 * bad[:, None]
+
+    method = fitted(with_velocity(drive, errors), config, gnss__use_velocity=True)
+    assert off(drive, method) < 3.3
+    # 2 % of the rows at the edge of what counts in full, 9 in place of 1: 1.18 in variance
+    assert method.details['noise']['velocity'] < 1.18
+
+
+def test_velocity_errors_that_stay_promise_no_more():
+    drive, config, _ = made(**SHORT)
+
+    def slow(e):
+        out = np.empty_like(e)
+        x = e[0]
+        for i, draw in enumerate(e):
+            x = 0.95 * x + np.sqrt(1 - 0.95**2) * draw
+            out[i] = SIGMA * x
+        return out
+
+    method = fitted(with_velocity(drive, slow), config, gnss__use_velocity=True)
+    # neighbours are 0.95 alike: (1 + 0.95) / (1 - 0.95) = 39 count as one, less what the
+    # smoothing takes for motion
+    assert 10 < method.details['outside']['velocity']['alike'] < 80
+    assert off(drive, method) < 3.3
+
+
+def test_white_errors_are_not_alike():
+    rng = np.random.default_rng(3)
+
+    class White:
+        r, weight = rng.standard_normal((1000, 3)), np.ones((1000, 3))
+
+    # the largest of seven ratios of chi2 with 24 to 1000 degrees of freedom: 1 + 3 / sqrt(12)
+    assert alike(White) < 1.9
+
+
+@pytest.mark.parametrize('how', ['topic', 'fixed', 'imu'])
+def test_a_heading_adds_its_sigma_and_no_more(how):
+    sigma = 1e-3
+    options = {'topic': {'heading_sigma': sigma}, 'imu': {'orientation_sigma': sigma}}
+    drive, config, leg = made(**STRAIGHT, **options.get(how, {}))
+    ask = {'topic': {}, 'imu': {'alignment__heading_source': 'imu_orientation'},
+           'fixed': {'alignment__heading': float(drive.truth.heading),
+                     'alignment__heading_sigma': sigma}}[how]
+    without = smooth(replace(leg, heading=Heading()), config)
+    method = fitted(drive.leg(), config, **ask)
+    name = 'yaw_mounting_angle'
+    alone = sigma_of(without, name)
+    # two independent sources
+    assert sigma_of(method, name) == pytest.approx(1 / np.hypot(1 / sigma, 1 / alone), rel=0.05)
+    assert off(drive, method) < 3.3
+    assert method.details['outside']['heading']['source'].startswith(how[:3]) or how == 'topic'
+    shared = {s.name for s in method.sources if s.shared}
+    assert 'heading' in shared
+    assert 'heading' not in {s.name for s in without.sources}
+
+
+def test_the_orientation_of_an_imu_is_used_only_when_asked_for():
+    drive, config, leg = made(**STRAIGHT, orientation_sigma=1e-3)
+    assert not len(leg.heading.t)
+
+
+def test_a_wrong_heading_is_said_and_gives_way():
+    drive, config, _ = made(**SHORT)
+    method = fitted(drive.leg(), config, alignment__heading=float(drive.truth.heading) + 0.05,
+                    alignment__heading_sigma=2e-3)
+    text = [r.text for r in method.reasons if r.code is Code.MODEL_MISMATCH]
+    assert text
+    assert 'heading (fixed) differs by' in text[0]
+    assert off(drive, method) < 3.3
+
+
+def test_a_velocity_is_screened():
+    drive, config, _ = made(**SHORT)
+    leg = with_velocity(drive, lambda e: 0 * e)
+
+    def spoil(v):
+        v[5:8, 0] = np.nan
+
+    inputs, found = screen(replace(leg, fix_velocity=changed(leg.fix_velocity, velocity_n=spoil)),
+                           config)
+    assert len(inputs.t_velocity) == len(leg.fix_velocity.stamp_ns) - 3
+    assert any('3 of' in r.text and 'fix velocity messages' in r.text for r in found)
