@@ -100,7 +100,9 @@ def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made):
     latitude = made.fix.latitude + late * 2e-5      # 127 m north
     again = calibrate(replace(made.leg(), fix=replace(made.fix, latitude=latitude)),
                       settings(made), holdout=True)
-    assert again.methods['wheels'].estimates['scale_factor_left'].value == a.value
+    # sums by BLAS differ in the last bit with where arrays lie in memory
+    assert again.methods['wheels'].estimates['scale_factor_left'].value == pytest.approx(
+        a.value, rel=1e-12)
 
 
 def test_what_the_search_found_is_in_the_details(result):

@@ -192,7 +192,7 @@ def test_fixes_after_the_stop_are_not_used():
     spoilt[late] += 1000.0
     a, b = (fit_wheels(held_out(x, 0.8), config).estimates['scale_factor']
             for x in (leg, replace(leg, fixes_n=spoilt)))
-    assert a == b
+    assert (a.value, a.sigma) == pytest.approx((b.value, b.sigma), rel=1e-9)   # BLAS' last bits
 
 
 def test_few_fixes_are_refused():
