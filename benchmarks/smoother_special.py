@@ -1,0 +1,133 @@
+"""What ``smoother_cells.py --special`` prints: sigmas of dull drives, and starts from afar."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+from smoother_legs import leg_of, truth
+
+from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.problem import Problem
+
+FIRST_SEED = 55_000_000
+DULL = (({'scenario': 'straight', 'imu_grade': 'industrial'}, 'yaw bound of method.md 0.105 deg'),
+        ({'scenario': 'paper', 'imu_grade': 'navigation', 'fix_noise': 'white'},
+         'yaw bound of method.md 0.008 deg'))
+DULL_DRIVES, STARTS_DRIVES = 20, 3
+ROAD = 0.05**2 / 10      # m^2/s: 0.05 m/s at 10 Hz, as the bounds of method.md have it
+IN_MOTION = 5.0          # m/s at the start mark moved into the drive
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+
+
+def special(simulated, true_levels):
+    """Print both tables; functions of smoother_cells.py."""
+    print('Sigma of the yaw against bounds at the truth, deg (levels of the simulation: wheels\n'
+          'that never slide; and of method.md: 0.05 m/s sideways at 10 Hz)')
+    for number, (options, promise) in enumerate(DULL):
+        _dull(simulated, true_levels, FIRST_SEED + 1000 * number, options, promise)
+    print('\nThe same leg from afar: change of scale, yaw, pitch in sigmas (asked: below 0.1)')
+    worst = {}
+    for number, grade in enumerate(('consumer', 'industrial', 'tactical')):
+        for noise in ('white', 'rtk'):
+            for k in range(STARTS_DRIVES):
+                _starts(simulated, FIRST_SEED + 10_000 * (number + 1) + k, grade, noise, worst)
+    for what, change in worst.items():
+        print(f'{what:50} worst {np.round(change, 3)}', flush=True)
+
+
+def _dull(simulated, true_levels, first, options, promise):
+    rows, refused = [], 0
+    for seed in range(first, first + DULL_DRIVES):
+        drive, config = simulated(seed, **options)
+        leg = leg_of(drive.leg(), config)
+        result = smooth(leg, config)
+        yaw, scale = (result.estimates[n] for n in ('yaw_mounting_angle', 'scale_factor'))
+        problem, state = Problem.of(leg, config), truth(drive, config, leg)
+        levels = true_levels(problem, drive)
+        slides = levels.but(**dict.fromkeys(('side', 'side_turn', 'up'), ROAD))
+        least, sliding = (math.sqrt(bound(leg, config, state, x)[1, 1]) for x in (levels, slides))
+        if yaw.value is None:
+            refused += 1
+            print(f'    seed {seed}: {[r.text for r in result.reasons]}')
+            continue
+        rows.append([yaw.value - drive.truth.yaw, yaw.sigma, least, sliding,
+                     scale.value / drive.truth.scale - 1, scale.sigma / scale.value])
+    if not rows:
+        print(f'{options["scenario"]}: all {refused} refused')
+        return
+    error, sigma, least, sliding, off, scale_sigma = np.array(rows).T
+    print(f'{options["scenario"]}, {options["imu_grade"]}, {len(rows)} drives, refused {refused}: '
+          f'stated {np.degrees(np.median(sigma)):.4f} ({np.degrees(sigma.min()):.4f} to '
+          f'{np.degrees(sigma.max()):.4f}), bound {np.degrees(np.median(least)):.4f}, sliding '
+          f'{np.degrees(np.median(sliding)):.4f}; {promise}\n'
+          f'    stated over bound {(sigma / least).min():.3f} to {(sigma / least).max():.3f}; '
+          f'RMS error {np.degrees(np.sqrt((error**2).mean())):.4f} deg, over stated '
+          f'{np.sqrt((error**2 / sigma**2).mean()):.2f}; scale over stated '
+          f'{np.sqrt((off**2 / scale_sigma**2).mean()):.2f}', flush=True)
+
+
+def _starts(simulated, seed, grade, noise, worst):
+    drive, config = simulated(seed, scenario='town', imu_grade=grade, fix_noise=noise)
+    leg = leg_of(drive.leg(), config)
+    usual = smooth(leg, config)
+    for factor in (0.7, 1.3):
+        _note(worst, f'scale wrong by {factor:g}, {grade} {noise}', usual,
+              smooth(replace(leg, rough_scale=factor * leg.rough_scale), config))
+    for angle in (-40.0, 40.0):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])       # old b by the new
+        turned = smooth(replace(leg, w_b=leg.w_b @ turn, f_b=leg.f_b @ turn), config)
+        _note(worst, f'Imu turned by {angle:g} deg, {grade} {noise}', usual, turned,
+              math.radians(angle))
+    moving, state = _in_motion(drive, config)
+    late = smooth(moving, config)
+    problem = Problem.of(moving, config)
+    noise_found = dict(late.details['noise'])
+    tau = noise_found.pop('correlation_time')
+    levels = problem.first_levels.but(correlation_time=tau,
+                                      **{k: v**2 for k, v in noise_found.items()})
+    best = fit(problem, state, levels)
+    change = [(math.log(late.estimates[NAMES[0]].value) - best.state.constants[0]),
+              *(late.estimates[n].value - best.state.constants[i]
+                for i, n in enumerate(NAMES) if i)]
+    sigma = np.sqrt(np.diag(best.solved.covariance))[:3]
+    _keep(worst, f'starts in motion: nothing or truth, {grade} {noise}', np.array(change) / sigma)
+    # the rest of the drive adds to it: the difference of both is what the rest is worth
+    more = [max(late.estimates[n].sigma**2 - usual.estimates[n].sigma**2, 0.0) for n in NAMES]
+    apart = [late.estimates[n].value - usual.estimates[n].value for n in NAMES]
+    _keep(worst, f'starts in motion or whole, of the difference, {grade} {noise}',
+          np.array(apart) / np.sqrt(np.maximum(more, 1e-30)))
+
+
+def _in_motion(drive, config):
+    """Return the leg with its start mark in motion, and the truth at its keyframes."""
+    t = np.arange(0.0, drive.motion.duration, 0.5)
+    at = t[np.flatnonzero(np.abs(drive.motion.speed(t)) > IN_MOTION)[0]]
+    start = drive.options.start_ns + round(at * 1e9)
+    leg = leg_of(_cut(replace(drive.leg(), start_ns=start), start), config)
+    return leg, truth(replace(drive, truth=replace(drive.truth, start_ns=start)), config, leg)
+
+
+def _cut(leg, start):
+    """Return a leg without what came before: a recorder that was switched on in motion."""
+    from odocal_ros.samples import take
+    return replace(leg, **{name: take(getattr(leg, name), getattr(leg, name).stamp_ns >= start)
+                           for name in ('imu', 'odometer', 'fix')})
+
+
+def _note(worst, what, usual, other, turned=0.0):
+    change = []
+    for name in NAMES:
+        a, b = usual.estimates[name], other.estimates[name]
+        if b.value is None:
+            change.append(np.inf)
+            continue
+        off = b.value - a.value - (turned if name == NAMES[1] else 0.0)
+        change.append(off / a.sigma)
+    _keep(worst, what, np.array(change))
+
+
+def _keep(worst, what, change):
+    if what not in worst or np.abs(change).max() > np.abs(worst[what]).max():
+        worst[what] = change
