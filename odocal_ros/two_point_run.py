@@ -20,6 +20,7 @@ from odocal_ros.calib.slip import find_slips, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.leg_tracks import near
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
@@ -157,7 +158,7 @@ class TwoPointRun:
         keep, sigma = steady(residual, run.fix_sigma)
         middle, direction, course = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
         C = matrix_from_quat(self.track.q_nb)
-        yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
+        yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
         found += against_travel(direction, course, self.config.odometer.signed)
         run.reasons += found

@@ -10,6 +10,7 @@ from odocal_ros.calib.wheels.planar import planar_leg
 from odocal_ros.calib.wheels.ranges import ranges_of
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
 from odocal_ros.reasons import Code, Reason
@@ -99,7 +100,7 @@ def _straightened(run, travel, drift, error, since):
     """Return the track of a wheel without drift, rad/s, and scale error of the gyro."""
     t, q_nb = run.epochs
     x = matrix_from_quat(q_nb)[..., 0]
-    yaw = np.unwrap(np.arctan2(x[:, 1], x[:, 0]))
+    yaw = np.unwrap(arctan2(x[:, 1], x[:, 0]))
     turn = np.zeros((len(t), 3))
     turn[:, 2] = -drift * (t - since) - error / (1 + error) * (
         yaw - np.interp(since, t, yaw))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.result import TrackCheck
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
 
 DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compared
@@ -96,7 +96,7 @@ def pieces(track_2d, fixes_2d, t, sigma):
         return np.empty(0), np.empty(0), np.empty(0)
     a, b = np.array(cuts).T
     track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
-    return (t[a] + t[b]) / 2, np.arctan2(*track.T[::-1]), np.arctan2(*fix.T[::-1])
+    return (t[a] + t[b]) / 2, arctan2(*track.T[::-1]), arctan2(*fix.T[::-1])
 
 
 def steady(residual, fix_sigma):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
@@ -45,7 +46,7 @@ def judge_drive(track, t_stop, metres_per_unit, leg):
         found += (Reason(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
                          f'{leg.min_speed:g} m/s are asked'),)
     C = matrix_from_quat(track.q_nb[inside])
-    yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
+    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
     turning = np.abs(_rate_1s(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
     if share > TURNS:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.sections import Sections, sections
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import matrix_from_quat
 
 ROWS = 5000          # of each kind kept
@@ -78,7 +79,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
     before, after = (_pinned(path, pin) for path in paths)
     after_n, off_n = after(t), after(t_fix) - fix_n
     C_nb = matrix_from_quat(track.q_nb[inside])
-    yaw = np.unwrap(np.arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0]))
+    yaw = np.unwrap(arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0]))
     sign = np.where(_over_window(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
     forward = _forward_at(t_fix, t, after_n, sign)

@@ -10,6 +10,7 @@ not.
 import numpy as np
 
 from odocal_ros.calib.result import Source
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.earth import gravity
 from odocal_ros.reasons import Code, Reason
 
@@ -52,7 +53,7 @@ def find_slips(t_imu, f_b, track, f, latitude, quantum):
     excess = excess_way(span, a, K * np.interp(grid, track.t, track.s))
     # in a turn the level error comes to bear on another axis: no window is judged there
     C = track.C_nb_at(grid)
-    yaw = np.unwrap(np.arctan2(C[:, 1, 0], C[:, 0, 0]))[PINS:-PINS]
+    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PINS:-PINS]
     excess[np.abs(yaw[span:] - yaw[:-span]) > TURN] = 0.0
     # what the drive as a whole does (rough road, soft suspension) is no event
     usual = np.median(np.abs(excess[excess != 0.0])) / 0.6745 if excess.any() else 0.0

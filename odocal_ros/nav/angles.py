@@ -11,6 +11,16 @@ def wrap(angle):
     return np.where((angle > -np.pi) & (angle <= np.pi), angle, wrapped)[()]
 
 
+def arctan2(y, x):
+    """
+    Return np.arctan2, the same wherever the values lie in memory.
+
+    numpy 1.26, which Jazzy has, rounds that of columns of a matrix by their addresses; live would
+    part from replay by the last digits.
+    """
+    return np.arctan2(np.copy(y), np.copy(x))
+
+
 def yaw_from_heading(heading):
     """Turn compass heading into ENU yaw, rad."""
     return wrap(np.pi / 2 - heading)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from odocal_ros.nav.angles import arctan2
+
 A = 6378137.0                  # m, semi-major axis
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
@@ -59,14 +61,14 @@ def geodetic_from_ecef(r_e):
     x, y, z = np.moveaxis(np.asarray(r_e, dtype=float), -1, 0)
     b = A * (1 - F)
     p = np.hypot(x, y)
-    beta = np.arctan2(A * z, b * p)
+    beta = arctan2(A * z, b * p)
     for _ in range(3):
-        latitude = np.arctan2(z + E2 / (1 - E2) * b * np.sin(beta) ** 3,
-                              p - E2 * A * np.cos(beta) ** 3)
-        beta = np.arctan2((1 - F) * np.sin(latitude), np.cos(latitude))
+        latitude = arctan2(z + E2 / (1 - E2) * b * np.sin(beta) ** 3,
+                           p - E2 * A * np.cos(beta) ** 3)
+        beta = arctan2((1 - F) * np.sin(latitude), np.cos(latitude))
     s, c = np.sin(latitude), np.cos(latitude)
     height = p * c + z * s - A * np.sqrt(1 - E2 * s * s)
-    return latitude, np.arctan2(y, x), height
+    return latitude, arctan2(y, x), height
 
 
 def C_en(latitude, longitude):

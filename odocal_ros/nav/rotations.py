@@ -7,6 +7,8 @@ Rotations: matrices, quaternions (x y z w, as ROS sends them) and fixed-axis rol
 
 import numpy as np
 
+from odocal_ros.nav.angles import arctan2
+
 
 def skew(a):
     """Return the matrix of the cross product with a: (..., 3) to (..., 3, 3)."""
@@ -105,10 +107,10 @@ def rpy_from_matrix(C):
     C = np.asarray(C, dtype=float)
     level = np.hypot(C[..., 0, 0], C[..., 1, 0])
     locked = level < 1e-12
-    yaw = np.where(locked, np.arctan2(-C[..., 0, 1], C[..., 1, 1]),
-                   np.arctan2(C[..., 1, 0], C[..., 0, 0]))
+    yaw = np.where(locked, arctan2(-C[..., 0, 1], C[..., 1, 1]),
+                   arctan2(C[..., 1, 0], C[..., 0, 0]))
     # roll is what is left once this yaw is undone: near the lock its error then mends the yaw's
     s, c = np.sin(yaw), np.cos(yaw)
-    roll = np.where(locked, 0.0, np.arctan2(s * C[..., 0, 2] - c * C[..., 1, 2],
-                                            c * C[..., 1, 1] - s * C[..., 0, 1]))
-    return np.stack([roll, np.arctan2(-C[..., 2, 0], level), yaw], -1)
+    roll = np.where(locked, 0.0, arctan2(s * C[..., 0, 2] - c * C[..., 1, 2],
+                                         c * C[..., 1, 1] - s * C[..., 0, 1]))
+    return np.stack([roll, arctan2(-C[..., 2, 0], level), yaw], -1)

@@ -8,6 +8,7 @@ import numpy as np
 
 from odocal_ros.calib.planned_drive import from_rates, marked, PlannedDrive, STEP
 from odocal_ros.errors import BadUsage
+from odocal_ros.nav.angles import arctan2
 
 TURN_TIME = 8.0          # s of a turn of 90 deg
 MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
@@ -157,10 +158,10 @@ def _from_points(path, t, position_n, start) -> PlannedDrive:
     piece = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)
     moving = (grid >= begin[piece]) & (grid <= t[b][piece])
     speed = np.where(moving, (way / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
-    yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
     return marked(grid, speed, np.interp(grid, middle, yaw),
-                  np.interp(grid, middle, np.arctan2(step[:, 2], level)),
+                  np.interp(grid, middle, arctan2(step[:, 2], level)),
                   latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screen import Inputs
@@ -116,7 +117,7 @@ def turn_ratio(inputs: Inputs, drive: Drive, w_up) -> float | None:
         return None
     step = np.diff(drive.fixes_n[knots, :2], axis=0)
     t = (drive.t_fix[knots][:-1] + drive.t_fix[knots][1:]) / 2
-    course = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     angle = np.concatenate([[0.0], np.cumsum((w_up[:-1] + w_up[1:]) / 2 * np.diff(inputs.t_imu))])
     # the mean angle over each chord; what a bias adds goes with the time
     way_of = np.concatenate([[0.0], np.cumsum((angle[:-1] + angle[1:]) / 2

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.nav.angles import wrap, yaw_from_heading
+from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
 
@@ -103,7 +103,7 @@ def _sent(inputs, t, q, variance, offset, config, origin, C_ib, source):
     if sigma > HEADING_LIMIT:
         return Heading()
     C = matrix_from_quat(q) @ C_ib
-    yaw = np.arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + _convergence(inputs, t, origin)
+    yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + _convergence(inputs, t, origin)
     return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source)
 
 
@@ -115,4 +115,4 @@ def _from_place(inputs, t, origin):
 
 def _convergence(inputs, t, origin):
     C_np = _from_place(inputs, t, origin)
-    return np.arctan2(C_np[:, 1, 0], C_np[:, 0, 0])
+    return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

@@ -22,7 +22,7 @@ from odocal_ros.calib.smoother.state import (
     V,
     YAW,
 )
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.nav.rotations import skew
 
 LEAST_SPEED, LEAST_TURN = 0.005, 5e-4     # m/s, rad: no receiver is better
@@ -111,7 +111,7 @@ def _heading(sent, state, points):
     C = state.C_nb[k]
     x = (C @ points.R)[:, :, 0]
     level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
-    raw = wrap(sent.yaw - np.arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
+    raw = wrap(sent.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
     turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
                       np.ones(len(k))], -1)
     J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.planar import coefficients, PlanarLeg, squared_distances
-from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.angles import arctan2, wrap
 
 # sigmas of an axis at which a fix's pull stops growing: one in seven white fixes is beyond
 HUBER = 2.0
@@ -103,6 +103,6 @@ def course_differences(leg: PlanarLeg, sets):
     mix = coefficients(sets)[:, :3]
     east, north = (rows[:3, b] - rows[:3, a] for rows in leg.basis)
     way = leg.fixes_n[b] - leg.fixes_n[a]
-    course = np.arctan2(way[:, 1], way[:, 0])
-    reckoned = np.arctan2(mix @ north, mix @ east)
+    course = arctan2(way[:, 1], way[:, 0])
+    reckoned = arctan2(mix @ north, mix @ east)
     return wrap(reckoned + np.asarray(sets, dtype=float)[:, 2:] - course)

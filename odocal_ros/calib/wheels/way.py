@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.wheels.leg import wheel_factors
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
 
@@ -94,7 +95,7 @@ class Way:
     def _by_gyro_scale(self, track, since):
         """Return -(turn since the gyro counts) / (1 + g)^2 by epoch: drift is g (1 + g) it."""
         x = matrix_from_quat(track.q_nb) @ self.d_b
-        yaw = np.unwrap(np.arctan2(x[:, 1], x[:, 0]))
+        yaw = np.unwrap(arctan2(x[:, 1], x[:, 0]))
         return -(yaw - np.interp(since, track.t, yaw)) / (1 + self.state.gyro_scale)**2
 
     def _yaw(self):
@@ -103,7 +104,7 @@ class Way:
         if self.turned:
             x = turned(self.phi(self.t), x)
         level = np.hypot(x[:, 0], x[:, 1])
-        yaw = np.unwrap(np.arctan2(x[:, 1], x[:, 0]))
+        yaw = np.unwrap(arctan2(x[:, 1], x[:, 0]))
         # the wheels turn about the vehicle's own upright: on a slope less than the heading does
         turn = np.diff(yaw) * (level[:-1] + level[1:]) / 2
         return np.append(0.0, np.cumsum(turn))
