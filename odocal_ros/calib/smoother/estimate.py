@@ -20,6 +20,7 @@ from odocal_ros.calib.smoother.state import M, PITCH, State, YAW
 
 MOST = 25            # iterations
 SETTLED = 0.03       # sigmas that the constants may still move
+NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
 SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant is held to that
 # rad: an angle known no better drifts where the cost is flat, and is refused (lever arms: m)
 UNKNOWN = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
@@ -29,6 +30,7 @@ QUIET = 0.01         # relative change of the sigmas of scale and mounting, the 
 SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 INERTIA = 4.0
 HASTE = 1.6          # power on the steps of levels: the fixed point is slow where a noise is small
+CALM, PART = 0.6, 0.5    # power and share of a step later on: what still moves goes to and fro
 ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
 OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
 GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
@@ -87,23 +89,27 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        state = state.moved(solved.step, solved.step_border)
+        settled = bool(move < SETTLED and (frozen or change < QUIET and count > tails + 2))
+        part = PART if count > LAST_TAILS and not settled else 1.0
+        state = state.moved(part * solved.step, part * solved.step_border)
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved)
-        settled = bool(move < SETTLED and (frozen or change < QUIET and count > tails + 2))
         if settled or count == most:
+            still = np.abs(solved.step_border / sigma)[:3].max()
+            settled = settled or bool(max(still, change) < NEARLY)
             break
         if not frozen:
             near = solved.neighbours()
-            levels = update(weighted, near, levels, problem)
+            haste = HASTE if count <= LAST_TAILS else CALM
+            levels = update(weighted, near, levels, problem, haste)
             if tails <= count <= LAST_TAILS:
                 spread = slips(weighted, near, spread)
                 priors = beliefs(problem.priors, priors, state, solved, near)
     return Fit(state, levels, priors, spread, weighted, solved, settled, count)
 
 
-def update(weighted, neighbours, levels, problem) -> Levels:
+def update(weighted, neighbours, levels, problem, haste=HASTE) -> Levels:
     """Return levels moved towards the maximum of the restricted likelihood."""
     new = {}
     for name, (quadratic, expected) in components(weighted, neighbours).items():
@@ -112,7 +118,7 @@ def update(weighted, neighbours, levels, problem) -> Levels:
         pull = belief * (problem.first_levels[name] / level if name in SENSOR else 1.0)
         factor = (quadratic + pull) / (max(expected, 0.0) + belief)
         if name in ROAD_NOISE or name in SENSOR:
-            factor = factor**HASTE
+            factor = factor**haste
         new[name] = max(level * float(np.clip(factor, 0.03, 30.0)), problem.least[name])
     return levels.but(**new)
 

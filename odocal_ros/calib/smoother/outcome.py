@@ -7,6 +7,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.shares import shares
+from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
     BG,
@@ -28,6 +29,7 @@ INFORMED = 0.5                  # posterior over prior: above it the data say li
 BACKWARDS = np.deg2rad(135.0)   # of yaw from nominal: no mounting, but the other way round
 FAR = np.deg2rad(20.0)
 TRACK_ROWS = 5000
+AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
@@ -52,6 +54,8 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     """Return what a settled fit says of the leg."""
     near = fit.solved.neighbours()
     widen, reasons = mismatch(problem, fit, near, config)
+    slips = find_slips(fit, near)
+    reasons += slip_reasons(fit, slips)
     sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
     state, c = fit.state, fit.state.constants
     K, yaw, pitch = state.scale, float(wrap(c[YAW])), float(c[PITCH])
@@ -80,15 +84,29 @@ def outcome(leg, problem, fit, config) -> MethodResult:
         ratio[name] = float(bias_sigma[i] / problem.priors.gyro_bias[i])
         if ratio[name] < INFORMED:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
-    unsaid = [f'{name} {r:.2f}' for name, r in ratio.items()
-              if name in found and found[name].value is None]
+    unsaid = [name for name in ratio if name in found and found[name].value is None]
     if unsaid:
-        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'the drive adds little to what is '
-                              'believed of these (sigma after over before): ' + ', '.join(unsaid)))
+        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'this drive does not tell '
+                              f'{in_words(unsaid)}; what the settings say of it is kept'))
     reasons += judge(found, leg.nominal_scale, config)
     sources = [_widened(s, widen) for s in shares(fit, near)]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
-                        _details(leg, problem, fit, sources, ratio, widen, sigma))
+                        _details(leg, problem, fit, sources, ratio, widen, sigma)
+                        | {'slips': [vars(s) for s in slips]})
+
+
+def in_words(names):
+    """Return names of estimates as people say them, axes of one thing together."""
+    words: dict[str, list[str]] = {}
+    for name in names:
+        stem, _, axis = name.rpartition('_')
+        if axis not in AXES:
+            stem, axis = name, ''
+        words.setdefault(stem.replace('gnss', 'fix').replace('_', ' '), []).append(
+            AXES.get(axis, ''))
+    said = [f'the {word}' + (f' ({", ".join(axes)})' if 0 < len(axes) < 3 and axes[0] else '')
+            for word, axes in words.items()]
+    return said[0] if len(said) == 1 else f'{", ".join(said[:-1])} and {said[-1]}'
 
 
 def _widened(source, widen):

@@ -1,0 +1,68 @@
+"""Where a wheel turned more, or less, than the vehicle moved: what the odometer's noise shows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.smoother.components import road_noise
+from odocal_ros.calib.smoother.noise import INTERVAL
+from odocal_ros.reasons import Code, Reason
+
+FAR_OUT = 1.5           # factor on the variance of an interval from which it is a slip
+LEAST = 0.05            # m that are worth a word
+NOISY = 4.0             # times the usual noise of as long a time, the same
+TOGETHER = 2            # intervals between slips of one run
+HARD_NOISE = 0.006      # m/sqrt(s) when speeding up or braking, which no wheel without slip has
+HARDER = 3.0            # times that of even driving, the same
+SHOWN = 3               # runs told in the sentence
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A run of slip: s since the start mark, s, m the wheel turned beyond the ground."""
+
+    t: float
+    duration: float
+    metres: float
+
+
+def along(fit, neighbours):
+    """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
+    w = fit.weighted
+    own = [INTERVAL.index('along'), INTERVAL.index('along_hard')]
+    estimate, _ = road_noise(w, neighbours)
+    pick = np.isin(w.eq.noise.component, own)
+    root = np.sqrt([w.levels[INTERVAL[i]] for i in w.eq.noise.component[pick]])
+    size = np.linalg.norm(w.eq.noise.columns[:, -3:, pick] * root, axis=1).sum(axis=1)
+    return -estimate[:, 0] * size
+
+
+def find_slips(fit, neighbours) -> tuple[Slip, ...]:
+    """Return the runs of intervals that lie far out along, largest first."""
+    turned, t = along(fit, neighbours), fit.state.t
+    noise = NOISY * float(np.sqrt(fit.levels['along']))
+    far = np.flatnonzero((fit.spread[:, 0] > FAR_OUT) | (np.abs(turned) > max(LEAST, noise)))
+    if not len(far):
+        return ()
+    runs = np.split(far, np.flatnonzero(np.diff(far) > TOGETHER) + 1)
+    slips = [Slip(float(t[run[0]]), float(t[run[-1] + 1] - t[run[0]]), float(turned[run].sum()))
+             for run in runs]
+    return tuple(sorted((s for s in slips if abs(s.metres)
+                         >= max(LEAST, noise * np.sqrt(s.duration))),
+                        key=lambda s: -abs(s.metres)))
+
+
+def slip_reasons(fit, slips):
+    """Say where the wheels slipped and how much, one by one or whenever the speed changes."""
+    level = fit.levels.roots()
+    said = []
+    if slips:
+        one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)' for s in slips[:SHOWN]]
+        more = f' and {len(slips) - SHOWN} more' if len(slips) > SHOWN else ''
+        said.append('the wheel turned more (+) or less (-) than the vehicle moved: '
+                    + ', '.join(one) + more)
+    if level['along_hard'] > max(HARD_NOISE, HARDER * level['along']):
+        said.append('it slips when the speed changes: about '
+                    f'{1e3 * level["along_hard"]:.0f} mm in each second of speeding up or '
+                    f'braking, {1e3 * level["along"]:.1f} mm in even driving')
+    return [Reason(Code.WHEEL_SLIP, '; '.join(said))] if said else []

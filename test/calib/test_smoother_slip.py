@@ -1,0 +1,72 @@
+"""Slip of a wheel in the smoother: said, where and how much, and held by the sigma."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.outcome import in_words
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.reasons import Code
+
+SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
+
+
+def slipping(leg, begin, length, share):
+    """Return a leg whose wheel turns more by a share for some seconds, and by how much, m."""
+    t, s = leg.travel.t, leg.travel.s
+    spun = np.cumsum(np.diff(s, prepend=s[0]) * ((t >= begin) & (t < begin + length)) * share)
+    travel = Travel(t, np.floor(s + spun + 0.5), leg.travel.quantum)
+    return replace(leg, travel=travel), spun[-1]
+
+
+def said(method):
+    return ' '.join(r.text for r in method.reasons if r.code is Code.WHEEL_SLIP)
+
+
+def off(drive, method):
+    scale = method.estimates['scale_factor']
+    return abs(scale.value - drive.truth.scale) / scale.sigma
+
+
+@pytest.mark.parametrize(('noise', 'begin', 'length', 'share'), [
+    ('white', 100.0, 3.0, 0.1), ('white', 100.0, 10.0, 0.05), ('rtk', 60.0, 10.0, 0.1),
+    ('rtk', 100.0, 10.0, 0.3)])
+def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share):
+    drive, config, leg = made(**SHORT, fix_noise=noise)
+    leg, pulses = slipping(leg, begin, length, share)
+    method = smooth(leg, config)
+    assert off(drive, method) < 3.3
+    slips = method.details['slips']
+    metres = sum(s['metres'] for s in slips)
+    # intervals of a second that slip in part are not all told: nine tenths, and the accelerometer
+    # knows a way of 10 s to some decimetres
+    assert metres == pytest.approx(pulses * drive.truth.scale, rel=0.25, abs=0.3)
+    assert begin - 2.0 <= slips[0]['t'] <= begin + length
+    assert f'{slips[0]["metres"]:+.2f} m at t = {slips[0]["t"]:.0f} s' in said(method)
+
+
+@pytest.mark.parametrize('noise', ['white', 'rtk'])
+def test_slip_at_starts_is_said(noise):
+    drive, config, leg = made(**SHORT, fix_noise=noise, start_slip=0.005)
+    method = smooth(leg, config)
+    assert 'slips when the speed changes' in said(method)
+    assert off(drive, method) < 3.3
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'fix_noise': 'rtk'}, {'fix_noise': 'correlated'}, {'odometer_delay': 0.05},
+    {'odometer': 'speed', 'speed_noise': 0.05, 'odometer_rate': 10.0, 'sway': 0.05,
+     'fix_noise': 'rtk'}], ids=str)
+def test_wheels_that_hold_are_not_blamed(options):
+    _, config, leg = made(**SHORT, **options)
+    assert not said(smooth(leg, config))
+
+
+def test_names_of_parameters_in_words():
+    arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
+    assert in_words(arm) == 'the antenna lever arm'
+    assert in_words(['odometer_lever_arm_z', 'gnss_delay', *arm]) == (
+        'the odometer lever arm (up), the fix delay and the antenna lever arm')
