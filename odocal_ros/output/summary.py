@@ -116,7 +116,10 @@ def _values(calibration):
         estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', *ANGLES, *BIASES) \
                 and estimate.value is not None:
-            lines.append(_line(name.replace('_', ' '), _with_unit(estimate)))
+            text = _with_unit(estimate)
+            if name == 'heading_error':
+                text = f'{_angle_text(estimate)}   heading and (reversed) mounting together'
+            lines.append(_line(name.replace('_', ' '), text))
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
@@ -143,7 +146,7 @@ def _mostly(calibration, name):
 
 
 def _line(label, text):
-    return f'  {label:<20}{text}'.rstrip()
+    return f'  {label:<19} {text}'.rstrip()
 
 
 def _scale_text(scale):

@@ -114,3 +114,13 @@ def test_legs_pool_their_checks_over_fixes():
     assert (both.max, both.end, both.percent_of_distance) == (5.0, 3.0, 0.1)
     assert overall([(None, 5)]) is None
     assert overall([]) is None
+
+
+def test_the_heading_error_of_wheels_is_said_to_hold_the_mounting(good):
+    more = {'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels'),
+            'odometer_lever_arm_x': Estimate(0.02, 0.01, 'm', 'smoother')}
+    text = screen(replace(good, estimates=good.estimates | more))
+    (line,) = (line for line in text.splitlines() if 'heading error' in line)
+    assert '-0.957 ± 0.029 deg' in line
+    assert line.endswith('heading and (reversed) mounting together')
+    assert 'odometer lever arm x 0.02' in text       # a long name keeps its distance
