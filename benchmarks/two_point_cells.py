@@ -100,9 +100,11 @@ class Cell:
                     'odometer.nominal_scale': self.options.nominal_scale}
         if self.options.imu_grade == 'navigation':
             return with_settings(Config(), settings | {
+                'method': 'two_point',
                 'alignment.heading_source': 'gyrocompass'}), None
         error = HEADING_SIGMA * stream(seed, 'known heading').standard_normal()
         return with_settings(Config(), settings | {
+                'method': 'two_point',
             'alignment.heading_source': 'fixed',
             'alignment.heading': float(self.truth.heading + error),
             'alignment.heading_sigma': HEADING_SIGMA}), float(error)

@@ -44,6 +44,7 @@ def drive(options, seed):
     made = simulate(SimOptions(seed=seed, **RATES, **options))
     heading = made.truth.heading + HEADING_SIGMA * np.random.default_rng(seed).standard_normal()
     config = with_settings(Config(), {
+        'method': 'two_point',
         'odometer.nominal_scale': made.options.nominal_scale,
         'imu.grade': made.options.imu_grade, 'alignment.heading': float(heading),
         'alignment.heading_sigma': HEADING_SIGMA, 'verdict.max_yaw_sigma': 1.0})

@@ -222,8 +222,10 @@ class UpdaterConfig:
 class Config:
     """All settings of the calibrator; see the module for how they are named."""
 
-    method: str = setting('auto', choices=('auto', 'two_point', 'wheels', 'all'), about=(
-        'Method whose figures are the result; auto: the best that the leg supports.'))
+    method: str = setting('auto', choices=(
+        'auto', 'two_point', 'wheels', 'smoother', 'all'), about=(
+        'Method whose figures are the result; auto: wheels with two counters, else two_point; '
+        'all: each value of the first of smoother, wheels and two_point that has it.'))
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

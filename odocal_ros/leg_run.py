@@ -21,6 +21,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
+from odocal_ros.smoother_run import smoother
 from odocal_ros.two_point_run import two_point
 from odocal_ros.wheels_run import wheels
 
@@ -34,7 +35,7 @@ WORTH = 0.01            # relative sigma up to which a scale gives the distance
 
 
 # in order of running; two_point, the operator's own marks, is always computed and shown
-METHODS = {'two_point': two_point, 'wheels': wheels}
+METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -108,11 +109,13 @@ class LegRun:
         return [name for name in METHODS if name in wanted
                 and not (name == 'wheels' and one_counter)]
 
-    def path(self, f):
+    def path(self, f, track=None):
         """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
+        track = self.track if track is None else track
+
         def at(t):
-            path = self.track.at(t) @ f
-            return path + self.track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+            path = track.at(t) @ f
+            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
         return at
 
     def mark(self, t, path, name=''):

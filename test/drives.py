@@ -19,9 +19,14 @@ def drive(**options):
 
 
 def settings(made, heading_sigma=1e-3, **changes):
-    """Return the settings of a drive with its true heading, and changes as group__name."""
+    """
+    Return the settings of a drive with its true heading, and changes as group__name.
+
+    The method is the quick one, two_point, unless another is asked for.
+    """
     o = made.options
     known = {
+        'method': 'two_point',
         'odometer.nominal_scale': float(o.nominal_scale),
         'odometer.lever_arm': tuple(map(float, o.odometer_lever_arm)),
         'gnss.lever_arm': tuple(map(float, o.antenna_lever_arm)),

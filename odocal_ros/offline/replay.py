@@ -9,7 +9,6 @@ import sys
 from odocal_ros.errors import BadUsage
 
 HELP = 'calibrate from recorded bags'
-LATER = ('smoother',)
 
 
 class LegDropped(BadUsage):
@@ -88,9 +87,6 @@ def _config(args, journal=None):
     if args.config:
         config = with_settings(config, read_config_file(Path(args.config)))
     config = with_settings(config, dict(parse_set(text) for text in args.settings))
-    if args.method in LATER:
-        raise BadUsage(f'--method {args.method}: not in this version; use auto, two_point or '
-                       'wheels')
     return with_settings(config, {'method': args.method}) if args.method else config
 
 

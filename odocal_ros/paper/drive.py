@@ -80,6 +80,7 @@ class PaperDrive:
             scenario='paper', imu_grade='perfect', fix_sigma=0.0, scale=PULSE))
         truth, options = self.drive.truth, self.drive.options
         self.config: Config = with_settings(Config(), {
+            'method': 'two_point',
             'odometer.nominal_scale': options.nominal_scale, 'imu.grade': 'navigation'})
         self.start = (truth.start_ns - options.start_ns) * 1e-9     # s, end of the standstill
         state = self.drive.motion.at(np.array([self.start]))

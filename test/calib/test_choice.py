@@ -9,10 +9,11 @@ from odocal_ros.calib.agreement import disagreements, LOOSE
 from odocal_ros.calib.choice import choose, deciding, worth_saying
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.combination import combine
-from odocal_ros.config import Config
+from odocal_ros.config import Config, with_settings
 from odocal_ros.reasons import Code, Reason, Verdict
 
 NO_YAW = Reason(Code.YAW_NOT_DETERMINED, 'no turns')
+ALL = with_settings(Config(), {'method': 'all'})
 REFUSED = Reason(Code.CHORD_TOO_SHORT, 'a loop')
 
 
@@ -32,7 +33,7 @@ def several(*methods):
 
 def test_the_first_in_order_gives_what_it_has():
     methods = several(method('two_point', 2.0, 0.01), method('smoother', 2.1, None, [NO_YAW]))
-    estimates, giving = choose(methods, 'auto')
+    estimates, giving = choose(methods, 'all')
     assert (estimates['scale_factor'].value, estimates['scale_factor'].method) == (2.1, 'smoother')
     assert estimates['yaw_mounting_angle'].method == 'two_point'
     assert giving == ('smoother', 'two_point')
@@ -61,14 +62,14 @@ def test_a_method_asked_for_is_the_only_one():
 
 @pytest.mark.parametrize(('asked', 'run'), [
     ('two_point', ('two_point',)), ('wheels', ('wheels', 'two_point')),
-    ('auto', ('smoother', 'wheels', 'two_point')), ('all', ('smoother', 'wheels', 'two_point'))])
+    ('auto', ('wheels', 'two_point')), ('all', ('smoother', 'wheels', 'two_point'))])
 def test_the_operators_own_marks_are_always_computed(asked, run):
     assert deciding(asked, shown=True) == run
 
 
 def test_reasons_about_a_value_that_another_method_gives_are_not_said():
-    both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'auto')
-    alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'auto')
+    both, _ = choose(several(method('smoother', 2.1, None, [NO_YAW]), method('two_point')), 'all')
+    alone, _ = choose(several(method('smoother', 2.1, None, [NO_YAW])), 'all')
     assert worth_saying([NO_YAW, REFUSED], 'smoother', both) == (REFUSED,)
     assert worth_saying([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
 
@@ -105,7 +106,7 @@ def leg(number, *methods, reasons=(), deciding=()):
 def test_a_leg_good_by_another_method_is_good_and_the_refusal_is_not_the_result():
     one = leg(1, method('two_point', None, None, [REFUSED]), method('smoother'))
     assert one.verdict is Verdict.ACCEPTED
-    whole = combine([one], Config())
+    whole = combine([one], ALL)
     assert whole.verdict is Verdict.ACCEPTED
     assert whole.estimates['scale_factor'].method == 'smoother'
     assert REFUSED not in whole.reasons
@@ -120,7 +121,7 @@ def test_a_leg_is_judged_by_the_methods_asked_for():
 def test_a_method_takes_only_the_legs_where_it_is_sound():
     legs = [leg(1, method('two_point', 2.0), method('smoother', 2.2)),
             leg(2, method('two_point', 2.0), method('smoother', None, None, [REFUSED]))]
-    whole = combine(legs, Config())
+    whole = combine(legs, ALL)
     assert whole.estimates['scale_factor'].value == 2.2
     assert whole.verdict is Verdict.CAUTION
     assert [r.text for r in whole.reasons] == ['leg 2: not used for smoother: a loop']

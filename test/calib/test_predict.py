@@ -27,7 +27,7 @@ DEG = math.degrees(1.0)
 
 def config(**changes):
     names = {'grade': 'imu.grade', 'correlation': 'gnss.correlation_time'}
-    base = {'imu.grade': 'navigation', 'gnss.correlation_time': 0.0,
+    base = {'method': 'two_point', 'imu.grade': 'navigation', 'gnss.correlation_time': 0.0,
             'alignment.heading_source': 'fixed', 'alignment.heading_sigma': HEADING}
     return with_settings(Config(), base | {names.get(k, k.replace('__', '.')): v
                                            for k, v in changes.items()})

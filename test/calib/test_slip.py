@@ -17,6 +17,7 @@ LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 def result(**options):
     drive = simulate(SimOptions(**LOW | options))
     config = with_settings(Config(), {
+        'method': 'two_point',
         'odometer.nominal_scale': drive.options.nominal_scale,
         'imu.grade': drive.options.imu_grade})
     return drive, calibrate(drive.leg(), config)

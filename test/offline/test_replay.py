@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from odocal_ros.bagio.write import drive_topics, write_bag
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.config import Config, with_settings
 from odocal_ros.config_file import parse_set
 from odocal_ros.leg import LegRecorder
@@ -80,7 +81,7 @@ def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, ca
     recorder.form = drive.form
     config = with_settings(Config(), dict(parse_set(s) for s in known(drive)[1::2]))
     result = calibrate(recorder.close(start, stop, config.leg.preroll), config)
-    for name, estimate in result.methods['two_point'].estimates.items():
+    for name, estimate in leg_estimates(result).items():
         assert told['result'][name]['value'] == estimate.value
         assert told['result'][name]['sigma'] == estimate.sigma
 

@@ -1,0 +1,47 @@
+"""The smoother as a member of the pipeline."""
+
+from drives import drive, settings
+import pytest
+
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.reasons import Verdict
+
+SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
+ASKED = {'method': 'smoother', 'heading_sigma': None}      # no heading from outside
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=240.0, imu_grade='industrial', seed=11)
+
+
+@pytest.fixture(scope='module')
+def held(made):
+    return calibrate(made.leg(), settings(made, **ASKED), holdout=True)
+
+
+def test_scale_yaw_and_pitch_come_without_a_heading(made, held):
+    found = held.methods['smoother'].estimates
+    for name, true in (('scale_factor', made.truth.scale), ('yaw_mounting_angle', made.truth.yaw),
+                       ('pitch_mounting_angle', made.truth.pitch)):
+        assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
+    assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
+
+
+def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made, held):
+    assert held.after.rms < held.before.rms / 4
+    whole = calibrate(made.leg(), settings(made, **ASKED))
+    assert whole.methods['smoother'].estimates['scale_factor'].value \
+        != held.methods['smoother'].estimates['scale_factor'].value
+
+
+def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held):
+    whole = combine([held], settings(made, **ASKED))
+    assert whole.estimates['yaw_mounting_angle'].method == 'smoother'
+    assert whole.verdict is Verdict.ACCEPTED
+    assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
+
+
+def test_auto_does_not_take_it(made):
+    leg = calibrate(made.leg(), settings(made, method='auto'))
+    assert set(leg.methods) == {'two_point'}
