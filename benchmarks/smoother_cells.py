@@ -3,7 +3,7 @@ Monte Carlo of the smoother: does the stated sigma hold, and how far is it from 
 
     python benchmarks/smoother_cells.py [--drives 40] [--jobs 2] [--cells TEXT ...] [--file F]
     python benchmarks/smoother_cells.py --stress [--drives 100]
-    python benchmarks/smoother_cells.py --special
+    python benchmarks/smoother_cells.py --special [--cells dull] [--cells starts]
 
 A cell is a kind of drive: scenario town, 600 s, one Imu grade, white fixes of 1.5 m or RTK ones of
 2 cm at 5 Hz; the heading is drawn and not told. Drive k of cell c has seed 50_000_000 + 100_000 c
@@ -180,7 +180,7 @@ def main():
     args = parser.parse_args()
     if args.special:
         from smoother_special import special
-        special(simulated, true_levels)
+        special(simulated, true_levels, args.drives, args.cells)
         return
     names = list(CELLS)[FIRST_STRESS:] if args.stress else list(CELLS)[:FIRST_STRESS]
     names = [n for n in names if not args.cells

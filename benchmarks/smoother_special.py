@@ -9,36 +9,50 @@ from smoother_legs import leg_of, truth
 from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.nav.dead_reckoning import forward_b
 
 FIRST_SEED = 55_000_000
 DULL = (({'scenario': 'straight', 'imu_grade': 'industrial'}, 'yaw bound of method.md 0.105 deg'),
+        ({'scenario': 'straight', 'imu_grade': 'industrial', 'sway': 0.05},
+         'sideways 0.05 m/s at 10 Hz, as method.md has it'),
         ({'scenario': 'paper', 'imu_grade': 'navigation', 'fix_noise': 'white'},
          'yaw bound of method.md 0.008 deg'))
-DULL_DRIVES, STARTS_DRIVES = 20, 3
+DULL_DRIVES, STARTS_DRIVES = 20, 3      # unless --drives says otherwise
 ROAD = 0.05**2 / 10      # m^2/s: 0.05 m/s at 10 Hz, as the bounds of method.md have it
 IN_MOTION = 5.0          # m/s at the start mark moved into the drive
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
-def special(simulated, true_levels):
-    """Print both tables; functions of smoother_cells.py."""
+def special(simulated, true_levels, drives, parts):
+    """Print both tables; functions of smoother_cells.py, drives of each kind (None: as above)."""
+    if not parts or 'dull' in parts:
+        _print_dull(simulated, true_levels, drives or DULL_DRIVES)
+    if not parts or 'starts' in parts:
+        _print_starts(simulated, drives or STARTS_DRIVES)
+
+
+def _print_dull(simulated, true_levels, drives):
     print('Sigma of the yaw against bounds at the truth, deg (levels of the simulation: wheels\n'
           'that never slide; and of method.md: 0.05 m/s sideways at 10 Hz)')
     for number, (options, promise) in enumerate(DULL):
-        _dull(simulated, true_levels, FIRST_SEED + 1000 * number, options, promise)
-    print('\nThe same leg from afar: change of scale, yaw, pitch in sigmas (asked: below 0.1)')
-    worst = {}
+        first = FIRST_SEED + 1000 * number
+        _dull(simulated, true_levels, range(first, first + drives), options, promise)
+
+
+def _print_starts(simulated, drives):
+    print('The same leg from afar: change of scale, yaw, pitch in sigmas (asked: below 0.1)')
     for number, grade in enumerate(('consumer', 'industrial', 'tactical')):
         for noise in ('white', 'rtk'):
-            for k in range(STARTS_DRIVES):
+            worst = {}
+            for k in range(drives):
                 _starts(simulated, FIRST_SEED + 10_000 * (number + 1) + k, grade, noise, worst)
-    for what, change in worst.items():
-        print(f'{what:50} worst {np.round(change, 3)}', flush=True)
+            for what, change in worst.items():
+                print(f'{what:68} worst {np.round(change, 3)}', flush=True)
 
 
-def _dull(simulated, true_levels, first, options, promise):
+def _dull(simulated, true_levels, seeds, options, promise):
     rows, refused = [], 0
-    for seed in range(first, first + DULL_DRIVES):
+    for seed in seeds:
         drive, config = simulated(seed, **options)
         leg = leg_of(drive.leg(), config)
         result = smooth(leg, config)
@@ -57,7 +71,8 @@ def _dull(simulated, true_levels, first, options, promise):
         print(f'{options["scenario"]}: all {refused} refused')
         return
     error, sigma, least, sliding, off, scale_sigma = np.array(rows).T
-    print(f'{options["scenario"]}, {options["imu_grade"]}, {len(rows)} drives, refused {refused}: '
+    kind = ', '.join(str(x) for x in options.values())
+    print(f'{kind}, {len(rows)} drives, refused {refused}: '
           f'stated {np.degrees(np.median(sigma)):.4f} ({np.degrees(sigma.min()):.4f} to '
           f'{np.degrees(sigma.max()):.4f}), bound {np.degrees(np.median(least)):.4f}, sliding '
           f'{np.degrees(np.median(sliding)):.4f}; {promise}\n'
@@ -78,8 +93,7 @@ def _starts(simulated, seed, grade, noise, worst):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])       # old b by the new
         turned = smooth(replace(leg, w_b=leg.w_b @ turn, f_b=leg.f_b @ turn), config)
-        _note(worst, f'Imu turned by {angle:g} deg, {grade} {noise}', usual, turned,
-              math.radians(angle))
+        _note(worst, f'Imu turned by {angle:g} deg, {grade} {noise}', usual, turned, turn)
     moving, state = _in_motion(drive, config)
     late = smooth(moving, config)
     problem = Problem.of(moving, config)
@@ -116,16 +130,17 @@ def _cut(leg, start):
                            for name in ('imu', 'odometer', 'fix')})
 
 
-def _note(worst, what, usual, other, turned=0.0):
-    change = []
-    for name in NAMES:
-        a, b = usual.estimates[name], other.estimates[name]
-        if b.value is None:
-            change.append(np.inf)
-            continue
-        off = b.value - a.value - (turned if name == NAMES[1] else 0.0)
-        change.append(off / a.sigma)
-    _keep(worst, what, np.array(change))
+def _note(worst, what, usual, other, turn=None):
+    """Keep the change from one result to another, of an Imu turned by C (old b by the new)."""
+    if other.estimates[NAMES[1]].value is None:
+        _keep(worst, what, np.full(3, np.inf))
+        return
+    values = [np.array([m.estimates[n].value for n in NAMES]) for m in (usual, other)]
+    if turn is not None:
+        # the forward axis in the turned frame, and the angles that it means there, roll 0
+        x, y, z = turn.T @ forward_b(*values[0][1:])
+        values[0][1:] = -math.asin(y), math.atan2(z, x)
+    _keep(worst, what, (values[1] - values[0]) / [usual.estimates[n].sigma for n in NAMES])
 
 
 def _keep(worst, what, change):
