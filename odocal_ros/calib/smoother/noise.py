@@ -24,7 +24,8 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 HARD = 0.5          # m/s^2 along: above it, a wheel may slip
 TURNING = 0.05      # rad/s: above it, a vehicle may slide sideways
-AT_REST = 1e-3      # m that an odometer at rest may err by in a second
+AT_REST = 1e-3      # m that an odometer at rest may err by in a second, at least
+FEWEST_RESTS = 5     # seconds to know that by
 SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
 GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
 GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
@@ -112,8 +113,17 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
         root = share * (where & ~rest) * np.sqrt(spread[:, axis])
         add(name, [(D, (axes[:, axis] * root[:, None])[:, :, None])], 1)
     extra = _extra(motion, leg)
-    extra[rest, D] += AT_REST**2
+    still = rest_noise(speed, rest)
+    extra[rest, D] += still
+    slow = ~rest & (speed < 1.0)
+    extra[slow, D] += still * (1 - speed[slow, None])
     return IntervalNoise(np.concatenate(parts, axis=2), np.array(component), extra)
+
+
+def rest_noise(speed, rest):
+    """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
+    measured = float((speed[rest]**2).mean()) if rest.sum() >= FEWEST_RESTS else 0.0
+    return max(measured, AT_REST**2)
 
 
 def hard_and_turning(motion):

@@ -1,0 +1,35 @@
+"""Noise levels the smoother finds are those of the simulation, at rest and in motion."""
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.noise import AT_REST, rest_noise
+
+SWAY = {'sway': 0.05, 'odometer': 'speed', 'odometer_rate': 10.0, 'speed_noise': 0.05}
+
+
+@pytest.mark.parametrize('noise', ['white', 'rtk'])
+def test_levels_of_a_noisy_speed_and_a_swaying_vehicle_are_found(noise):
+    _, config, leg = made(imu_grade='industrial', fix_noise=noise, duration=400.0, **SWAY)
+    result = smooth(leg, config)
+    level, scale = result.details['noise'], result.estimates['scale_factor'].value
+    # what a second's way errs by: the walk, and a reading's own error at both of its ends
+    along = np.hypot(level['along'], np.sqrt(2) * scale * level['travel'])
+    # 0.05 m/s white at 10 Hz: 0.0158 m/sqrt(s); 150 seconds of even driving tell it: 5 sigma of
+    # a standard deviation from so many are 29 %
+    for name, found in (('along', along), ('side', level['side']), ('up', level['up'])):
+        assert found == pytest.approx(0.05 / np.sqrt(10.0), rel=5 / np.sqrt(2 * 150)), name
+    # no interval but chance ones is taken for a slip: the edges of stops are none
+    assert result.details['residuals']['intervals_slipping'] <= 4
+
+
+def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
+    rng = np.random.default_rng(4)
+    way = np.concatenate([np.full(100, 9.0), 0.0158 * rng.standard_normal(100)])
+    rest = np.arange(200) >= 100
+    # 5 sigma of a variance from a hundred draws
+    assert rest_noise(way, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
+    assert rest_noise(way, rest & (np.arange(200) < 103)) == AT_REST**2
+    assert rest_noise(np.zeros(200), rest) == AT_REST**2
