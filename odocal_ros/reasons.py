@@ -96,6 +96,8 @@ class Code(Enum):
                                      'stretches at speed; the mean of both wheels is not touched.')
     TRACK_WIDTH_NOT_DETERMINED = NOTE, ('Drive turns with a net change of heading (a loop, a '
                                         'round about), or give odometer.track_width.')
+    TRACK_WIDTH_FAR_FROM_GIVEN = CAUTION, ('Measure the distance between the wheels again and set '
+                                           'odometer.track_width, or leave it 0.')
     WHEELS_SWAPPED = REJECT, 'Exchange odometer.left and odometer.right.'
     WHEEL_DEAD = REJECT, ('Check the sensor and the wiring of that wheel, or calibrate the other '
                           'alone: name one joint or index in odometer.field.')

@@ -119,6 +119,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'on a straight line only their mean is seen.',
         Code.TRACK_WIDTH_NOT_DETERMINED: 'The distance between the wheels shows in turns only, '
         'and the heading at the end is about that at the start.',
+        Code.TRACK_WIDTH_FAR_FROM_GIVEN: 'The turns of the wheels against the gyro make a track '
+        'width that is more than 6 % from the one given: one of the two is wrong, and what a '
+        'controller makes of turns with it.',
         Code.WHEELS_SWAPPED: 'In left turns the wheel named left goes farther. It is the outer '
         'one, the right one.',
         Code.WHEEL_DEAD: 'One wheel does not count, or sends nothing, while the other turns.',

@@ -135,6 +135,15 @@ def test_a_slip_of_one_wheel_is_named_once_and_counts_half_in_the_mean(made):
     assert whole.effects[0] @ whole.effects[0] > 0
 
 
+def test_a_track_width_given_wrong_is_said(made):
+    given = 1.1 * made.options.track_width
+    leg = calibrate(made.leg(), settings(made, odometer__track_width=given))
+    text = everything_said(leg)[Code.TRACK_WIDTH_FAR_FROM_GIVEN]
+    assert f'odometer.track_width says {given:.4g} m' in text
+    near = calibrate(made.leg(), settings(made, odometer__track_width=made.options.track_width))
+    assert Code.TRACK_WIDTH_FAR_FROM_GIVEN not in everything_said(near)
+
+
 def test_legs_of_two_wheels_combine(made, result):
     other = drive(**ROUTE, seed=8, start_ns=made.options.start_ns + 10**13)
     legs = [result, calibrate(other.leg(), settings(other))]
@@ -144,3 +153,4 @@ def test_legs_of_two_wheels_combine(made, result):
         assert min(e.value for e in alone) <= whole.estimates[name].value \
             <= max(e.value for e in alone)
         assert whole.estimates[name].sigma < max(e.sigma for e in alone)
+    assert whole.estimates['heading_error'].value is None      # each leg's own at its start

@@ -55,11 +55,17 @@ def combine_method(name, results) -> MethodResult:
 
 
 def _newest(results, estimates):
-    """Return what belongs to a leg alone (gyro bias) from the last leg that knows it."""
+    """
+    Return what belongs to a leg alone (gyro bias) from the last leg that knows it.
+
+    The heading error is each leg's own at its start: of several there is none.
+    """
     names = [n for n in results[0].estimates if n not in estimates and n != 'scale_ratio']
-    return {n: next((r.estimates[n] for r in reversed(results)
+    none = {n: Estimate(None, None, results[0].estimates[n].unit) for n in names
+            if n == 'heading_error'}
+    return none | {n: next((r.estimates[n] for r in reversed(results)
                      if r.estimates[n].value is not None), results[0].estimates[n])
-            for n in names}
+            for n in names if n not in none}
 
 
 def _details(sources, parameters, estimates):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.two_point import PITCH_PRIOR
+from odocal_ros.calib.wheels.beliefs import WIDTH_SIGMA
 from odocal_ros.calib.wheels.model import PARAMETERS
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.nav.angles import wrap
@@ -75,10 +76,18 @@ def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ..
     width = solution.state.width
     told = solution.width_told and sigma < WIDTH_SHARE * width
     if told or given:
-        return told and (not given or sigma < BETTER * 0.02 * given), ()
+        return told and (not given or sigma < BETTER * WIDTH_SIGMA * given), ()
     away = solution.eq.yaw
     return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the heading ranges over '
                           f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
+
+
+def judge_width(width, sigma, given) -> tuple[Reason, ...]:
+    """Return what is to be said of a track width told by the drive beside the one given, m."""
+    if not given or abs(width - given) <= 3 * np.hypot(WIDTH_SIGMA * given, sigma):
+        return ()
+    return (Reason(Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'the drive tells a track width of '
+                   f'{width:.4f} +- {sigma:.4f} m, odometer.track_width says {given:.4g} m'),)
 
 
 def judge_heading(leg, heading, config) -> tuple[Reason, ...]:

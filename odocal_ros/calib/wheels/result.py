@@ -12,6 +12,7 @@ from odocal_ros.calib.wheels.observable import (
     HEADING_LIMIT,
     judge_fit,
     judge_heading,
+    judge_width,
     SCALE_LIMIT,
     separable,
     width_told,
@@ -25,7 +26,8 @@ from odocal_ros.reasons import Code, Reason
 
 PARAMETERS = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle',
               'track_width')       # rows of the sources: relative for scales, rad, m
-NOTE = 'heading_error is the error of the heading at the start plus the yaw mounting angle'
+NOTE = ('heading_error is how far the heading at the start must be turned, counter-clockwise: its '
+        'error less the yaw mounting angle, which a drive cannot tell apart')
 BENDS = 1.5e-6       # of a scale in town, by simulated fixes of 2 cm and better: a bend between
 # epochs of 40 ms is cut; counts and bins add to it
 LEARNED = 0.7        # of the alignment's sigma: a gyro bias that the leg tells better
@@ -72,6 +74,8 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
     yaw_known = Code.YAW_NOT_SEPARABLE not in {r.code for r in about_heading}
     sources = _sources(leg, solution)
     reasons += why + about_heading + judge_fit(solution)
+    if told:
+        reasons += judge_width(solution.state.width, sigma[WIDTH], config.odometer.track_width)
     total = np.sqrt(np.diag(total_covariance(sources)))
     K = solution.state.scale
     left, right = wheel_factors(K, solution.state.log_ratio)
