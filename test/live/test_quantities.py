@@ -198,7 +198,7 @@ def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, heard, said)
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
     monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'wheels', 'smoother'))
-    can = ability(CONFIG, Heard(NONE, 30.0)).can
+    can = ability(with_settings(CONFIG, {'method': 'smoother'}), Heard(NONE, 30.0)).can
     assert 'the yaw (by stops, starts and turns)' in can
     only = with_settings(CONFIG, {'method': 'two_point'})
     assert len(ability(only, Heard(NONE, 30.0)).cannot) == 1

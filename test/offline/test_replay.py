@@ -174,7 +174,7 @@ def test_config_file_then_set_then_default(drive, bag, tmp_path, capsys):
     (['--config', '/nowhere.yaml'], '/nowhere.yaml'),
     (['--leg', '900000:900001'], 'runs from 0'),
     (['--imu-topic', '/other'], '/other'),
-    (['--method', 'smoother'], 'smoother')])
+    (['--set', 'method=best'], 'method')])
 def test_wrong_requests_are_one_line_and_exit_2(argv, says, bag, tmp_path, capsys):
     assert replay(bag, '--output', tmp_path / 'out', *argv) == 2
     err = capsys.readouterr().err
