@@ -41,6 +41,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test' / 'calib'))
 
 import numpy as np
+from resumed import read_rows
 
 GRADES, NOISES = ('consumer', 'industrial', 'tactical'), ('white', 'rtk')
 TOWN = {'scenario': 'town', 'duration': 600.0}
@@ -201,7 +202,7 @@ def main():
 
 
 def _run(names, drives, jobs, path):
-    have = _read(path)
+    have = read_rows(path)
     with ProcessPoolExecutor(jobs) as pool, path.open('a') as out:
         for name in names:
             missing = [seed for seed in seeds_of(name, drives) if seed not in have]
@@ -215,18 +216,6 @@ def _run(names, drives, jobs, path):
                 print(f'{name}: {len(missing)} drives in {time.monotonic() - begin:.0f} s',
                       file=sys.stderr, flush=True)
     return have
-
-
-def _read(path) -> dict[int, dict]:
-    """Return rows by seed; a last line cut short by an interruption is done again."""
-    rows = {}
-    if path.exists():
-        text = path.read_text()
-        if text and not text.endswith('\n'):
-            text = text[:text.rfind('\n') + 1]
-            path.write_text(text)
-        rows = {row['seed']: row for row in map(json.loads, text.splitlines())}
-    return rows
 
 
 def _print_cell(name, rows, kind, whole=False):

@@ -28,6 +28,7 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')     # two processes, two cores
 
 import numpy as np
+from resumed import read_rows
 
 SCENARIOS, GRADES, NOISES = ('paper', 'straight', 'out_and_back'), ('navigation', 'tactical'), \
     ('white', 'correlated')
@@ -150,7 +151,7 @@ def main() -> None:
     parser.add_argument('--file', type=Path, default=Path('/tmp/two_point_cells.jsonl'))
     args = parser.parse_args()
     wanted = [c for c in range(len(CELLS)) if args.only in ' '.join(CELLS[c])]
-    have = _read(args.file)
+    have = read_rows(args.file)
     with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
         for number in wanted:
             first = FIRST_SEED + SEEDS_A_CELL * number
@@ -168,18 +169,6 @@ def main() -> None:
         first = FIRST_SEED + SEEDS_A_CELL * number
         _print_cell(' '.join(CELLS[number]),
                     [have[first + k] for k in range(args.drives) if first + k in have])
-
-
-def _read(path) -> dict[int, dict]:
-    """Return rows by seed; a last line cut short by an interruption is done again."""
-    rows = {}
-    if path.exists():
-        text = path.read_text()
-        if text and not text.endswith('\n'):
-            text = text[:text.rfind('\n') + 1]
-            path.write_text(text)
-        rows = {row['seed']: row for row in map(json.loads, text.splitlines())}
-    return rows
 
 
 def _print_cell(name, rows):

@@ -28,6 +28,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'calib'))
 
 import numpy as np
+from resumed import read_rows
 
 CELLS = {
     'town consumer white': {},
@@ -105,7 +106,7 @@ def main() -> None:
                         "whose name holds it, e.g. 'town'")
     parser.add_argument('--file', type=Path, default=Path('/tmp/wheels_monte_carlo.jsonl'))
     args = parser.parse_args()
-    have = _read(args.file)
+    have = read_rows(args.file)
     wanted = [i for i, name in enumerate(CELLS) if args.cell == name] or [
         i for i, name in enumerate(CELLS) if args.cell in name]
     with ProcessPoolExecutor(args.processes) as pool, args.file.open('a') as out:
@@ -127,18 +128,6 @@ def main() -> None:
         first = FIRST_SEED + SEEDS_A_CELL * number
         print_cell(list(CELLS)[number],
                    [have[first + k] for k in range(args.drives) if first + k in have])
-
-
-def _read(path) -> dict[int, dict]:
-    """Return rows by seed; a last line cut short by an interruption is done again."""
-    rows = {}
-    if path.exists():
-        text = path.read_text()
-        if text and not text.endswith('\n'):
-            text = text[:text.rfind('\n') + 1]
-            path.write_text(text)
-        rows = {row['seed']: row for row in map(json.loads, text.splitlines())}
-    return rows
 
 
 def print_cell(name, rows) -> None:
