@@ -7,6 +7,7 @@ joining files copies chunks and packs nothing again.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 import os
@@ -93,10 +94,17 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
         It cannot be written; nothing is left of it.
 
     """
+    with whole_file(path) as file:
+        return _fill(file, channels, chunks)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that is there, whole and safe on the disk, after the block, or not at all."""
     part = path.with_name(f'.{path.name}{PART}')
     try:
         with part.open('wb') as file:
-            size = _fill(file, channels, chunks)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         part.rename(path)
@@ -104,7 +112,6 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-    return size
 
 
 def sync_folder(folder: Path) -> None:

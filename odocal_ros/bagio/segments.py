@@ -9,10 +9,9 @@ go, and its name tells which they are: a reader that finds both takes the joined
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-import os
 from pathlib import Path
 
-from odocal_ros.bagio.chunks import Chunk, PART, read_chunks, sync_folder, write_file
+from odocal_ros.bagio.chunks import Chunk, read_chunks, whole_file, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
 from odocal_ros.bagio.recover import Channel
 
@@ -142,17 +141,8 @@ def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all, safe on the disk when this returns."""
-    part = path.with_name(f'.{path.name}{PART}')
-    try:
-        with part.open('w', encoding='utf-8') as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(path)
-        sync_folder(path.parent)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as file:
+        file.write(text.encode())
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
