@@ -5,25 +5,18 @@ ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and the READ
 made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
 """
 
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 import difflib
 import math
-from typing import Any
 
 from odocal_ros.errors import BadConfig
+from odocal_ros.setting import Setting, setting
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
 FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
            'report')
 NAN = math.nan
-TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
-
-
-def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False) -> Any:
-    """Declare a setting. ``ro``: fixed at start-up. NaN passes where the default is NaN."""
-    return field(default=default, metadata={
-        'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,58 +233,6 @@ class Config:
     publish: PublishConfig = PublishConfig()
     frames: FramesConfig = FramesConfig()
     diagnostic_updater: UpdaterConfig = UpdaterConfig()
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One setting: what a parameter descriptor, a YAML line and a table row are made from."""
-
-    name: str
-    default: Any
-    unit: str
-    low: float | None
-    high: float | None
-    choices: tuple
-    about: str
-    read_only: bool
-
-    @property
-    def kind(self) -> str:
-        """Return bool, int, float, str, floats or strs (lists)."""
-        if not isinstance(self.default, tuple):
-            return type(self.default).__name__
-        return 'strs' if self.choices else 'floats'
-
-    def checked(self, value):
-        """Return value as this setting's type, or raise BadConfig with what it wants."""
-        if isinstance(self.default, tuple):
-            if isinstance(value, str) or not hasattr(value, '__len__'):
-                raise BadConfig(f'{self.name}: {value!r} is not a list')
-            items = tuple(self._one(v, str if self.choices else float) for v in value)
-            lengths = (0, 4) if self.name.startswith('reference.') else (3,)
-            if not self.choices and len(items) not in lengths:
-                raise BadConfig(f'{self.name}: {len(items)} values, want {lengths[-1]}')
-            return items
-        return self._one(value, type(self.default))
-
-    def _one(self, value, kind):
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if type(value) is not kind:
-            raise BadConfig(f'{self.name}: {value!r} is not {TYPES[kind]}')
-        if self.choices and value not in self.choices:
-            raise BadConfig(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
-        if kind in (int, float):
-            unset = kind is float and math.isnan(value)
-            if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
-                raise BadConfig(f'{self.name}: NaN is not a value')
-            if not unset and not math.isfinite(value):
-                raise BadConfig(f'{self.name}: {value} is not finite')
-            below = self.low is not None and value < self.low
-            if below or self.high is not None and value > self.high:
-                raise BadConfig(f'{self.name} = {value:g}: want {self.low:g} to {self.high:g} '
-                                f'{self.unit}'.rstrip())
-        return value
 
 
 def _settings(owner, prefix=''):

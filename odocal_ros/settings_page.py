@@ -11,9 +11,10 @@ from pathlib import Path
 import sys
 import textwrap
 
-from odocal_ros.config import Setting, SETTINGS
+from odocal_ros.config import SETTINGS
 from odocal_ros.reasons import Code
 from odocal_ros.reasons_page import reasons_md, WEIGHTS
+from odocal_ros.setting import Setting
 
 ROOT = Path(__file__).resolve().parent.parent
 YAML_HEAD = """\

@@ -9,10 +9,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.config import Config, Setting, SETTINGS, with_settings
+from odocal_ros.config import Config, SETTINGS, with_settings
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Verdict
+from odocal_ros.setting import Setting
 
 SCALE = 'm/pulse, m/rad or 1'
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
