@@ -196,12 +196,16 @@ class LegRun:
 
     @cached_property
     def epochs(self):
-        """Return the attitude through the leg: t (m,) s, q_nb (m, 4)."""
-        inputs, a = self.inputs, self.alignment
-        pick = (inputs.t_imu >= a.t - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
+        """Return the attitude through the leg as aligned: t (m,) s, q_nb (m, 4)."""
+        return self.attitude_from(self.alignment.t, self.alignment.q_nb, self.alignment.gyro_bias)
+
+    def attitude_from(self, t_begin, q_nb, gyro_bias):
+        """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
+        inputs = self.inputs
+        pick = (inputs.t_imu >= t_begin - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
         t = inputs.t_imu[pick]
         rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-        return attitude(t, inputs.w_b[pick] - a.gyro_bias, a.q_nb,
+        return attitude(t, inputs.w_b[pick] - gyro_bias, q_nb,
                         earth_rate_n(self.origin.latitude), max(1, int(rate / EPOCH_RATE)))
 
     def _four_fifths(self):
