@@ -4,6 +4,7 @@ import re
 
 from bench import ROOT, wait_for
 import pytest
+from rclpy._rclpy_pybind11 import NodeNameNonExistentError
 import shown
 
 from odocal_ros.live.inputs import message_class
@@ -38,8 +39,15 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
     status = client.until(state='waiting')
     node = client.node
 
+    def of_node(what):
+        # a message may be here before discovery knows the name of who sent it
+        try:
+            return dict(getattr(node, f'get_{what}_names_and_types_by_node')('calibrator', '/'))
+        except NodeNameNonExistentError:
+            return {}
+
     def publishers():
-        return dict(node.get_publisher_names_and_types_by_node('calibrator', '/'))
+        return of_node('publisher')
     wait_for(lambda: set(shown.published()) <= set(publishers()), 'all publishers')
     for topic, kind in shown.published().items():
         assert publishers()[topic] == [kind]
@@ -56,7 +64,8 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
         'predicted_scale_sources_ppm', 'predicted_yaw_sources_deg'}
     array = client.arrays[-1].status[0]
     assert shown.status_names() == {(array.hardware_id, array.name)}
-    served = dict(node.get_service_names_and_types_by_node('calibrator', '/'))
+    wait_for(lambda: set(shown.services()) <= set(of_node('service')), 'all services')
+    served = of_node('service')
     for service in shown.services():
         assert served[service] == ['std_srvs/srv/Trigger']
 
