@@ -54,7 +54,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
     reasons += sanity
     if z_down:
-        inputs = _turned_over(inputs)
+        inputs = turned_over(inputs)
     if Code.IMU_AXES in {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
     return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
@@ -75,7 +75,7 @@ def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
     return missing
 
 
-def _turned_over(inputs: Inputs) -> Inputs:
+def turned_over(inputs: Inputs) -> Inputs:
     """Return inputs with a forward-right-down Imu read as what it is."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)
