@@ -51,9 +51,9 @@ class Problem:
     thin: dict               # of each, how many of its errors are one and the same
 
     @classmethod
-    def of(cls, leg, config):
-        """Return the problem of a leg."""
-        imu = ImuRows.of(leg, SPACING)
+    def of(cls, leg, config, imu=None):
+        """Return the problem of a leg; ``imu``: its rows, with keyframes of one's own."""
+        imu = ImuRows.of(leg, SPACING) if imu is None else imu
         t = imu.t[imu.key]
         still = standing(leg, t)
         use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
