@@ -92,26 +92,17 @@ class Column:
     """
     Values wanted of every message.
 
-    ``pick`` says at which paths they lie in a message, None if they are not there. ``mean``: one
-    value, the mean of all; else ``width`` of them.
+    ``pick`` says at which paths they lie in a message, None if they are not there.
     """
 
     dtype: type
     width: int
     pick: Callable[[View], Sequence[str] | None]
-    mean: bool = False
 
     def of_table(self, layout: cdr.Layout, table: cdr.Table) -> NDArray | None:
         """Return (n, width) values of messages of one layout, None if they are not there."""
         paths = self.pick(layout)
-        values = cdr.columns(layout, table, paths) if paths else None
-        if values is None or not self.mean:
-            return values
-        n = values.shape[1]
-        total: NDArray = values[:, 0].astype(self.dtype)
-        for k in range(1, n):
-            total = total + values[:, k]
-        return (total / n if n > 1 else total)[:, None]
+        return cdr.columns(layout, table, paths) if paths else None
 
     def of_message(self, view: MessageView) -> list | None:
         """Return the same values of one message."""
@@ -121,12 +112,7 @@ class Column:
         values = [view.value(path) for path in paths]
         if self.dtype is np.int64:
             values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
-        if not self.mean:
-            return values
-        total = values[0]
-        for value in values[1:]:
-            total = total + value
-        return [total / len(values) if len(values) > 1 else total]
+        return values
 
 
 def fixed(dtype: type, *paths: str) -> Column:

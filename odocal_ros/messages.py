@@ -76,6 +76,11 @@ class Reader:
         """Return what odometer values mean (certain once a message came); None for others."""
         return self._plan.form
 
+    @property
+    def wheels(self) -> tuple[str, ...]:
+        """Return the keys (joints, indices) that odometer values are taken from, left first."""
+        return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
+
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int],
              deserialize: Callable[[bytes], object]) -> Pairs:
         """
@@ -100,8 +105,11 @@ class Reader:
             The messages can never give what was asked: no such field, not a number.
 
         """
-        plan, n = self._plan, len(raws)
-        if not self._settled(raws, deserialize):
+        plan = self._plan
+        first = 0 if plan.columns else self._settled(raws, deserialize)
+        raws, received_ns = raws[first:], received_ns[first:]
+        n = len(raws)
+        if not n:
             return []
         out: list[NDArray] = [np.empty((n, column.width), column.dtype) for column in plan.columns]
         good = np.ones(n, bool)
@@ -122,18 +130,19 @@ class Reader:
             out, received = [values[good] for values in out], received[good]
         return plan.build(received, out) if len(received) else []
 
-    def _settled(self, raws, deserialize) -> bool:
-        """Let the plan see messages in order until it knows all; False: none told."""
-        for raw in raws:
+    def _settled(self, raws, deserialize) -> int:
+        """Let the plan see messages in order until it knows all; return how many told nothing."""
+        for k, raw in enumerate(raws):
             view: View | None = cdr.layout_of(self.msgtype, raw)
             if view is None:
                 view = self._view(raw, deserialize)
             if view is not None and self._plan.ready(view):
-                return True
+                self.unreadable += k
+                return k
             if view is not None:
                 self.trouble = self._plan.missing(view)
         self.unreadable += len(raws)
-        return False
+        return len(raws)
 
     def _view(self, raw, deserialize) -> MessageView | None:
         """Return one message deserialised, None if that fails."""

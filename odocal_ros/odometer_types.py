@@ -1,6 +1,7 @@
 """Odometer messages: where the value lies in each type, and what it means."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral
 
 import numpy as np
@@ -11,6 +12,7 @@ from odocal_ros.config import Config
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.message_fields import Column, MessageView, parts, STAMP, stamp_ns, View
 from odocal_ros.samples import OdometerForm, OdometerSamples
+from odocal_ros.wheel_choice import choose, sided
 
 JOINTS = 'sensor_msgs/msg/JointState'
 TWIST = 'geometry_msgs/msg/Twist'
@@ -20,8 +22,8 @@ DEFAULT_FIELD = {
     f'{TWIST}Stamped': 'twist.linear.x',
     f'{TWIST}WithCovarianceStamped': 'twist.twist.linear.x',
     'nav_msgs/msg/Odometry': 'twist.twist.linear.x',
-    'std_msgs/msg/Int32MultiArray': 'data[0]',
-    'std_msgs/msg/Int64MultiArray': 'data[0]',
+    'std_msgs/msg/Int32MultiArray': 'data',
+    'std_msgs/msg/Int64MultiArray': 'data',
 } | {f'std_msgs/msg/{name}': 'data' for name in (
     'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
 TYPES = tuple(DEFAULT_FIELD)
@@ -31,8 +33,9 @@ class OdometerPlan:
     """
     What to take from the messages of an odometer topic, and what it means.
 
-    Some of it only the first message tells (does a JointState hold positions? is a foreign field
-    a whole number?); ``ready`` is asked with messages in order until it says yes.
+    Some of it only the first message tells (does a JointState hold positions? which of its joints
+    are wheels? is a foreign field a whole number?); ``ready`` is asked with messages in order
+    until it says yes.
     """
 
     def __init__(self, slot: str, msgtype: str, config: Config) -> None:
@@ -44,13 +47,19 @@ class OdometerPlan:
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
+        self.unclear = ''        # why the last message did not tell which values are wheels
         self._check()
-        if self.known and self.field:
-            self._settle(self.field)
-        elif msgtype == JOINTS and self.odometer.quantity != 'auto':
-            self._settle('velocity' if self.odometer.quantity == 'rate' else 'position')
-        elif msgtype == JOINTS:
-            self.form = OdometerForm('cumulative', 0, 'm/rad')
+        self.choosing = self._listed() and not _base(self.field)[1] and not self.keys[0]
+        if msgtype == JOINTS and not self.field:
+            self.fields: tuple[str, ...] = {
+                'auto': ('position', 'velocity'), 'rate': ('velocity',)}.get(
+                self.odometer.quantity, ('position',))
+        else:
+            self.fields = (self.field,)
+        if self.known:
+            self.form = self._meaning(self.fields[0])
+            if len(self.fields) == 1 and not self.choosing:
+                self._settle(self.field or self.fields[0])
 
     def _check(self) -> None:
         """Refuse what can be seen to fail before any message came."""
@@ -69,27 +78,54 @@ class OdometerPlan:
         if self.field and base not in kinds:
             raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; it has '
                           f'{", ".join(kinds)}')
-        listed = self.msgtype == JOINTS or '[' in kinds[base]
-        if self.two and not listed:
+        if self.two and not self._listed():
             raise BadConfig(f'odometer.left and odometer.right: {self.msgtype} holds one value '
                             f"({self.field}); use 'topic' for wheels on two topics")
-        if listed and not key and not self.two and self.msgtype != JOINTS:
+        if self.odometer.field and self._listed() and not (
+                key or self.two or self.msgtype == JOINTS):
             raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value of it, '
                             f'{base}[0], or set odometer.left and odometer.right')
+
+    def _listed(self) -> bool:
+        """Return whether the field is a list of values, of which one or two are wanted."""
+        base, _ = _base(self.field)
+        return self.known and (not base or '[' in _kinds(self.msgtype)[base])
 
     def ready(self, view: View) -> bool:
         """Learn from a message what is still open; False: ask again with the next one."""
         if self.columns:
             return True
-        if self.msgtype == JOINTS:
-            for field in ('position', 'velocity'):
-                if self._pick(field, self.keys[0])(view):
-                    self._settle(field)
-                    return True
-            return False
-        assert isinstance(view, MessageView)
-        self._learn(view)
-        return True
+        if not self.known:
+            assert isinstance(view, MessageView)
+            self._learn(view)
+            return True
+        for field in self.fields:
+            if self.choosing and view.count(field):
+                self._choose(field, view)
+                return bool(self.columns)
+            if not self.choosing and self._pick(field, self.keys[0])(view):
+                self._settle(field)
+                return True
+        return False
+
+    def _choose(self, field: str, view: View) -> None:
+        """Find the wheels in a message, and settle; else note why they cannot be told."""
+        found = choose(view.names, view.count(field))
+        if isinstance(found, str):
+            self.unclear = found
+            return
+        own = {'odometer_right': 'right'}.get(
+            self.slot, 'left' if self.odometer.right == 'topic' else '')
+        if own:
+            key = sided(found, own)
+            if not key:
+                self.unclear = found.about
+                return
+            self.keys = (key,)
+        else:
+            self.keys, self.two = found.keys, len(found.keys) == 2
+        self._settle(field)
+        self.form = replace(self.form, sides=found.sides, chosen=found.about)
 
     def _learn(self, view: MessageView) -> None:
         """Settle a foreign type by its first message."""
@@ -109,9 +145,20 @@ class OdometerPlan:
 
     def _settle(self, field: str, kind: str = '') -> None:
         """Fix columns and form for a field; ``kind`` of foreign types comes from their values."""
+        self.form = self._meaning(field, kind)
+        whole = 'int' in (kind or self._kind(field))
+        dtype = np.int64 if whole else np.float64
+        self.columns = STAMP * self.stamped + tuple(
+            Column(dtype, 1, self._pick(field, key)) for key in self.keys)
+
+    def _kind(self, field: str) -> str:
+        return _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
+
+    def _meaning(self, field: str, kind: str = '') -> OdometerForm:
+        """Return what the values of a field mean."""
         bits = 0
         if self.known:
-            kind = _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
+            kind = self._kind(field)
             bits = int(kind.lstrip('uintfloa'))
         whole = 'int' in kind
         joint = self.msgtype == JOINTS and _base(field)[0] in ('position', 'velocity')
@@ -121,10 +168,7 @@ class OdometerPlan:
         modulus = (self.odometer.wrap or (2**bits if bits else 0)) * (
             whole and quantity == 'cumulative')
         unit = 'm/rad' if joint else 'm/pulse' if whole or quantity != 'rate' else '1'
-        self.form = OdometerForm(quantity, modulus, unit)
-        dtype = np.int64 if whole else np.float64
-        self.columns = STAMP * self.stamped + tuple(
-            Column(dtype, 1, self._pick(field, key), mean=not whole) for key in self.keys)
+        return OdometerForm(quantity, modulus, unit)
 
     def _path(self, field: str, key: str) -> str:
         """Return the path of a wheel's value: the list's element, or the key as a path."""
@@ -143,8 +187,6 @@ class OdometerPlan:
 
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)
-            if not key:
-                return tuple(f'{base}[{i}]' for i in range(n)) or None
             names = view.names
             at = names.index(key) if key in names else int(key) if key.isdigit() else n
             return (f'{base}[{at}]',) if at < n else None
@@ -152,6 +194,8 @@ class OdometerPlan:
 
     def missing(self, view: View) -> str:
         """Say why a message holds no value, for people."""
+        if self.unclear and not self.columns:
+            return self.unclear
         wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
         names = f', its names are {", ".join(view.names)}' if view.names else ''
         return f'no {wanted} in a {self.msgtype}{names}'

@@ -92,6 +92,8 @@ class Code(Enum):
                                     'their own.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     # left and right wheel
+    ODOMETER_CHOSEN = NOTE, ('Nothing, if that is right; else name them: odometer.left and '
+                             'odometer.right, or one value by odometer.field.')
     WHEELS_NOT_SEPARABLE = CAUTION, ('Use the gyro: give odometer.track_width, or drive straight '
                                      'stretches at speed; the mean of both wheels is not touched.')
     TRACK_WIDTH_NOT_DETERMINED = NOTE, ('Drive turns with a net change of heading (a loop, a '

@@ -115,6 +115,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'the ellipsoid, is not the one that was solved for: a check of the computation.',
     },
     'Left and right wheel': {
+        Code.ODOMETER_CHOSEN: 'A message holds several values (joints, or an array) and no '
+        'setting says which are the wheels. Joints were chosen by their names; of two values '
+        'whose sides nothing tells the mean is taken, and method wheels is not run.',
         Code.WHEELS_NOT_SEPARABLE: 'What was driven does not tell the left wheel from the right; '
         'on a straight line only their mean is seen.',
         Code.TRACK_WIDTH_NOT_DETERMINED: 'The distance between the wheels shows in turns only, '

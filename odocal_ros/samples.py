@@ -54,12 +54,15 @@ class OdometerForm:
     ``quantity`` is ``cumulative`` (a counter or angle), ``increment`` (since the row before) or
     ``rate`` (m/s, or rad/s of a joint). ``modulus`` is the counter's span in counts, 0 for values
     that do not roll over. ``scale_unit`` is the unit of the scale factor: ``m/pulse``, ``m/rad``
-    or ``1``.
+    or ``1``. ``sides`` is false where two values come and nothing tells which is the left wheel:
+    only their mean has a meaning. ``chosen`` says what the reader took of a message, unasked.
     """
 
     quantity: str
     modulus: int
     scale_unit: str
+    sides: bool = True
+    chosen: str = ''
 
 
 @dataclass(frozen=True, eq=False)

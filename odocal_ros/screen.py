@@ -5,7 +5,7 @@ Rows that cannot be used are dropped and counted, the rest is used. Times are se
 start mark; the mark is an Imu stamp, so the Imu's time offset moves the others against it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -96,6 +96,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     heading, t_heading = rows('heading')
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
+    found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
+              for form in (leg.form, leg.form_right) if form and form.chosen]
     fix, t_fix = rows('fix')
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
@@ -111,6 +113,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
     if travelled.right is not None:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
+    if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
+        travelled = replace(travelled, left=None, right=None)
     return Inputs(
         t_stop=t_stop, t_imu=t_imu, w_b=w_b, f_b=f_b,
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,

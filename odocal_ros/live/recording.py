@@ -102,8 +102,9 @@ class Recording:
             source.health.forget()
 
     def two_wheels(self) -> bool:
-        """Return whether the right wheel is heard by itself."""
-        return self.recorder.newest_ns('odometer_right') > 0
+        """Return whether the right wheel is heard by itself, and known to be the right one."""
+        form = self.inputs.form
+        return self.recorder.newest_ns('odometer_right') > 0 and (form is None or form.sides)
 
     def heard_before(self, preroll_s: float) -> Heard:
         """Return what came so far that says what a leg can tell."""

@@ -59,7 +59,8 @@ class Sketch:
         if form.quantity != 'rate':
             whole = np.issubdtype(self._cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in self._cells else True
-            form = replace(COUNTER if whole else FLOATS, scale_unit=form.scale_unit)
+            form = replace(COUNTER if whole else FLOATS, scale_unit=form.scale_unit,
+                           sides=form.sides)
         stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **self._cells)
 

@@ -3,6 +3,8 @@
 from datetime import datetime, UTC
 import math
 
+import numpy as np
+
 from odocal_ros.bagio import cdr
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.config import Config
@@ -13,6 +15,7 @@ from odocal_ros.odometer_types import TYPES as ODOMETERS
 from odocal_ros.offline import survey
 from odocal_ros.offline.inspection_drive import closed, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
+from odocal_ros.offline.wheel_survey import FIELDS as LISTS, in_words, suggested, Values
 from odocal_ros.reasons import Code, Reason
 
 
@@ -23,9 +26,12 @@ class _Tap:
 
     def __init__(self, reader: Reader) -> None:
         self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
+        self.values = Values(reader.msgtype) if reader.msgtype in LISTS else None
 
     def rows(self, raws, received_ns, deserialize) -> list:
         """Read and keep a block."""
+        if self.values:
+            self.values.rows(raws, received_ns)
         try:
             for slot, block in self.reader.rows(raws, received_ns, deserialize):
                 self.recorder.feed(slot, block)
@@ -54,9 +60,9 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         'topics': topics, 'mapping': mapping, 'mounting': None, 'drive': None,
         'standstills': [], 'legs': [], 'each_stop': [], 'straight': []}
     findings: list[Reason] = [note for note in bag.notes if isinstance(note, Reason)]
-    extra: list[str] = []
+    extra = _wheels(taps, mapping, config, topics)
     if {'imu', 'odometer'} <= mapping.keys():
-        extra = look(bag, _together(taps, mapping), config, found, findings)
+        extra += look(bag, _together(taps, mapping), config, found, findings)
     findings += _lacking(found, mapping, config)
     found['findings'] = [reason.as_dict() for reason in dict.fromkeys(findings)]
     found['open'] = left_open(bag.topics, config, overrides)
@@ -117,6 +123,33 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict:
     elif slot in ('imu', 'fix'):
         facts[slot] = (survey.imu if slot == 'imu' else survey.fixes)(rows)
     return facts
+
+
+def _wheels(taps, mapping, config, topics) -> list[str]:
+    """Tell how each joint or entry of an odometer moves; return the settings for the wheels."""
+    options: list[str] = []
+    open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
+    imu = taps[mapping['imu']].recorder.rows('imu') if mapping.get('imu') in taps else None
+    turn = None
+    if imu is not None and len(imu.stamp_ns):
+        up_i = np.nanmedian(imu.f_i, axis=0)
+        turn = imu.stamp_ns, imu.w_i @ (up_i / max(np.linalg.norm(up_i), 1e-9))
+    for facts in topics:
+        tap = taps.get(facts['name'])
+        if tap is None or tap.values is None:
+            continue
+        facts['values'] = tap.values.facts(turn)
+        if len(facts['values']) > 1:
+            facts['moves'] = in_words(facts['values'])
+        form = tap.reader.form
+        if form.chosen:
+            facts['chosen'] = form.chosen
+        if facts['name'] == mapping.get('odometer') and open_:
+            named = tap.reader.wheels if form.sides else ()
+            options += suggested(facts['values']) if len(named) < 2 else [
+                f'odometer.{side}={key}' for side, key in zip(('left', 'right'), named,
+                                                              strict=True)]
+    return options
 
 
 def _together(taps, mapping) -> LegRecorder:

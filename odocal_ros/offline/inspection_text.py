@@ -12,7 +12,8 @@ def text(found: dict) -> str:
     """Return one screen of text (more where there is more to say)."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
-    blocks += [_details(topic, roles) for topic in found['topics'] if 'timing' in topic]
+    blocks += [_details(topic, roles) for topic in found['topics']
+               if 'timing' in topic or 'moves' in topic]
     blocks += [_drive(found), _findings(found), _way_on(found)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
@@ -81,6 +82,9 @@ def _orientation(imu):
 
 
 def _of_odometer(topic):
+    if 'chosen' in topic:
+        yield topic['chosen']
+    yield from topic.get('moves', ())
     odometer = topic.get('odometer')
     if not odometer:
         return
@@ -117,7 +121,9 @@ def _of_fix(topic):
 
 
 def _of_timing(topic):
-    timing = topic['timing']
+    timing = topic.get('timing')
+    if not timing:
+        return
     if timing['headerless']:
         yield 'no header: stamped by its arrival (bag time)'
     elif abs(timing['header_to_bag']) > 0.5e-3:

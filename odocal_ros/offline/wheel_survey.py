@@ -1,0 +1,115 @@
+"""How each value of a list (joints, an array of counters) moves: which could be wheels, by data."""
+
+import numpy as np
+
+from odocal_ros.bagio import cdr
+from odocal_ros.odometer_types import JOINTS
+
+TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
+ALIKE = 0.3            # of the largest way: what a wheel of the same vehicle rolls at least
+CELL = 0.5             # s, in which sides are told by the gyro
+CLEAR = 0.5            # correlation with the gyro from which on a side is told
+FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('data',),
+          'std_msgs/msg/Int64MultiArray': ('data',)}
+
+
+class Values:
+    """Collects all values of a topic of lists, messages in order."""
+
+    def __init__(self, msgtype: str) -> None:
+        self.msgtype = msgtype
+        self._blocks: dict[tuple, list] = {}     # (field, keys) -> (stamps, values)
+
+    def rows(self, raws, received_ns) -> None:
+        """Take messages; those that are not read as columns are passed over."""
+        received = np.array(received_ns, np.int64)
+        for layout, rows, table in cdr.tables(self.msgtype, raws):
+            if layout is None:
+                continue
+            field = next((f for f in FIELDS[self.msgtype] if layout.count(f)), '')
+            if not field:
+                continue
+            n = layout.count(field)
+            keys = tuple(layout.names[:n]) or tuple(str(k) for k in range(n))
+            values = cdr.columns(layout, table, [f'{field}[{k}]' for k in range(len(keys))])
+            stamp = cdr.columns(layout, table, ['header.stamp.sec', 'header.stamp.nanosec'])
+            stamps = received[rows] if stamp is None else (
+                stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1])
+            self._blocks.setdefault((field, keys), []).append((stamps, np.array(values, float)))
+
+    def facts(self, imu=None) -> list[dict]:
+        """
+        Return what each value of the most frequent list does.
+
+        imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None where there is none.
+        """
+        if not self._blocks:
+            return []
+        (field, keys), blocks = max(self._blocks.items(),
+                                    key=lambda entry: sum(len(t) for t, _ in entry[1]))
+        stamp_ns = np.concatenate([t for t, _ in blocks])
+        value = np.concatenate([v for _, v in blocks])
+        keep = np.append(True, np.diff(stamp_ns) > 0) & np.isfinite(value).all(axis=1)
+        stamp_ns, value = stamp_ns[keep], value[keep]
+        if len(stamp_ns) < 3:
+            return []
+        t = (stamp_ns - stamp_ns[0]) * 1e-9
+        s = _travelled(t, value, field)
+        way, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
+        rolls = (span > (TURNS if self.msgtype == JOINTS else 0)) & (span > ALIKE * span.max())
+        sides = _sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
+        unit = 'rad' if self.msgtype == JOINTS else 'counts'
+        return [{'key': key, 'field': field, 'unit': unit, 'way': float(w), 'span': float(d),
+                 'rolls': bool(r), 'side': side}
+                for key, w, d, r, side in zip(keys, way, span, rolls, sides, strict=True)]
+
+
+def _travelled(t, value, field):
+    """Return running travels: (n, k)."""
+    if field == 'velocity':
+        mean = (value[1:] + value[:-1]) / 2 * np.diff(t)[:, None]
+        return np.concatenate([np.zeros((1, value.shape[1])), np.cumsum(mean, axis=0)])
+    if field == 'position':
+        inside = (np.abs(value) <= np.pi + 0.01).all(axis=0)
+        return np.where(inside, np.unwrap(value, axis=0), value)
+    return value
+
+
+def _sides(t, s, rolls, imu) -> list[str]:
+    """Return 'left' or 'right' of each wheel that the gyro tells: the outer one runs farther."""
+    k = len(rolls)
+    none = [''] * k
+    grid = np.arange(t[0], t[-1], CELL)
+    if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
+        return none
+    turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
+    turn = np.diff(np.interp(grid, imu[0], turned))
+    turn = turn - np.median(turn)
+    step = np.stack([np.diff(np.interp(grid, t, s[:, j])) for j in range(k)])
+    scale = np.abs(step).sum(axis=1, keepdims=True)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        step = step / scale
+    others = step[rolls].mean(axis=0)
+    for j in np.flatnonzero(rolls):
+        more = step[j] - others
+        power = float(np.sqrt((more @ more) * (turn @ turn)))
+        told = float(more @ turn) / power if power else 0.0
+        none[j] = 'right' if told > CLEAR else 'left' if told < -CLEAR else ''
+    return none
+
+
+def suggested(facts: list[dict]) -> tuple[str, ...]:
+    """Return the settings for the two wheels that data tell; none where they do not."""
+    sides = {side: [f['key'] for f in facts if f['side'] == side] for side in ('left', 'right')}
+    if [len(keys) for keys in sides.values()] != [1, 1]:
+        return ()
+    return tuple(f'odometer.{side}={keys[0]}' for side, keys in sides.items())
+
+
+def in_words(facts: list[dict]) -> list[str]:
+    """Return what each value does, for people, a line each."""
+    def one(f):
+        side = f', the {f["side"]} wheel by the gyro' if f['side'] else ''
+        kind = f'a wheel by its way{side}' if f['rolls'] else 'no wheel'
+        return f'{f["key"]} moves {f["way"]:.6g} {f["unit"]} in a range of {f["span"]:.6g}: {kind}'
+    return [one(f) for f in facts]

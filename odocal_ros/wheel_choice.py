@@ -1,0 +1,162 @@
+"""
+Which values of a message are the wheels, where no setting names them.
+
+Joints are told by their names: a wheel says so, a steering or an arm joint too. A left and a right
+one make a pair; of several axles the one that does not steer, else the rear one. What names do not
+tell is not guessed: two values of unknown sides give their mean, more give a refusal.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import re
+
+WORD = re.compile(r'[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+')
+WHEEL = ('wheel', 'whl', 'tire', 'tyre')
+MAY_BE = ('track', 'tread', 'drive', 'motor', 'traction', 'hub', 'encoder')
+STEER = ('steer', 'swivel', 'pivot', 'kingpin')
+NO_WHEEL = (*STEER, 'caster', 'castor', 'susp', 'shock', 'spring', 'damper', 'drop', 'brake',
+            'bogie', 'rocker', 'camber')
+# parts of a body or a machine: whole words, they occur in other words
+NO_TRAVEL = ('arm', 'shoulder', 'elbow', 'wrist', 'finger', 'gripper', 'hand', 'head', 'neck',
+             'torso', 'waist', 'hip', 'knee', 'ankle', 'leg', 'pan', 'tilt', 'lift', 'servo',
+             'camera', 'mast', 'boom', 'bucket', 'door', 'throttle', 'pedal', 'flipper', 'lidar',
+             'laser', 'hinge', 'slider', 'yaw', 'pitch', 'roll')
+REAR, FRONT = ('rear', 'back', 'aft'), ('front', 'fore')
+LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
+MOST_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The values taken (joint names or indices), left before right where ``sides`` is true."""
+
+    keys: tuple[str, ...]
+    sides: bool
+    about: str            # for people; '' where there was nothing to choose
+
+
+def choose(names: Sequence[str], count: int) -> Choice | str:
+    """
+    Return the wheels among the values of a message, or why they cannot be told.
+
+    names : of the values, as sent; may be fewer than there are, or none.   count : of values.
+    """
+    names = list(names[:count])
+    keys = names or [str(k) for k in range(count)]
+    if not keys:
+        return 'the list is empty'
+    if len(set(keys)) < len(keys):
+        return f'two joints of one name in {_listed(keys)}'
+    found = _by_name(names) if names else tuple(keys)
+    if len(keys) == 1:
+        if not found:
+            return f'its only joint, {keys[0]}, is no wheel by its name; odometer.field names it'
+        return Choice((keys[0],), True, '')
+    if isinstance(found, Choice):
+        return found
+    if len(found) == 1:
+        return Choice((found[0],), True, f'of the joints {_listed(keys)}: only {found[0]} is taken, '
+                      'by their names')
+    if len(found) == 2:
+        what = 'joints' if names else 'values'
+        first, second = found
+        return Choice((first, second), False, f'of the {what} {_listed(keys)}: the mean of {first} '
+                      f'and {second} is taken; which is left and which is right nothing tells: '
+                      'below, the left one is the first')
+    what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
+    return (f'which of {what} are the wheels is not clear: name two by odometer.left and '
+            f'odometer.right{"" if names else " (indices from 0)"}, or one by odometer.field; '
+            'odocal inspect shows how each of them moves')
+
+
+def sided(choice: Choice, side: str) -> str:
+    """Return the key of the wheel on one side, 'left' or 'right'; '' where that is not told."""
+    if len(choice.keys) == 1:
+        return choice.keys[0]
+    return choice.keys[side == 'right'] if choice.sides else ''
+
+
+def _by_name(names) -> Choice | tuple[str, ...]:
+    """Return the pair that names tell, else all that may be wheels."""
+    low = {name: name.lower() for name in names}
+    free = [n for n in names if not any(w in low[n] for w in NO_WHEEL)]
+    rolls = [n for n in free if any(w in low[n] for w in WHEEL)]
+    if not rolls:
+        free = [n for n in free if not set(_words(n)) & set(NO_TRAVEL)]
+        rolls = [n for n in free if any(w in low[n] for w in MAY_BE)] or free
+    places = {name: _place(name) for name in rolls}
+    left, right = ([n for n in rolls if places[n][0] == side] for side in ('left', 'right'))
+    pairs = [(a, b) for a in left for b in right if places[a][1] == places[b][1]]
+    if len(left) == len(right) == 1:
+        pairs = [(left[0], right[0])]
+    if len(pairs) != len({n for pair in pairs for n in pair}) / 2:
+        return tuple(rolls)                      # one wheel in two pairs
+    if len(pairs) == 1:
+        return Choice(pairs[0], True, _taken(names, pairs[0], ''))
+    steered = {_axle(_place(n)[1]) for n in names if any(w in low[n] for w in STEER)} - {''}
+    fixed = [p for p in pairs if steered and _axle(places[p[0]][1]) not in steered]
+    rear = [p for p in pairs if _axle(places[p[0]][1]) == 'rear']
+    for some, why in ((fixed, ', of the axle that does not steer'), (rear, ', of the rear axle')):
+        if len(some) == 1:
+            return Choice(some[0], True, _taken(names, some[0], why))
+    single = [n for n in rolls if _axle(places[n][1]) == 'rear']
+    return tuple(single) if len(rolls) == 2 and len(single) == 1 else tuple(rolls)
+
+
+def _taken(names, pair, why):
+    rest = '' if len(names) == 2 else f'of the joints {_listed(names)}: '
+    return f'{rest}{pair[0]} is taken for the left wheel and {pair[1]} for the right one, by ' \
+           f'their names{why}'
+
+
+def _words(name) -> list[str]:
+    """Return the words of a name, single letters beside each other as one: r_l is rl."""
+    words: list[str] = []
+    for word in (w.lower() for w in WORD.findall(name)):
+        if len(word) == 1 and words and len(words[-1]) == 1 and (words[-1] + word).isalpha():
+            words[-1] += word
+        else:
+            words.append(word)
+    return words
+
+
+def _place(name) -> tuple[str, tuple[str, ...]]:
+    """Return the side that a name tells ('' none or both), and what is left of the name."""
+    sides, rest = set(), []
+    for word in _words(name):
+        axle, side = _letters(word)
+        if side:
+            sides.add(side)
+            rest += [axle] * bool(axle)
+            continue
+        for side in ('left', 'right'):
+            if side in word and word != 'upright':
+                sides.add(side)
+                word = word.replace(side, '')
+        rest += [word] * bool(word)
+    return (sides.pop() if len(sides) == 1 else ''), tuple(rest)
+
+
+def _letters(word) -> tuple[str, str]:
+    """Return axle and side of a short hand: l, rh, fl, rr; '' where it is none."""
+    side = {'l': 'left', 'r': 'right'}
+    if word in side or word in ('lh', 'rh'):
+        return '', side[word[0]]
+    if len(word) != 2:
+        return '', ''
+    if word[1] in side and word[0] in LETTERS:
+        return LETTERS[word[0]], side[word[1]]
+    if word[0] in side and word[1] in LETTERS:
+        return LETTERS[word[1]], side[word[0]]
+    return '', ''
+
+
+def _axle(rest) -> str:
+    whole = ' '.join(rest)
+    return 'rear' if any(w in whole for w in REAR) else 'front' if any(
+        w in whole for w in FRONT) else ''
+
+
+def _listed(keys) -> str:
+    more = len(keys) - MOST_SHOWN
+    return ', '.join(keys[:MOST_SHOWN]) + (f' and {more} more' if more > 0 else '')

@@ -1,0 +1,76 @@
+"""odocal inspect on lists of values: which of them roll, and which side each is on."""
+
+import json
+
+import numpy as np
+import ros_bags
+from ros_bags import T0
+import ros_messages as make
+
+from odocal_ros.offline.cli import main
+
+RATE, WIDTH = 20, 1.6
+
+
+def drive(message, seconds=120):
+    """Return rows of a drive with turns; message(ns, i, left, right) gives an odometer."""
+    t = np.arange(0, seconds, 1 / RATE)
+    v = np.clip(t - 10, 0, 8) * (t < 100)
+    w = 0.2 * np.sin(t / 5) * (t > 20) * (t < 90)
+    left, right = (np.cumsum(v - s * w * WIDTH / 2) / RATE / 0.3 for s in (1, -1))
+    yaw = np.cumsum(w) / RATE
+    east, north = np.cumsum(v * np.cos(yaw)) / RATE, np.cumsum(v * np.sin(yaw)) / RATE
+    rows = []
+    for i, s in enumerate(t):
+        ns = T0 + round(s * 1e9)
+        rows.append(('/imu/data', ns, make.imu(ns, w=(0, 0, w[i]), f=(0, v[i] * w[i], 9.81))))
+        rows.append(('/wheels', ns + 1, message(ns, i, left[i], right[i])))
+        if i % 4 == 0:
+            rows.append(('/fix', ns + 2, make.fix(ns, 48 + np.rad2deg(north[i] / 6.38e6),
+                                                  11 + np.rad2deg(east[i] / 4.27e6), sigma=0.3)))
+    return rows
+
+
+def inspect(path, capsys):
+    assert main(['inspect', str(path), '--json']) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert main(['inspect', str(path)]) == 0
+    wheels = next(t for t in told['topics'] if t['name'] == '/wheels')
+    return told, wheels, capsys.readouterr().out
+
+
+def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
+    names = ['j1', 'j2', 'j3']
+    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
+        ns, names, [0.4 * np.sin(i / 30), right, left])))
+    told, wheels, text = inspect(path, capsys)
+    assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
+    assert [v['rolls'] for v in wheels['values']] == [False, True, True]
+    assert 'which of the joints j1, j2, j3 are the wheels is not clear' in wheels['trouble']
+    assert told['command'].endswith('--set odometer.left=j3 --set odometer.right=j2')
+    assert 'j1 moves' in text
+
+
+def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
+    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.whole_array(
+        [int(right * 50), int(left * 50)])))
+    told, wheels, text = inspect(path, capsys)
+    assert 'the mean of 0 and 1 is taken' in wheels['chosen']
+    options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
+    assert told['command'].split()[-4:] == options
+    assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json']) < 2
+    said = capsys.readouterr().out
+    assert 'wheels' in json.loads(said)['methods']
+    assert 'WHEELS_SWAPPED' not in said
+
+
+def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(tmp_path, capsys):
+    names = ['left_steer', 'left_wheel', 'right_steer', 'right_wheel']
+    path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
+        ns, names, velocity=[0.1, left, 0.1, right])))
+    told, wheels, _ = inspect(path, capsys)
+    assert 'left_wheel is taken for the left wheel and right_wheel for the right' in \
+        wheels['chosen']
+    assert told['command'].endswith(
+        '--set odometer.left=left_wheel --set odometer.right=right_wheel')
+    assert 'trouble' not in wheels
