@@ -217,8 +217,8 @@ class Config:
 
     method: str = setting('auto', choices=(
         'auto', 'two_point', 'wheels', 'smoother', 'all'), about=(
-        'Method whose figures are the result; auto: wheels with two counters, else two_point; '
-        'all: each value of the first of smoother, wheels and two_point that has it.'))
+        'Method whose figures are the result; auto: each value of the first of smoother, wheels '
+        '(with two counters) and two_point that has it; all: the same, wheels tried always.'))
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

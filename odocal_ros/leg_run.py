@@ -29,7 +29,7 @@ from odocal_ros.wheels_run import wheels
 ALIGNED = ('two_point', 'wheels')
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
-BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
+BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.REVERSING_UNSIGNED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
 
@@ -73,7 +73,7 @@ class LegRun:
         self.nominal = nominal_scale(config, inputs.scale_unit)
         self.rough = rough_scale(inputs.travel, inputs.t_fix, self.fixes_n,
                                  self.fix_sigma) or self.nominal
-        self.alignment, self.about_alignment = alignment, ()
+        self.alignment, self.about_alignment, self.of_ends = alignment, (), ()
         self.lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
 
     def result(self) -> LegResult:
@@ -84,9 +84,9 @@ class LegRun:
         methods, paths = {}, {}
         for name in self._asked():
             method, paths[name] = METHODS[name](self)
-            if name in ALIGNED:
-                method = replace(method, reasons=(*self.about_alignment, *method.reasons))
-            methods[name] = method
+            about = self.about_alignment if name in ALIGNED else ()
+            about += self.of_ends if name == 'two_point' else ()
+            methods[name] = replace(method, reasons=(*about, *method.reasons))
         self.reasons += disagreements(methods)
         estimates, _ = choose(methods, self.config.method)
         scale = estimates.get('scale_factor')
@@ -105,7 +105,7 @@ class LegRun:
     def _asked(self):
         """Return the methods to run: those asked for, of auto those that the leg can carry."""
         wanted = deciding(self.config.method, shown=True)
-        one_counter = self.inputs.travel_right is None and self.config.method != 'wheels'
+        one_counter = self.inputs.travel_right is None and self.config.method == 'auto'
         return [name for name in METHODS if name in wanted
                 and not (name == 'wheels' and one_counter)]
 
@@ -174,7 +174,9 @@ class LegRun:
         self.track = self.reckon(inputs.travel)
         self.wheel_slips = self._faults()
         self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
-        self.reasons += found
+        # turns are what the others live on
+        self.of_ends = tuple(r for r in found if r.code is Code.LEG_NOT_STRAIGHT)
+        self.reasons += [r for r in found if r not in self.of_ends]
         if self.holdout:
             self.t_fit = self._four_fifths()
 

@@ -3,6 +3,7 @@
 from drives import drive, settings
 import pytest
 
+from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Verdict
 
@@ -42,6 +43,14 @@ def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held)
     assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
 
 
-def test_auto_does_not_take_it(made):
-    leg = calibrate(made.leg(), settings(made, method='auto'))
-    assert set(leg.methods) == {'two_point'}
+def test_auto_takes_it_and_computes_two_point_beside_it(made):
+    leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None))
+    assert set(leg.methods) == {'smoother', 'two_point'}
+    assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
+
+
+def test_all_says_of_each_method_why_it_gives_nothing(made):
+    leg = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
+    (why,) = leg.methods['wheels'].reasons[-1:]
+    assert 'two wheels' in why.text
+    assert leg.verdict is Verdict.ACCEPTED

@@ -6,7 +6,6 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Code, Verdict
 
 ORDER = ('smoother', 'wheels', 'two_point')
-AUTO = ('wheels', 'two_point')     # the smoother is taken where it is asked for
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
 # what a reason speaks of: nothing to say where another method gives it
 ABOUT = {
@@ -30,7 +29,7 @@ def deciding(asked, shown: bool = False) -> tuple[str, ...]:
     if not isinstance(asked, str):
         return asked
     if asked in ('auto', 'all'):
-        return AUTO if asked == 'auto' else ORDER
+        return ORDER
     return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
 
 

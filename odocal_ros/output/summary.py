@@ -17,6 +17,7 @@ SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
+ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
@@ -115,11 +116,12 @@ def _values(calibration):
     for name in estimates:
         estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', *ANGLES, *BIASES) \
-                and estimate.value is not None:
+                and name[:-2] not in ARMS and estimate.value is not None:
             text = _with_unit(estimate)
             if name == 'heading_error':
                 text = f'{_angle_text(estimate)}   heading and (reversed) mounting together'
             lines.append(_line(name.replace('_', ' '), text))
+    lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
@@ -129,7 +131,15 @@ def _values(calibration):
         rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
-    return lines
+    return [line for line in lines if line]
+
+
+def _arm(estimates, arm, word):
+    """Return the coordinates of a lever arm that are known, '' without any."""
+    found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
+    found = {axis: e for axis, e in found.items() if e.value is not None}
+    shown = ', '.join(with_sigma(e.value, e.sigma, signed=True) for e in found.values())
+    return _line(f'{word} {", ".join(found)}', f'{shown} m') if found else ''
 
 
 def _mostly(calibration, name):

@@ -62,7 +62,8 @@ def test_a_method_asked_for_is_the_only_one():
 
 @pytest.mark.parametrize(('asked', 'run'), [
     ('two_point', ('two_point',)), ('wheels', ('wheels', 'two_point')),
-    ('auto', ('wheels', 'two_point')), ('all', ('smoother', 'wheels', 'two_point'))])
+    ('auto', ('smoother', 'wheels', 'two_point')),
+    ('all', ('smoother', 'wheels', 'two_point'))])
 def test_the_operators_own_marks_are_always_computed(asked, run):
     assert deciding(asked, shown=True) == run
 

@@ -117,10 +117,16 @@ def test_legs_pool_their_checks_over_fixes():
 
 
 def test_the_heading_error_of_wheels_is_said_to_hold_the_mounting(good):
-    more = {'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels'),
-            'odometer_lever_arm_x': Estimate(0.02, 0.01, 'm', 'smoother')}
+    more = {'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')}
     text = screen(replace(good, estimates=good.estimates | more))
     (line,) = (line for line in text.splitlines() if 'heading error' in line)
     assert '-0.957 ± 0.029 deg' in line
     assert line.endswith('heading and (reversed) mounting together')
-    assert 'odometer lever arm x 0.02' in text       # a long name keeps its distance
+
+
+def test_the_coordinates_of_a_lever_arm_share_a_line(good):
+    arm = {f'odometer_lever_arm_{axis}': Estimate(value, sigma, 'm') for axis, value, sigma in (
+        ('x', -0.0058, 0.0031), ('y', None, None), ('z', 0.25, 0.06))}
+    lines = screen(replace(good, estimates=dict(good.estimates) | arm)).splitlines()
+    assert [line for line in lines if 'odometer at' in line or 'lever' in line] == [
+        '  odometer at x, z    -0.0058 ± 0.0031, +0.250 ± 0.060 m']
