@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.reversing import reversed_starts
 from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
@@ -113,6 +114,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
     if travelled.right is not None:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
+    found += reversed_starts(travelled.mean, t_imu, w_b, f_b, (0.0, t_stop),
+                             config.odometer.signed)
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
         travelled = replace(travelled, left=None, right=None)
     return Inputs(

@@ -160,9 +160,11 @@ class TwoPointRun:
         C = matrix_from_quat(self.track.q_nb)
         yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
-        found += against_travel(direction, course, self.config.odometer.signed)
+        by_imu = Code.REVERSING_UNSIGNED in {r.code for r in run.reasons}
+        if not by_imu:
+            found += against_travel(direction, course, self.config.odometer.signed)
         run.reasons += found
-        if not found:
+        if not (found or by_imu):
             check = track_check(stray(run.path(f), chord.start, fixes), run.distance)
             self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
 

@@ -267,7 +267,7 @@ def test_reversing_without_direction_rejects(reversing, signed):
     leg = replace(reversing.leg, odometer=changed(reversing.leg.odometer, value=rising))
     result, said = run(leg, settings(reversing.made, odometer__signed=signed))
     assert Code.REVERSING_UNSIGNED in rejecting(result)
-    assert 'the track runs against the fixes' in said[Code.REVERSING_UNSIGNED]
+    assert 'the vehicle reversed' in said[Code.REVERSING_UNSIGNED]
 
 
 def test_g_instead_of_metres_per_second_squared(made, leg):

@@ -1,0 +1,128 @@
+"""
+Reversing that the counter does not tell: it counts up, and the Imu is pushed backwards.
+
+Off a stop the specific force along the vehicle grows with what the wheels speed up by, in the same
+ratio at every start. Where the ratio has the other sign the vehicle went the other way. Fixes see
+that only once the stretch is long beside their noise; a few metres are enough for the Imu.
+"""
+
+import numpy as np
+
+from odocal_ros.reasons import Code, Reason
+
+STEP = 0.1          # s, grid
+HALF = 0.6          # s each side that accelerations are taken over
+LONGEST = 12.0      # s after a stop that are looked at: longer, and the tilt wanders
+BEFORE = 1.0        # s of the stop that belong to it
+STANDS = 0.02       # of the top speed: below it is a stop
+COUNTS = 20.0       # counts a second at top speed, below which a counter shows no acceleration
+SURE = 5.0          # sigmas
+ALIKE = (0.5, 2.0)  # of the usual ratio: a start that is like the others
+G = 9.81            # m/s^2
+
+
+def reversed_starts(travel, t_imu, w_b, f_b, between, signed=True) -> tuple[Reason, ...]:
+    """
+    Return REVERSING_UNSIGNED where the vehicle drives off backwards and the counter counts up.
+
+    Parameters
+    ----------
+    travel : Travel
+        Of the odometer, any unit.
+    t_imu, w_b, f_b : (n,), (n, 3), (n, 3) arrays
+        s, turn rate, rad/s, bias and all, specific force, m/s^2.
+    between : (2,)
+        The marks, s; what was driven before tells what is usual.
+    signed : bool
+        Whether the counter is said to tell the direction.
+
+    Returns
+    -------
+    At most one reason. Travel that counts down in reverse gives none, nor does an Imu whose x
+    axis lies across the vehicle.
+
+    """
+    if len(travel.t) < 3 or len(t_imu) < 3:
+        return ()
+    t = np.arange(max(travel.t[0], t_imu[0]) + HALF, min(travel.t[-1], t_imu[-1]) - HALF, STEP)
+    if len(t) < 2 * (BEFORE + HALF) / STEP:
+        return ()
+    begins, ends = _stretches(t, travel)
+    if len(begins) < 2:
+        return ()
+    force = _forces(t, t_imu, w_b, f_b)
+    push = _second(t, travel.t, travel.s)
+    ratio, sigma = np.array([_ratio(t, push, force, a, b)
+                             for a, b in zip(begins, ends, strict=True)]).T
+    way = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
+    clear = np.abs(ratio) > SURE * sigma
+    onward = np.sign((way * np.sign(ratio))[clear].sum())
+    usual = clear & (np.sign(ratio) == onward)
+    if not onward or not usual.any():
+        return ()
+    level = np.median(np.abs(ratio[usual]))
+    back = clear & ~usual & (np.abs(ratio) > ALIKE[0] * level) & (
+        np.abs(ratio) < ALIKE[1] * level)
+    back &= (t[ends] > between[0]) & (t[begins] < between[1])
+    if not back.any():
+        return ()
+    first = begins[np.argmax(back)]
+    how = 'the counter does not count down' if signed else 'odometer.signed is false'
+    times = int(back.sum())
+    return (Reason(Code.REVERSING_UNSIGNED, f'{times} time{"s" * (times > 1)} the Imu is pushed '
+                   f'the other way than at the other starts, first at t = {t[first]:.1f} s, and '
+                   f'the odometer counts on: the vehicle reversed and {how}'),)
+
+
+def _stretches(t, travel):
+    """Return the first and the last step of each stretch between stops that begins with one."""
+    speed = np.abs(travel.at(t + HALF / 2) - travel.at(t - HALF / 2)) / HALF
+    top = np.percentile(speed, 95)
+    if top == 0.0 or top < COUNTS * travel.quantum:
+        return np.empty(0, int), np.empty(0, int)
+    stands = speed <= max(1.01 * travel.quantum / HALF, STANDS * top)
+    edge = np.flatnonzero(np.diff(stands.astype(int)))
+    begins = edge[stands[edge]] + 1
+    ends = np.append(edge[~stands[edge]], len(t) - 1)
+    ends = ends[np.searchsorted(ends, begins)]
+    long = (ends - begins) * STEP > 2 * HALF
+    return begins[long], ends[long]
+
+
+def _second(t, t_in, s):
+    """Return the second difference of s over HALF each side, per s^2."""
+    before, here, after = (np.interp(t + d, t_in, s) for d in (-HALF, 0.0, HALF))
+    return (before - 2 * here + after) / HALF**2
+
+
+def _forces(t, t_imu, w_b, f_b):
+    """Return integrals to be differenced: (n,) of f_x twice, (n, 3) of the turn, and f itself."""
+    step = np.diff(t_imu)[:, None]
+
+    def integral(x):
+        return np.concatenate([np.zeros((1, x.shape[1])),
+                               np.cumsum((x[1:] + x[:-1]) / 2 * step, axis=0)])
+    speed = integral(f_b)
+    return t_imu, integral(speed[:, :1])[:, 0], integral(w_b), speed
+
+
+def _ratio(t, push, force, a, b):
+    """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
+    t_imu, way, turned, speed = force
+    low = max(0, a - round((BEFORE + HALF) / STEP))
+    high = min(len(t), b + 1, a + round(LONGEST / STEP))
+    span = t[low:high]
+    # which way is up, at rest: as the vehicle pitches, gravity goes into x or out of it
+    rest = [np.array([np.interp(x, t_imu, v) for v in speed.T])
+            for x in (span[0] - HALF, t[max(a - round(HALF / STEP), 0)])]
+    up = (rest[1] - rest[0]) / max(np.linalg.norm(rest[1] - rest[0]), 1e-9)
+    turn = np.stack([np.interp(span, t_imu, v) for v in turned.T], -1)
+    turn -= turn[0]
+    tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
+    y = _second(span, t_imu, way) - G * tilt
+    A = np.stack([push[low:high], np.ones(len(span)), span - span.mean()], -1)
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    spread = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
+    left = float(np.sqrt(np.mean((y - A @ x)**2)))
+    alike = 2 * HALF / STEP          # neighbours share their samples
+    return float(x[0]), left * float(np.sqrt(alike * spread)) + 1e-12

@@ -1,0 +1,108 @@
+"""Reversing in a leg: signed counters give the truth, others are refused, however short it is."""
+
+from drives import drive, errors_in_sigmas, everything_said, rejecting, settings, shifted
+import numpy as np
+import pytest
+from reversing_drives import made, there_and_back, three_point_turn, without_direction
+
+from odocal_ros.calib.reversing import reversed_starts
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code, Verdict
+from odocal_ros.screen import screen
+
+# m/s and s at that speed: 3 m, 10 m and 72 m backwards
+ROUTES = {'3 m': there_and_back(0.8, 0.0), '10 m': there_and_back(1.5, 3.0),
+          '72 m': there_and_back(3.0, 20.0), 'three point turn': three_point_turn}
+BACK_AT = {'3 m': 85.0, '10 m': 85.0, '72 m': 85.0, 'three point turn': 90.0}    # s in the bag
+
+
+def told(leg, config):
+    return {r.code: r.text for r in screen(leg, config)[1]}
+
+
+@pytest.mark.parametrize('route', ROUTES)
+@pytest.mark.parametrize('kind', [
+    {}, {'two_wheels': True}, {'odometer': 'speed', 'speed_noise': 0.05},
+    {'slope': 0.05, 'imu_grade': 'consumer'}, {'yaw': np.pi, 'imu_grade': 'consumer'}],
+    ids=['counts', 'two wheels', 'speed', 'hills', 'Imu facing back'])
+def test_a_counter_that_counts_up_in_reverse_is_seen_off_the_stop(route, kind):
+    drive_ = made(ROUTES[route], **kind)
+    leg = drive_.leg()
+    assert Code.REVERSING_UNSIGNED not in told(leg, settings(drive_))
+    text = told(without_direction(leg), settings(drive_))[Code.REVERSING_UNSIGNED]
+    times = '2 times' if route == 'three point turn' else '1 time'
+    assert text.startswith(f'{times} the Imu is pushed the other way')
+    # where: the stop before the stretch ends where the route says, to the stop's blur
+    at = float(text.split('t = ')[1].split(' s')[0])
+    start = (drive_.truth.start_ns - drive_.options.start_ns) * 1e-9
+    assert at + start == pytest.approx(BACK_AT[route], abs=2.0)
+
+
+@pytest.mark.parametrize('route', ['10 m', 'three point turn'])
+def test_the_leg_is_rejected_for_it_and_for_nothing_else(route):
+    drive_ = made(ROUTES[route], two_wheels=True)
+    for config in (settings(drive_, method='wheels'), settings(drive_)):
+        result = calibrate(without_direction(drive_.leg()), config)
+        assert result.verdict is Verdict.REJECTED
+        assert rejecting(result) == {Code.REVERSING_UNSIGNED}
+        assert Code.WHEELS_SWAPPED not in everything_said(result)
+
+
+@pytest.mark.parametrize('route', ROUTES)
+def test_signed_counters_give_the_truth_over_it(route):
+    drive_ = made(ROUTES[route])
+    result = calibrate(drive_.leg(), settings(drive_))
+    assert result.verdict is Verdict.ACCEPTED
+    errors = errors_in_sigmas(result, drive_.truth)
+    assert len(errors) == 3
+    assert max(map(abs, errors.values())) < 3.5      # 12 draws: p = 0.006 for an honest sigma
+
+
+@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('scenario', ['town', 'out_and_back'])
+def test_no_drive_forward_is_taken_for_it(scenario, seed):
+    clean = drive(scenario=scenario, seed=seed, slope=0.08, imu_grade='consumer', sway=0.05)
+    assert Code.REVERSING_UNSIGNED not in told(clean.leg(), settings(clean))
+
+
+def starts(speeds, nose=None, noise=0.0):
+    """
+    Return travel, Imu times, turn rates and forces of runs of 10 s with stops of 4 s between.
+
+    speeds : m/s at the top of each.   nose : gravity along x by the nose's rise, in parts of the
+    acceleration.
+    """
+    t = np.arange(0.0, 14.0 * len(speeds) + 4.0, 0.02)
+    v, theta = np.zeros(len(t)), np.zeros(len(t))
+    for k, top in enumerate(speeds):
+        run = top * np.sin(np.pi * np.clip((t - 14.0 * k - 4.0) / 10.0, 0.0, 1.0))**2
+        v += run
+        theta += np.arcsin((nose[k] if nose else 0.0) * np.gradient(run, t) / 9.81)
+    zero = np.zeros(len(t))
+    rng = np.random.default_rng(1)
+    f = np.gradient(v, t) + 9.81 * np.sin(theta) + noise * rng.standard_normal(len(t))
+    s = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * 0.02)])
+    return Travel(t, s, 0.0), t, np.stack([zero, -np.gradient(theta, t), zero], -1), \
+        np.stack([f, zero, 9.81 * np.cos(theta)], -1)
+
+
+def test_a_nose_that_dips_off_a_kerb_is_no_reversing():
+    # gravity by the dip takes away twice what the speed adds to the specific force
+    made_ = starts([8.0, 1.0, 8.0], [0.0, -2.0, 0.0])
+    assert reversed_starts(*made_, (0.0, 50.0)) == ()
+    travel, t, w_b, f_b = made_
+    assert reversed_starts(travel, t, 0 * w_b, f_b, (0.0, 50.0))     # but for the gyro it were
+
+
+def test_starts_too_gentle_for_a_rough_road_are_not_judged():
+    # 0.06 m/s^2 in 2 m/s^2 of white noise at 50 Hz: half of 60 would go the wrong way by chance
+    made_ = starts([12.0] + [0.2] * 60, noise=2.0)
+    assert reversed_starts(*made_, (0.0, 1000.0)) == ()
+
+
+def test_what_was_reversed_before_the_leg_does_not_matter():
+    drive_ = made(ROUTES['10 m'])
+    leg = without_direction(drive_.leg())
+    late = shifted(leg, start=75.0)
+    assert Code.REVERSING_UNSIGNED not in told(late, settings(drive_))
