@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.planned_drive import AT_REST, PlannedDrive
 from odocal_ros.calib.predict import metres_to_go, predict, Prediction, Sigmas
@@ -19,20 +20,17 @@ from odocal_ros.errors import BadData
 from odocal_ros.leg import Leg
 from odocal_ros.leg_profile import fix_figures, profile_of
 from odocal_ros.live.ability import stated_variance, with_heading
-from odocal_ros.live.outlook import Outlook, Prospect
+from odocal_ros.live.outlook import Abandoned, FARTHEST, Outlook, Prospect
+from odocal_ros.live.smoother_outlook import with_smoother
+from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.wheels_so_far import sources_of, with_wheels
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.screen import screen
 
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 REST = 10.0          # s of standstill at the end that is foreseen
-FARTHEST = 2e4       # m: who must drive on for more needs something else
 MOST_ROWS = 1000     # of the drive that a prediction is made from
 NEAR_NS = 1_000_000_000
-
-
-class Abandoned(Exception):
-    """The leg is over: what it might have become is of no more interest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +55,10 @@ class DriveSoFar(PlannedDrive):
 
 
 def outlook_of(leg: Leg, fix_rate: float, config: Config,
-               wanted: Callable[[], bool] = lambda: True) -> Outlook:
+               wanted: Callable[[], bool] = lambda: True,
+               smoother: SmootherSoFar | None = None) -> Outlook:
     """
-    Return what is foreseen of a leg that would end here.
+    Return what is foreseen of a leg that would end here, and what its methods say so far.
 
     Parameters
     ----------
@@ -71,6 +70,8 @@ def outlook_of(leg: Leg, fix_rate: float, config: Config,
         As frozen into the leg.
     wanted : callable
         Asked now and then; Abandoned is raised when it says no.
+    smoother : SmootherSoFar, optional
+        That of this leg; looks go from the one before to the next.
 
     Raises
     ------
@@ -78,6 +79,22 @@ def outlook_of(leg: Leg, fix_rate: float, config: Config,
         Nothing can be foreseen yet: no motion, no fixes, scale unknown.
 
     """
+    if deciding(config.method) == ('smoother',):      # its looks alone are what may be foreseen
+        limits = config.verdict
+        outlook = Outlook(Prospect(None, limits.max_scale_sigma, None),
+                          Prospect(None, limits.max_yaw_sigma, None))
+    else:
+        outlook = with_wheels(_by_ends(leg, fix_rate, config, wanted), leg, config)
+    if not wanted():
+        raise Abandoned
+    if smoother is not None:
+        outlook = with_smoother(outlook, leg, config, smoother, wanted)
+    estimates, _ = choose(outlook.methods, config.method)
+    return replace(outlook, estimates=estimates, until_ns=leg.stop_ns)
+
+
+def _by_ends(leg, fix_rate, config, wanted) -> Outlook:
+    """Return what two_point would make of the leg, its end points being what they are."""
     driven = profile_of(leg, config)
     sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(leg, config),
                     **fix_figures(leg, config) | {'fix_rate': fix_rate})
@@ -99,7 +116,7 @@ def outlook_of(leg: Leg, fix_rate: float, config: Config,
         now.method.estimates[PITCH].sigma)
     if not wanted():
         raise Abandoned
-    return with_wheels(outlook, leg, config)
+    return outlook
 
 
 def _yaw_limit(now: Prediction, asked: float) -> str:

@@ -8,6 +8,7 @@ from odocal_ros.reasons import Code, Verdict
 
 REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
 KMH = 3.6
+OLD_S = 15.0      # age from which what is foreseen is said to be old
 DRIVE = 'drive '
 STRAIGHT = 'go straight on at speed until left and right wheel are told apart'
 TURNS = 'turn by about 90 deg in all, or more, for the track width'
@@ -77,7 +78,7 @@ def manoeuvres(now: Situation) -> list[str]:
         wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
     if now.two_wheels and 'wheels' in deciding(now.session.config.method):
         wants += _of_two_wheels(now)
-    return wants
+    return wants + (now.outlook.lacks if now.outlook else [])
 
 
 def _of_two_wheels(now):
@@ -112,6 +113,8 @@ def _while_recording(now: Situation) -> str:
     if now.outlook is None:
         return '; '.join([*wants, _end(now)])
     parts = [now.outlook.words(), *wants]
+    if now.outlook_age_s > OLD_S:
+        parts.append(f'as it was {now.outlook_age_s:.0f} s ago')
     return '; '.join(parts + ([_end(now)] if now.outlook.complete else []))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import nan
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -92,11 +93,13 @@ class LegWay:
         if recording:
             self._distance_m = self._recording.progress.distance_m()
         end_ns = session.stop_ns or self._recording.newest_imu_ns
+        outlook = self._watch.outlook
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
             distance_m=self._distance_m,
             config=session.config if session.busy else self._config(),
-            ability=self._ability if recording else None, outlook=self._watch.outlook,
+            ability=self._ability if recording else None, outlook=outlook,
+            outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 

@@ -1,7 +1,17 @@
 """What is foreseen of a leg while it is recorded, and how it is said."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
+
+from odocal_ros.calib.result import Estimate, MethodResult
+
+FARTHEST = 2e4       # m: who must drive on for more needs something else
+# estimate: unit at the end of its key
+RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
+
+
+class Abandoned(Exception):
+    """The leg is over: what it might have become is of no more interest."""
 
 
 @dataclass(frozen=True)
@@ -13,6 +23,8 @@ class Prospect:
     metres : m more for what is asked, 0: enough, None: no way makes it.
     sources : (name, sigma) of the errors that matter, the largest first.
     why : what keeps it from what is asked where no way helps.
+    now : the value so far, for people, where the drive tells it before its end.
+    lack : what to drive for it, besides metres.
     """
 
     sigma: float | None
@@ -20,19 +32,28 @@ class Prospect:
     metres: float | None
     sources: tuple[tuple[str, float], ...] = ()
     why: str = ''
+    now: str = ''
+    lack: str = ''
 
     def words(self, name: str, unit: str, factor: float) -> str:
         """Return it for people, sigmas times ``factor`` in ``unit``."""
         asked = _three_digits(self.asked * factor)
-        now = None if self.sigma is None else _three_digits(self.sigma * factor)
+        sigma = None if self.sigma is None else _three_digits(self.sigma * factor)
+        known = name if sigma is None else f'{name} {sigma} {unit}'
+        if self.now and sigma is not None:
+            known = f'{name} {self.now} +- {sigma} {unit}'
+        if self.lack:
+            return f'{known} so far (asked {asked})' if self.now else (
+                f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
         if self.metres is None:
-            return f'{name}: {self.why}' if now is None else f'{name} {now} {unit}: {self.why}'
+            return f'{known}: {self.why}'
         if self.metres == 0.0:
-            return f'enough: {name} {now} {unit} (asked {asked})'
+            return f'enough: {known} (asked {asked})'
         more = f'{_rounded_up(self.metres)} m more bring it to the asked {asked} {unit}'
-        if now is None:
+        if sigma is None:
             return f'{name} is not determined yet; {more}'
-        return f'{name} would be good to {now} {unit} now; {more}'
+        return f'{known} so far; {more}' if self.now else (
+            f'{name} would be good to {sigma} {unit} now; {more}')
 
 
 @dataclass(frozen=True)
@@ -55,12 +76,17 @@ class Outlook:
     What is foreseen of a leg that ends where the vehicle is.
 
     pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
+    methods : what those say that need no end of the drive.   estimates : the running estimate,
+    each value by the method that will give it.   until_ns : stamp up to which it was looked at.
     """
 
     scale: Prospect
     yaw: Prospect
     pitch: float | None = None
     wheels: WheelsOutlook | None = None
+    methods: dict[str, MethodResult] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    until_ns: int = 0
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
@@ -76,12 +102,21 @@ class Outlook:
     @property
     def complete(self) -> bool:
         """Return whether driving on would bring nothing that was asked for."""
-        return not (self.scale.metres or self.yaw.metres)
+        return not (self.scale.metres or self.yaw.metres or self.lacks)
+
+    @property
+    def lacks(self) -> list[str]:
+        """Return what to drive besides metres."""
+        return [prospect.lack for prospect in (self.scale, self.yaw) if prospect.lack]
 
 
-def as_keys(outlook: Outlook | None) -> dict:
-    """Return the keys of ``~/status``; what is not foreseen is empty."""
-    keys: dict = {}
+def as_keys(outlook: Outlook | None, age_s: float = math.nan) -> dict:
+    """
+    Return the keys of ``~/status``; what is not foreseen is empty.
+
+    age_s : how long ago the way ended that the outlook is of.
+    """
+    keys = _running(outlook, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
         of = Prospect(None, 0.0, None) if outlook is None else getattr(outlook, name)
         keys |= {
@@ -91,6 +126,19 @@ def as_keys(outlook: Outlook | None) -> dict:
             f'predicted_{name}_sources_{unit}': ', '.join(
                 f'{source} {_three_digits(sigma * factor)}' for source, sigma in of.sources)}
     return keys
+
+
+def _running(outlook, age_s) -> dict:
+    """Return the keys of the running estimate, NaN where it tells nothing."""
+    found = {} if outlook is None else outlook.estimates
+    told = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
+    keys: dict = {}
+    for (name, unit), e in zip(RUNNING.items(), told.values(), strict=True):
+        for end, value in (('', e.value), ('_sigma', e.sigma if e.value is not None else None)):
+            keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
+    giving = dict.fromkeys(e.method for e in told.values() if e.value is not None)
+    return keys | {'estimate_method': ', '.join(giving),
+                   'estimate_age_s': math.nan if outlook is None else age_s}
 
 
 def _rounded_up(metres: float) -> int:

@@ -1,6 +1,7 @@
 """What is so just now: everything that status, hint and answers are made from."""
 
 from dataclasses import dataclass, field
+from math import nan
 
 from odocal_ros.config import Config
 from odocal_ros.live.ability import Ability
@@ -26,6 +27,7 @@ class Situation:
     two_wheels: bool = False                     # the right wheel is heard by itself
     ability: Ability | None = None               # of the leg that is recorded
     outlook: Outlook | None = None               # of the leg that is recorded
+    outlook_age_s: float = nan                   # since the way it is of
     saved: str = ''
     journal: str = ''                            # folder of the newest leg's journal
     journal_trouble: str = ''                    # why it cannot be written

@@ -57,7 +57,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
-    } | quantities.as_keys(ok) | as_keys(now.outlook)
+    } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v)) for k, v in keys.items()])

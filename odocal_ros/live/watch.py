@@ -10,11 +10,12 @@ from odocal_ros.live.answers import one_line
 from odocal_ros.live.foresight import Abandoned, outlook_of
 from odocal_ros.live.outlook import Outlook
 from odocal_ros.live.sketch import Sketch
+from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.worker import Worker
 from odocal_ros.samples import join
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
-SHARE = 1 / 50             # of one core is what looking may cost in the long run
+SHARE = 1 / 25             # of one core is what looking may cost in the long run
 
 
 class Watch:
@@ -30,6 +31,7 @@ class Watch:
         self._worker, self._log = worker, log
         self.outlook: Outlook | None = None
         self._sketch: Sketch | None = None
+        self._smoother = SmootherSoFar()
         self._before: LegRecorder | None = None
         self._fresh: list = []
         self._over = threading.Event()
@@ -43,6 +45,7 @@ class Watch:
         self.end()
         self._over, self._start_ns, self._config = threading.Event(), start_ns, config
         self._sketch, self._before = Sketch(recorder.form), recorder
+        self._smoother = SmootherSoFar()
         self._due_ns = start_ns + EVERY_NS
 
     def end(self) -> None:
@@ -67,7 +70,8 @@ class Watch:
         before, self._before = self._before, None
         fresh, self._fresh = self._fresh, []
         self._worker.submit(
-            partial(_look, self._sketch, before, fresh, self._start_ns, self._config, self._over),
+            partial(_look, self._sketch, before, fresh, self._start_ns, self._config, self._over,
+                    self._smoother),
             partial(self._take, self._over))
 
     def _take(self, over: threading.Event, look, error: Exception | None) -> None:
@@ -83,17 +87,22 @@ class Watch:
 
 
 def _look(sketch: Sketch, before: LegRecorder | None, fresh: list, start_ns: int, config: Config,
-          over: threading.Event) -> tuple[Outlook | None, float, Exception | None]:
-    """Return the outlook, the seconds of CPU it took and what went wrong; for the worker."""
+          over: threading.Event, smoother: SmootherSoFar,
+          ) -> tuple[Outlook | None, float, Exception | None]:
+    """
+    Return the outlook, the seconds of CPU it took and what went wrong; for the worker.
+
+    Without what is done ever less often as a leg grows: that is a small share by itself.
+    """
     begin = time.thread_time()
     outlook, failure = None, None
     try:
         _bring_up_to_date(sketch, before, fresh, over)
         outlook = outlook_of(sketch.leg(start_ns), sketch.fix_rate(), config,
-                             lambda: not over.is_set())
+                             lambda: not over.is_set(), smoother)
     except Exception as error:  # whatever is wrong with a look, the leg goes on
         failure = error
-    return outlook, time.thread_time() - begin, failure
+    return outlook, time.thread_time() - begin - smoother.once_s, failure
 
 
 def _bring_up_to_date(sketch, before, fresh, over) -> None:

@@ -41,7 +41,8 @@ def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
         scale = replace(scale, metres=min(scale.metres, more))
     yaw = _better(outlook.yaw, method, 'yaw_mounting_angle',
                   method.estimates['yaw_mounting_angle'].sigma)
-    return replace(outlook, wheels=WheelsOutlook(apart, width, fault), scale=scale, yaw=yaw)
+    return replace(outlook, wheels=WheelsOutlook(apart, width, fault), scale=scale, yaw=yaw,
+                   methods=outlook.methods | {'wheels': method})
 
 
 def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:

@@ -18,6 +18,7 @@ from odocal_ros.live.outlook import as_keys, Outlook, Prospect
 from odocal_ros.live.session import Session
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.sketch import MOST, Sketch
+from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.watch import EVERY_NS, Watch
 from odocal_ros.live.wheels_so_far import with_wheels
 from odocal_ros.live.worker import Worker
@@ -297,7 +298,7 @@ def test_the_watch_foresees_what_its_sketch_does(drive, config, worker):
     assert look.outlook is None                      # too early
     look.look(now_ns)
     finished(worker)
-    expected = foreseen(drive, config, 150.0)
+    expected = foreseen(drive, config, 150.0, smoother=SmootherSoFar())
     assert log.lines == []
     assert look.outlook.scale.sigma == pytest.approx(expected.scale.sigma)
     assert look.outlook.yaw.sigma == pytest.approx(expected.yaw.sigma)
@@ -349,8 +350,8 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
         now_ns += EVERY_NS
         look.look(now_ns)
         finished(worker)
-    # the first comes with imports and goes free, the others 50 s apart: at 1, 2, 52 and 102 s
-    assert len(looks) == 4
+    # the first comes with imports and goes free, the others 25 s apart: at 1, 2, 27, ... 102 s
+    assert len(looks) == 6
 
 
 # two wheels
@@ -463,11 +464,16 @@ def test_the_least_leg_comes_first():
 
 def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
     keys = as_keys(Outlook(GOOD, NO_YAW))
+    running = {key: keys.pop(key) for key in list(keys) if key.startswith('estimate_')}
+    assert running.pop('estimate_method') == ''
+    assert len(running) == 7
+    assert all(math.isnan(value) for value in running.values())
     assert keys == {
         'predicted_scale_sigma_ppm': pytest.approx(430.0), 'metres_to_go_scale': 0.0,
         'largest_error_source_scale': 'fix_end',
         'predicted_scale_sources_ppm': 'fix_end 300, fix_start 250',
         'predicted_yaw_sigma_deg': '', 'metres_to_go_yaw': '', 'largest_error_source_yaw': '',
         'predicted_yaw_sources_deg': ''}
-    assert set(as_keys(None)) == set(keys)
-    assert set(as_keys(None).values()) == {''}
+    none = as_keys(None)
+    assert set(none) == set(keys) | set(running) | {'estimate_method'}
+    assert {none[key] for key in keys} == {''}

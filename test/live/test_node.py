@@ -86,8 +86,9 @@ def _first_leg(seen, client, player, sent):
     seen.set_in_leg = client.set(leg__min_distance=50.0)
     player.play(part(sent, 60, 115), SPEED)
     seen.recording = client.until(state='recording')
-    seen.foreseen = wait_for(lambda: client.status['predicted_scale_sigma_ppm'] and client.status,
-                             'a prediction')
+    # a look that is due comes after the last message too: it sees 50 s of the leg or more
+    seen.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
+                             and client.status, 'a running estimate')
     stopping = client.ask('stop_leg')
     seen.computing = client.until(state='computing')
     player.play(part(sent, 115, 117), SPEED)
@@ -162,6 +163,8 @@ def test_live_and_recorded_agree_in_every_digit(session, drive):
     offline = json.loads(json.dumps(as_json(calibration, config, [], '')))
     for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
         assert written[part_of] == offline[part_of], part_of
+    assert written['result']['scale_factor']['method'] == 'smoother'       # of auto
+    assert len(written['methods']['smoother']['estimates']) > 10
 
 
 @pytest.fixture(scope='module')
@@ -261,20 +264,22 @@ def test_status_has_every_key_and_bare_numbers(session):
     assert float(session.recording['fix_rate_hz']) == pytest.approx(5, rel=0.07)
 
 
-def test_while_it_records_a_leg_is_foreseen(session):
+def test_while_it_records_the_running_estimate_is_told(session, drive):
     status = session.foreseen
     assert status['state'] == 'recording'
-    scale_ppm, yaw_deg, metres = (float(status[key]) for key in (
-        'predicted_scale_sigma_ppm', 'predicted_yaw_sigma_deg', 'metres_to_go_scale'))
-    # fixes of 2 cm at both ends: 28 mm over what was driven when it looked, 5 s to 55 s of it
-    assert 28e3 / 700 < scale_ppm < 28e3 / 20
+    assert 'smoother' in status['estimate_method']
+    value, sigma, scale_ppm, metres = (float(status[key]) for key in (
+        'estimate_scale_factor', 'estimate_scale_factor_sigma', 'predicted_scale_sigma_ppm',
+        'metres_to_go_scale'))
+    assert abs(value - drive.simulated.truth.scale) < 4 * sigma      # 1 in 16000 by chance
+    assert scale_ppm == pytest.approx(1e6 * sigma / value)
     assert (metres == 0.0) == (scale_ppm <= 1000)
-    # a heading of 0.002 rad is in every yaw; what comes on top is the fixes' part of the scale
-    assert math.degrees(0.002) < yaw_deg < math.degrees(0.002 + 28e-3 / 20)
-    assert status['largest_error_source_scale'] in ('fix_start', 'fix_end', 'height')
-    assert 'initial_heading 0.115' in status['predicted_yaw_sources_deg']
-    assert ('enough: yaw', 'enough: scale')[metres == 0.0] in status['hint']
-
+    assert float(status['predicted_yaw_sigma_deg']) > 0.0
+    assert 0.0 <= float(status['estimate_age_s']) <= 55.0            # the leg is no longer
+    assert f' +- {scale_ppm:.3g} ppm' in status['hint']
+    assert status['largest_error_source_scale']
+    assert session.idle['estimate_scale_factor'] == session.waiting['estimate_age_s'] == 'nan'
+    assert session.calibrated['estimate_scale_factor'] == 'nan'
 
 def test_nothing_is_foreseen_but_of_a_leg_that_is_recorded(session):
     foreseen = [key for key in session.foreseen

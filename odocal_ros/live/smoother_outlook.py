@@ -1,0 +1,96 @@
+"""What the running estimate makes foreseen: which sigma counts, how far to drive, and what."""
+
+from dataclasses import replace
+import math
+
+from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.config import Config
+from odocal_ros.errors import OdocalError
+from odocal_ros.leg import Leg
+from odocal_ros.live.outlook import FARTHEST, Outlook, Prospect
+from odocal_ros.live.smoother_so_far import Running, SmootherSoFar
+from odocal_ros.live.wheels_so_far import sources_of
+from odocal_ros.reasons import Verdict
+
+BRISK = 1.5            # m/s^2, of an ordinary stop and start
+SLOWEST = 5.0          # m/s that one would do them from
+# sigma goes with the way to the power of minus one over this
+BY_WAY, BY_WAY_SLOW = 1.25, 2.0       # with white errors of the fixes, with slow ones
+FAR_TOO_FEW = 50       # stops and starts: nobody does so many
+
+
+def with_smoother(outlook: Outlook, leg: Leg, config: Config, smoother: SmootherSoFar,
+                  wanted) -> Outlook:
+    """
+    Return an outlook with what the smoother tells so far, where the result will be by it.
+
+    leg : the way so far.   wanted : asked between passes, Abandoned is raised when it says no.
+
+    Raises
+    ------
+    OdocalError
+        Nothing can be told yet, and the smoother is the only method.
+
+    """
+    if 'smoother' not in deciding(config.method):
+        return outlook
+    try:
+        running = smoother.look(leg, config, wanted)
+    except OdocalError:
+        if deciding(config.method) == ('smoother',):
+            raise
+        return outlook
+    method = running.method
+    if method.verdict is not Verdict.REJECTED:
+        outlook = replace(outlook, methods=outlook.methods | {'smoother': method})
+    given, _ = choose(outlook.methods, config.method)
+    by = {name: e.method for name, e in given.items() if e.value is not None}
+    scale, yaw, pitch = outlook.scale, outlook.yaw, outlook.pitch
+    if by.get('scale_factor') == 'smoother' or scale.sigma is None:
+        scale = _scale(running, scale.asked)
+    if by.get('yaw_mounting_angle') == 'smoother' or yaw.sigma is None:
+        yaw = _yaw(running, yaw.asked)
+    if by.get('pitch_mounting_angle') == 'smoother' or pitch is None:
+        pitch = float(running.sigmas[2])
+    return replace(outlook, scale=scale, yaw=yaw, pitch=pitch)
+
+
+def _scale(running: Running, asked: float) -> Prospect:
+    e = running.method.estimates['scale_factor']
+    slow = running.method.details['noise']['correlation_time'] > 0
+    sigma = float(running.sigmas[0])
+    metres = _metres(running, sigma / asked, BY_WAY_SLOW if slow else BY_WAY)
+    now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
+    if now and e.unit != '1':
+        now += f' {e.unit}'
+    return Prospect(sigma, asked, metres, sources_of(running.method, 'scale_factor'),
+                    f'no {FARTHEST / 1000:.0f} km more bring it to what is asked', now)
+
+
+def _yaw(running: Running, asked: float) -> Prospect:
+    """Return the prospect of the yaw, of which acceleration, along or across, is what tells."""
+    e = running.method.estimates['yaw_mounting_angle']
+    sigma = float(running.sigmas[1])
+    ratio, lack = sigma / asked, ''
+    if ratio > 1:
+        one = 2 * BRISK * max(running.speed, SLOWEST)
+        stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
+        often = 'often' if stops > FAR_TOO_FEW else f'{stops} time{"s" * (stops > 1)}'
+        lack = f'stop and start {often}, or turn as often, for the yaw'
+    now = '' if e.value is None or e.sigma is None else _digits(
+        math.degrees(e.value), math.degrees(e.sigma))
+    return Prospect(sigma, asked, _metres(running, ratio, 2.0),
+                    sources_of(running.method, 'yaw_mounting_angle'), '', now, lack)
+
+
+def _metres(running, ratio, power) -> float | None:
+    """Return the metres more that make a sigma so many times better, driven as so far."""
+    metres = running.distance * (max(ratio, 1.0)**power - 1)
+    return metres if metres <= FARTHEST else None
+
+
+def _digits(value: float, sigma: float) -> str:
+    """Return a value to a tenth of its sigma, no more than eight digits of it."""
+    size = max(abs(value), sigma)
+    places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
+    return f'{value:.{min(max(places, 1), 8)}g}'
