@@ -37,6 +37,8 @@ class Code(Enum):
     TOPIC_GAP = NOTE, 'Mend the stream; the gap lowers the weight, not the leg.'
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')
+    DELAY_SEEN = NOTE, ('Set the time_offset as the sentence says, here and wherever else these '
+                        'sensors are used together; the two-point method gains most.')
     COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg; the travel across the '
                               'reset was bridged at the speed beside it.')
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'

@@ -1,6 +1,7 @@
 """The smoother on one leg: all samples at once, no outside heading."""
 
 from odocal_ros.calib.smoother import smooth, smoother_leg
+from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import quat_from_matrix
 
@@ -22,6 +23,9 @@ def smoother(run):
     method = smooth(leg, run.config)
     if method.estimates['scale_factor'].value is None:
         return method, None
+    delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
+    note_delays(run, {name: (e.value, e.sigma) for name, e in delays.items()
+                      if e.value is not None})
     start = method.details['start']      # its gyro bias is taken as constant
     track = dead_reckon(*run.attitude_from(start['t'], quat_from_matrix(start['C_nb']),
                                            start['gyro_bias']), run.inputs.travel)

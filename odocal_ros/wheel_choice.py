@@ -55,13 +55,13 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
     if isinstance(found, Choice):
         return found
     if len(found) == 1:
-        return Choice((found[0],), True, f'of the joints {_listed(keys)}: only {found[0]} is taken, '
-                      'by their names')
+        return Choice((found[0],), True, f'of the joints {_listed(keys)}: only {found[0]} is '
+                      'taken, by their names')
     if len(found) == 2:
         what = 'joints' if names else 'values'
         first, second = found
-        return Choice((first, second), False, f'of the {what} {_listed(keys)}: the mean of {first} '
-                      f'and {second} is taken; which is left and which is right nothing tells: '
+        return Choice((first, second), False, f'of the {what} {_listed(keys)}: the mean of '
+                      f'{first} and {second} is taken; which is left and which is right nothing tells: '
                       'below, the left one is the first')
     what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
     return (f'which of {what} are the wheels is not clear: name two by odometer.left and '

@@ -10,6 +10,7 @@ from odocal_ros.calib.wheels.planar import planar_leg
 from odocal_ros.calib.wheels.ranges import ranges_of
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
+from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
@@ -38,6 +39,8 @@ def wheels(run):
     method = fit_wheels(leg, run.config)
     if method.estimates['scale_factor'].value is None:
         return method, None
+    note_delays(run, {'gnss': (method.details['fix_latency_seen'],
+                               method.details['fix_latency_sigma'])})
     found = _search(run, leg, method.details['pitch']['value'])
     more = {} if found is None else {'search': found.as_dict()}
     # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself

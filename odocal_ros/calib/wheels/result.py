@@ -200,6 +200,7 @@ def _details(leg, solution: Solution, covariance, sources, scale, config):
                   'white_share': noise.white, 'slow_share': noise.slow,
                   'correlation_time': noise.time},
         'fix_latency_seen': state.latency,      # s by which stamps are late
+        'fix_latency_sigma': float(np.sqrt(covariance[LATENCY, LATENCY])),
         'gyro_scale_seen': {'value': state.gyro_scale, 'sigma': float(np.sqrt(
             covariance[GYRO, GYRO]))},
         'slip_walk': float(np.sqrt(solution.slip)),
