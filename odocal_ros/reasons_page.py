@@ -50,8 +50,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'be joined at the wrong times.',
         Code.DELAY_SEEN: 'Where the vehicle speeds up and slows down, the stamps of one sensor '
         'were found late or early against the others, by more than three sigmas and by enough to '
-        'matter at the speed driven. Methods wheels and smoother estimate the delay and allow for it; '
-        'other software that joins these sensors does not.',
+        'matter at the speed driven. Methods wheels and smoother estimate the delay and allow for '
+        'it; other software that joins these sensors does not.',
         Code.COUNTER_RESET: 'The counter jumps in a way that no rollover explains: it was reset '
         'or lost power. What was driven in that moment is guessed, with a sigma.',
         Code.COUNTER_ROLLOVER: 'The counter reached its largest number and began anew. That is '

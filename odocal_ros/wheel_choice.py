@@ -61,8 +61,8 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
         what = 'joints' if names else 'values'
         first, second = found
         return Choice((first, second), False, f'of the {what} {_listed(keys)}: the mean of '
-                      f'{first} and {second} is taken; which is left and which is right nothing tells: '
-                      'below, the left one is the first')
+                      f'{first} and {second} is taken; which is left and which is right nothing '
+                      'tells: below, the left one is the first')
     what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
     return (f'which of {what} are the wheels is not clear: name two by odometer.left and '
             f'odometer.right{"" if names else " (indices from 0)"}, or one by odometer.field; '
