@@ -65,7 +65,8 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     assert white.max() > 0.0
     single = np.eye(n)
     for k in range(N):
-        add(single[[E]], (block(k),), np.eye(1) / np.sqrt(problem.travel_floor))
+        add(single[[E]], (block(k),),
+            np.eye(1) * np.sqrt(equations.travel_weight[k] / problem.travel_floor))
         if problem.still[k]:
             add(single[3:6], (block(k),), np.eye(3) / STILL_SPEED)
     for k in range(N - 1):

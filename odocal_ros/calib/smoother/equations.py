@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import Normal
 from odocal_ros.calib.smoother.fixes import Fixes, heavy, weights
 from odocal_ros.calib.smoother.motion import Motion, rotvec
-from odocal_ros.calib.smoother.noise import interval_noise, Levels
+from odocal_ros.calib.smoother.noise import interval_noise, Levels, once_a_rest
 from odocal_ros.calib.smoother.outside_rows import (
     add_rows,
     by_interval,
@@ -55,6 +55,7 @@ class Equations:
         self.state, self.still = state, problem.still
         self.priors = priors or problem.priors
         self.travel_floor = problem.travel_floor       # variance of the odometer's rounding
+        self.travel_weight = once_a_rest(problem.still)
         leg = problem.leg
         intervals, gyro_change, delay_change, fix_change = sums.near(state)
         self.motion = Motion(leg, state, intervals, (gyro_change, delay_change))
@@ -165,8 +166,8 @@ class Weighted:
             self._add_slow(out)
         self._add_stills(out)
         e = self.travel_variance
-        out.diagonal[:, E, E] += 1 / e
-        out.g[:, E] -= state.travel_error / e
+        out.diagonal[:, E, E] += eq.travel_weight / e
+        out.g[:, E] -= eq.travel_weight * state.travel_error / e
         self._add_priors(out)
         return out
 
@@ -248,7 +249,7 @@ class Weighted:
         """Return the weighted sum of squares of all rows, robust in the fixes."""
         eq, state = self.eq, self.reached
         total = (self.wr**2).sum() + heavy(self.fix_r / np.sqrt(self.fix_weight))
-        total += (state.travel_error**2).sum() / self.travel_variance
+        total += (eq.travel_weight * state.travel_error**2).sum() / self.travel_variance
         total += sum(rows.cost() for rows in self.outside)
         total += (state.v_n[eq.still]**2).sum() / STILL_SPEED**2
         pair = eq.still[:-1] & eq.still[1:]
@@ -264,7 +265,7 @@ class Weighted:
 
     def log_R_total(self) -> float:
         """Return the log determinant of the covariance of all rows that the levels change."""
-        total = self.log_R + len(self.eq.state.t) * np.log(self.travel_variance)
+        total = self.log_R + self.eq.travel_weight.sum() * np.log(self.travel_variance)
         if self.n == WITH_SLOW:
             total += np.log(self.slow_drive).sum() + np.log(self.slow_power).sum()
         return float(total)

@@ -76,13 +76,12 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         Called with each pass, for benchmarks.
 
     """
-    sums, before, settled = None, np.ones(3), False
+    before, settled = np.ones(3), False
     priors = about.priors if about else problem.priors
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
     tails = 1 if about else FIRST_TAILS
     for count in range(1, most + 1):
-        if sums is None or not sums.hold_at(state):
-            sums = problem.sums(state)
+        sums = problem.sums_near(state)
         weighted = Equations(problem, state, sums, priors, spread).at(levels)
         solved = solve(weighted.normal())
         sigma = np.sqrt(np.diag(solved.covariance))

@@ -24,7 +24,7 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 HARD = 0.5          # m/s^2 along: above it, a wheel may slip
 TURNING = 0.05      # rad/s: above it, a vehicle may slide sideways
-AT_REST = 1e-3      # m that an odometer at rest may err by in a second, at least
+AT_REST = 5e-4      # m that an odometer at rest may err by in a second, at least
 FEWEST_RESTS = 5     # seconds to know that by
 SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
 GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
@@ -124,6 +124,20 @@ def rest_noise(speed, rest):
     """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= FEWEST_RESTS else 0.0
     return max(measured, AT_REST**2)
+
+
+def once_a_rest(still):
+    """
+    Return the weight of what is believed of the rounding at each keyframe, (N,).
+
+    A counter that stands errs by the same all the time: its keyframes together count as one.
+    """
+    starts = np.flatnonzero(np.diff(still, prepend=False) & still)
+    stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
+    weight = np.ones(len(still))
+    for first, last in zip(starts, stops, strict=True):
+        weight[first:last] = 1 / (last - first)
+    return weight
 
 
 def hard_and_turning(motion):

@@ -7,6 +7,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.shares import shares
+from odocal_ros.calib.smoother.slide import assumed
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
@@ -88,6 +89,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     if unsaid:
         reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'this drive does not tell '
                               f'{in_words(unsaid)}; what the settings say of it is kept'))
+    reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [_widened(s, widen) for s in shares(fit, near)]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
@@ -173,7 +175,8 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
                       'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
-                       'turned': float(turned), 'standing': float(problem.still.sum())},
+                       'turned': float(turned), 'in_turns': problem.turned,
+                       'standing': float(problem.still.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
         # what dead reckoning begins with: a bias that holds for the whole leg
         'start': {'t': float(state.t[0]), 'C_nb': state.C_nb[0],

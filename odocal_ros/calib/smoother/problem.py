@@ -10,6 +10,7 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside_rows import first_values, used
 from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, preintegrate
+from odocal_ros.calib.smoother.slide import least_slide, SIDEWAYS, turned
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
     GNSS_ARM,
@@ -23,12 +24,14 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.grades import grade_of
 
-# how near to the last pass over the samples a state must lie to do without another
-NEAR_GYRO, NEAR_ACCEL, NEAR_TIME, NEAR_FORWARD = 3e-5, 1e-2, 3e-4, 1e-3   # rad/s, m/s^2, s, 1
+# how near to the last pass over the samples a state must lie to do without another: first order
+# leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix
+NEAR_GYRO, NEAR_ACCEL, NEAR_FORWARD = 1e-4, 1e-2, 1e-3       # rad/s, m/s^2, 1
+NEAR_ODO_TIME, NEAR_GNSS_TIME = 3e-4, 3e-3                   # s
 LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
 SPACING = 1.0        # s between keyframes
 ROAD = 0.01          # m/sqrt(s), what slip and slide are believed to be at first
-LEAST_ROAD = 2e-4    # m/sqrt(s)
+LEAST_ROAD = 2e-4    # m/sqrt(s) along
 LEAST_FIX = 0.005    # m
 GYRO_SCALE_SIGMA = {'consumer': 3e-3, 'industrial': 2e-3, 'tactical': 3e-4, 'navigation': 1e-5}
 
@@ -49,6 +52,8 @@ class Problem:
     shaken: dict             # levels of gyro and accelerometer to come down from
     outside: dict            # velocity and heading within the keyframes, where there are any
     thin: dict               # of each, how many of its errors are one and the same
+    turned: float            # rad, in turns
+    kept: 'Sums | None' = None    # the last, which the next fit may do with
 
     @classmethod
     def of(cls, leg, config, imu=None):
@@ -65,20 +70,29 @@ class Problem:
         floor = max(q**2 / 12, (1e-3 / leg.rough_scale)**2)
         values = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2,
                   'gyro_walk': grade.gyro_bias_walk**2, 'accel_walk': grade.accel_bias_walk**2,
-                  'along': ROAD**2, 'along_hard': ROAD**2, 'side': ROAD**2,
-                  'side_turn': ROAD**2, 'up': ROAD**2, 'travel': floor, 'fix': 1.0,
+                  'along': ROAD**2, 'along_hard': ROAD**2, 'travel': floor, 'fix': 1.0,
                   'fix_up': 1.0, 'slow': fix_sigma**2, 'slow_up': 4 * fix_sigma**2}
+        angle = turned(leg, imu)
+        slide = least_slide(angle)**2
+        values |= dict.fromkeys(SIDEWAYS, max(ROAD**2, slide))
         values |= at_rest(imu, leg, still)
         least = {k: v for k, v in values.items() if k in ('gyro', 'accel')}
         least |= {k: v for k, v in values.items() if k in ('gyro_walk', 'accel_walk', 'travel')}
-        least |= dict.fromkeys(('along', 'along_hard', 'side', 'side_turn', 'up'), LEAST_ROAD**2)
+        least |= dict.fromkeys(('along', 'along_hard'), LEAST_ROAD**2)
+        least |= dict.fromkeys(SIDEWAYS, slide)
         least |= dict.fromkeys(('fix', 'fix_up'), (LEAST_FIX / fix_sigma)**2)
         least |= dict.fromkeys(('slow', 'slow_up'), LEAST_FIX**2)
         outside = used(leg, t)
         more, more_least = first_values(outside)
         return cls(leg, imu, _priors(config, grade, leg), use, root, still, floor,
                    least | more_least, Levels(values | more),
-                   {k: max(v, values[k]) for k, v in shaken(imu).items()}, outside, {})
+                   {k: max(v, values[k]) for k, v in shaken(imu).items()}, outside, {}, angle)
+
+    def sums_near(self, state: State) -> 'Sums':
+        """Return the last sums where they were made near a state, else those about it."""
+        if self.kept is None or not self.kept.hold_at(state):
+            self.kept = self.sums(state)
+        return self.kept
 
     def sums(self, state: State) -> 'Sums':
         """Return the preintegrated sums about a state."""
@@ -127,7 +141,8 @@ class Sums:
         """Tell whether a state is near enough for first order."""
         gyro, accel, c = self._apart(state)
         return bool(np.abs(gyro).max() < NEAR_GYRO and np.abs(accel).max() < NEAR_ACCEL
-                    and max(abs(c[ODO_DELAY]), abs(c[GNSS_DELAY])) < NEAR_TIME
+                    and abs(c[ODO_DELAY]) < NEAR_ODO_TIME
+                    and abs(c[GNSS_DELAY]) < NEAR_GNSS_TIME
                     and np.abs(c[:3]).max() < NEAR_FORWARD)
 
 

@@ -57,7 +57,8 @@ def shares(fit, neighbours) -> tuple[Source, ...]:
     _add_fixes(w, neighbours, add)
     for rows in w.outside:
         add(rows.source, rows.effects(neighbours, P))
-    travel = np.concatenate([with_c[:, :, E], with_c[-1:, :, n + E]]) / np.sqrt(w.travel_variance)
+    root = np.sqrt(w.eq.travel_weight / w.travel_variance)
+    travel = np.concatenate([with_c[:, :, E], with_c[-1:, :, n + E]]) * root[:, None]
     add('quantisation', travel[:, :, None])
     if n == WITH_SLOW:
         push = (with_c[:, :, n + SLOW.start:n + SLOW.stop]

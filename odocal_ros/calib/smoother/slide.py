@@ -1,0 +1,49 @@
+"""
+How little the wheels are believed to slide sideways, and to heave: as the leg has tested it.
+
+Wheels slide in turns. A leg with turns shows how much, and its own figure stands. On a leg that
+goes straight on nothing tells a vehicle that goes a little askew from an Imu that is mounted so:
+there an ordinary road's noise is believed, whatever the residuals of the single seconds say.
+"""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.noise import TURNING
+from odocal_ros.calib.smoother.start import rest_bias
+from odocal_ros.reasons import Code, Reason
+
+TESTED = 2e-4                   # m/sqrt(s), least that is believed where there are turns
+ROAD = 0.05 / np.sqrt(10.0)     # m/sqrt(s), an ordinary road: 0.05 m/s, white at 10 Hz
+# rad turned in all: less than one crossroads tests nothing, two do; in between in proportion
+NO_TURN, ENOUGH = np.pi / 2, np.pi
+MOVING = 0.2                    # m/s
+MATTERS = 2e-3                  # m/sqrt(s) worth a word
+SIDEWAYS = ('side', 'side_turn', 'up')
+
+
+def turned(leg, imu) -> float:
+    """Return the angle driven in turns, all counted positive, rad."""
+    t = imu.t[imu.key]
+    T = np.diff(t)
+    turn = np.add.reduceat(imu.turn, imu.key[:-1]) - rest_bias(leg, imu)[0] * T[:, None]
+    up = imu.f_b.mean(axis=0)
+    angle = np.abs(turn @ up) / np.linalg.norm(up)
+    way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
+    return float(angle[(angle > TURNING * T) & (way > MOVING * T)].sum())
+
+
+def least_slide(angle) -> float:
+    """Return the least sideways and vertical noise to believe in, m/sqrt(s), by angle turned."""
+    tested = np.clip((angle - NO_TURN) / (ENOUGH - NO_TURN), 0.0, 1.0)
+    return float(ROAD * (TESTED / ROAD)**tested)
+
+
+def assumed(problem, levels):
+    """Say where a road's noise was assumed and not seen, and decides: reasons."""
+    least = problem.least['side']
+    if least < MATTERS**2 or all(levels[name] > 1.01 * least for name in SIDEWAYS):
+        return []
+    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'the drive turns by '
+                   f'{np.rad2deg(problem.turned):.0f} deg in all, too little to test how much '
+                   f'the wheels slide sideways: {1e3 * np.sqrt(least):.0f} mm in a second are '
+                   'assumed, and the sigmas of the mounting angles rest on that')]

@@ -1,0 +1,76 @@
+"""Where a leg has no turns to test it by, an ordinary road's sideways noise is believed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from smoother_legs import made, truth
+
+from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.slide import least_slide, ROAD, SIDEWAYS, TESTED, turned
+from odocal_ros.reasons import Code
+
+
+def said(method):
+    """Tell whether the result says that a road's noise was assumed."""
+    return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'are assumed' in r.text
+               for r in method.reasons)
+
+
+def straight(**options):
+    return made(scenario='straight', duration=300.0, imu_grade='industrial', **options)
+
+
+@pytest.mark.parametrize('sway', [0.0, 0.05])
+def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
+    drive, config, leg = straight(sway=sway)
+    method = smooth(leg, config)
+    noise = dict(method.details['noise'])
+    tau = noise.pop('correlation_time')
+    # the road's noise in the place of what the fit made of the seconds
+    levels = Levels({k: v**2 for k, v in noise.items()}, tau).but(
+        **dict.fromkeys(SIDEWAYS, 0.05**2 / 10.0))
+    sigma = np.sqrt(bound(leg, config, truth(drive, config, leg), levels)[1, 1])
+    stated = method.estimates['yaw_mounting_angle'].sigma
+    # linearised at the estimate and not at the truth, heavy tails: 3 %; a second sways
+    # by a level known to 5 % of sqrt(1 / 2 / 200 s)
+    assert stated == pytest.approx(sigma, rel=0.03 + 0.05)
+    assert stated > 0.97 * sigma
+    if not sway:
+        assert said(method)
+
+
+def test_a_leg_with_turns_tests_it_itself():
+    _, config, leg = made(duration=200.0, imu_grade='industrial')
+    method = smooth(leg, config)
+    assert not said(method)
+    # wheels that never slide: far below a road's
+    assert max(method.details['noise'][name] for name in SIDEWAYS) < ROAD / 10
+
+
+def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():
+    drive, config, leg = made(duration=200.0, imu_grade='industrial')
+    problem = Problem.of(leg, config)
+    t = problem.imu.t[problem.imu.key] + (drive.truth.start_ns - drive.options.start_ns) * 1e-9
+    yaw = np.abs(np.diff(drive.motion.at(t).yaw))
+    # slower than TURNING between turns: less than that rate for all the time
+    assert turned(leg, problem.imu) == pytest.approx(yaw[yaw > 0.05].sum(), rel=0.02)
+    biased = replace(leg, w_b=leg.w_b + [0.0, 0.0, 0.06])
+    assert Problem.of(biased, config).turned == pytest.approx(problem.turned, rel=0.02)
+    assert straight_angle() == 0.0
+
+
+def straight_angle():
+    _, config, leg = straight()
+    return Problem.of(leg, config).turned
+
+
+def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
+    angles = np.deg2rad(np.arange(0.0, 270.0))
+    least = np.array([least_slide(a) for a in angles])
+    assert least[:90] == pytest.approx(ROAD)
+    assert least[181:] == pytest.approx(TESTED)
+    # a factor of 80 over 90 deg: 5 % a degree
+    assert np.abs(np.diff(np.log(least))).max() < np.log(ROAD / TESTED) / 90 * 1.001
