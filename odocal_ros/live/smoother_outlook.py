@@ -14,8 +14,8 @@ from odocal_ros.reasons import Verdict
 
 BRISK = 1.5            # m/s^2, of an ordinary stop and start
 SLOWEST = 5.0          # m/s that one would do them from
-# sigma goes with the way to the power of minus one over this
-BY_WAY, BY_WAY_SLOW = 1.25, 2.0       # with white errors of the fixes, with slow ones
+# the way goes with the sigma to the power of minus this: with white errors of the fixes, with slow
+BY_WAY, BY_WAY_SLOW = 1.0, 2.0
 FAR_TOO_FEW = 50       # stops and starts: nobody does so many
 
 
