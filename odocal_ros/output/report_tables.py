@@ -7,6 +7,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.config import Config, flat, SETTINGS
 from odocal_ros.output.figures import length, share, two_digits, with_sigma
 from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known, PPM
+from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 
 LABELS = {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
@@ -19,7 +20,8 @@ WORTH_A_ROW = 0.005      # share of a variance
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
            Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
-           Code.WHEEL_COUNTERS_DIFFER}
+           Code.WHEEL_COUNTERS_DIFFER, Code.ODOMETER_CHOSEN, Code.DELAY_SEEN,
+           Code.REVERSING_UNSIGNED}
 CHECKS = (('as configured', 'before'), ('as calibrated', 'after'))
 
 
@@ -76,8 +78,12 @@ def largest_source(method: MethodResult | None, name: str) -> str:
     return "the legs' own errors" if largest == 'legs' else label(largest)
 
 
-def method_table(methods: dict[str, MethodResult]) -> dict | None:
-    """Return any set of methods side by side: heads, verdicts, rows of (name, cells)."""
+def method_table(methods: dict[str, MethodResult], legs: tuple[LegResult, ...]) -> dict | None:
+    """
+    Return any set of methods side by side: heads, verdicts, rows of (name, cells).
+
+    legs : those that the figures rest on.
+    """
     if not methods:
         return None
     names = dict.fromkeys(n for m in methods.values() for n in m.estimates if n != 'scale_ratio'
@@ -90,7 +96,7 @@ def method_table(methods: dict[str, MethodResult]) -> dict | None:
             cells.append(('-', '') if name not in method.estimates else (first, other))
         rows.append((label(name), cells))
     return {'heads': [label(m) for m in methods],
-            'verdicts': [m.verdict.value for m in methods.values()], 'rows': rows,
+            'verdicts': [shown_verdict(m, legs) for m in methods.values()], 'rows': rows,
             'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
 
 

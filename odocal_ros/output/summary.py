@@ -9,6 +9,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Reason, Verdict
 
 WIDTH = 98
@@ -35,7 +36,7 @@ def screen(calibration: Calibration, styled: bool = False) -> str:
     styled : the verdict in bold and in colour, for a terminal.
     """
     parts = [_head(calibration, styled), _values(calibration), _leg_table(calibration.legs),
-             _method_table(calibration.methods), _check(calibration.legs), _budget(calibration),
+             _method_table(calibration), _check(calibration.legs), _budget(calibration),
              _reasons(calibration.reasons)]
     return '\n\n'.join('\n'.join(part) for part in parts if part)
 
@@ -187,8 +188,9 @@ def _columns(rows):
                              ).rstrip() for row in rows]
 
 
-def _method_table(methods):
+def _method_table(calibration):
     """Return the methods side by side, nothing for one."""
+    methods = calibration.methods
     if len(methods) < 2:
         return []
     rows = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
@@ -196,7 +198,7 @@ def _method_table(methods):
         scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
                      *('-' if a.value is None else with_sigma(a.value, a.sigma, DEG, signed=True)
-                       for a in angles), method.verdict.value))
+                       for a in angles), shown_verdict(method, calibration.legs)))
     return _columns(rows)
 
 

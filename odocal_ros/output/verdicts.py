@@ -1,0 +1,21 @@
+"""The verdict of a method as it is shown: no better than that of the data it was fed with."""
+
+from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.reasons import Verdict, verdict_of
+
+
+def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
+    """
+    Return the verdict of a method's figures, '(leg)' behind it where it is that of the leg.
+
+    What is wrong with a leg's data is no method's reason, but touches each of them: a method that
+    found nothing to say of a dead wheel is no way round it.
+
+    legs : those the figures rest on; of several that are good in part, the good ones count.
+    """
+    of_data = [verdict_of(leg.reasons) for leg in legs]
+    used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
+    worst = Verdict.worst([method.verdict, *used])
+    if worst is method.verdict:
+        return worst.value
+    return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
