@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.task import Future
+from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
@@ -29,6 +30,21 @@ from odocal_ros.live.recording import Recording
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
+HELP = """\
+usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]
+
+Calibrates a vehicle's odometer against IMU and GNSS while it is driven (a ROS 2 node; the same
+over recorded bags is 'odocal replay').
+
+listens to   imu/data, odometer, fix; where set so odometer_right, fix_velocity, heading
+             (another name: -r odometer:=/your/topic)
+services     ~/start_leg before a drive and ~/stop_leg after it, which answers with the result;
+             ~/cancel_leg, ~/undo_leg, ~/reset, ~/save   (all std_srvs/srv/Trigger)
+says         ~/status: what it waits for and what to do next; /diagnostics; ~/path/...; the
+             result as parameters result.*
+settings     parameters, all in config/calibrator.yaml with what they mean:
+             'calibrator --ros-args --params-file calibrator.yaml', or one by one
+             'calibrator --ros-args -p odometer.nominal_scale:=0.02'"""
 SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
 
 
@@ -144,12 +160,19 @@ def main(args=None) -> int:
     """
     Run the node until it is told to end.
 
-    Returns 0 after SIGINT, SIGTERM or a shutdown of the context; 1 when it cannot start, with
-    one line that says why.
+    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help was asked
+    for; 1 when it cannot start, with one line that says why.
     """
     # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
     signal.signal(signal.SIGINT, lambda *_: None)
     try:
+        asked = remove_ros_args(args)[1:]
+        if {'-h', '--help'} & set(asked):
+            print(HELP)
+            return 0
+        if asked:
+            return _complain(f'{asked[0]} means nothing here: settings are ROS parameters, '
+                             'written after --ros-args (see calibrator --help)')
         _init(args)
     except Exception as error:
         text = ' '.join(str(error).split()).split(', at /')[0]

@@ -3,9 +3,10 @@
 import math
 import os
 import signal
+import subprocess
 import time
 
-from bench import answer_of, NodeProcess, ROOT, wait_for
+from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
 from player import messages_of, part, Player, Sent
 import pytest
 
@@ -43,6 +44,18 @@ def test_a_signal_before_anything_ran_is_clean_too(start, connect):
     connect().until(state='waiting')
     node.end()
     assert (node.process.returncode, [x for x in node.lines if 'INFO' not in x]) == (0, [])
+
+
+@pytest.mark.parametrize(('arguments', 'code', 'words'), [
+    (['--help'], 0, 'usage: calibrator [--ros-args'), (['-h'], 0, '~/start_leg'),
+    (['--help', '--ros-args', '-p', 'imu.grade:=tactical'], 0, 'config/calibrator.yaml'),
+    (['--config', 'x.yaml'], 1, 'calibrator: --config means nothing here: settings are ROS')])
+def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments, code, words):
+    ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=PATIENCE,
+                           env=os.environ | {'PYTHONPATH': str(ROOT)}, check=False)
+    assert ended.returncode == code
+    assert words in ended.stdout + ended.stderr
+    assert bool(ended.stdout) == (code == 0)
 
 
 @pytest.mark.parametrize(('override', 'words'), [
