@@ -8,7 +8,7 @@ A publisher process sends Imu, pulses and fixes; the calibrator and a bare rclpy
 subscribes to the same topics, typed, with an empty callback, run beside it, all at once. Printed:
 CPU of one core for each, messages lost, and the latency of a service call during a leg. The fixes
 drive east at 10 m/s while the pulses count, so that the node has something to foresee: how often
-it did is printed too.
+it did, and how often there was a new running estimate, is printed too.
 """
 
 import argparse
@@ -158,6 +158,10 @@ def report(args, client, sent, used, latencies, told) -> None:
           f'max {ordered[-1]:.1f} ms')
     print(f'predictions meanwhile: {len(told)}' + (
         f', scale sigma {float(told[0]):.0f} to {float(told[-1]):.0f} ppm' if told else ''))
+    values = [v for v in (s['estimate_scale_factor'] for s in client.statuses) if v != 'nan']
+    ages = [float(s['estimate_age_s']) for s in client.statuses]
+    print(f'running estimates meanwhile: {len(dict.fromkeys(values))}, the oldest '
+          f'{max((a for a in ages if a == a), default=0.0):.0f} s old')
 
 
 def main() -> None:

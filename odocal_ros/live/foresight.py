@@ -21,7 +21,13 @@ from odocal_ros.leg import Leg
 from odocal_ros.leg_profile import fix_figures, profile_of
 from odocal_ros.live.ability import stated_variance, with_heading
 from odocal_ros.live.outlook import Abandoned, FARTHEST, Outlook, Prospect
-from odocal_ros.live.smoother_outlook import with_smoother
+from odocal_ros.live.smoother_outlook import (
+    gives_all,
+    look,
+    nothing_foreseen,
+    ONLY,
+    with_running,
+)
 from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.wheels_so_far import sources_of, with_wheels
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
@@ -79,16 +85,16 @@ def outlook_of(leg: Leg, fix_rate: float, config: Config,
         Nothing can be foreseen yet: no motion, no fixes, scale unknown.
 
     """
-    if deciding(config.method) == ('smoother',):      # its looks alone are what may be foreseen
-        limits = config.verdict
-        outlook = Outlook(Prospect(None, limits.max_scale_sigma, None),
-                          Prospect(None, limits.max_yaw_sigma, None))
+    running = look(leg, config, smoother, wanted)
+    if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
+        outlook = nothing_foreseen(config)
     else:
-        outlook = with_wheels(_by_ends(leg, fix_rate, config, wanted), leg, config)
+        outlook = _by_ends(leg, fix_rate, config, wanted)
     if not wanted():
         raise Abandoned
-    if smoother is not None:
-        outlook = with_smoother(outlook, leg, config, smoother, wanted)
+    outlook = with_wheels(outlook, leg, config)
+    if running is not None:
+        outlook = with_running(outlook, running, config)
     estimates, _ = choose(outlook.methods, config.method)
     return replace(outlook, estimates=estimates, until_ns=leg.stop_ns)
 
@@ -110,13 +116,10 @@ def _by_ends(leg, fix_rate, config, wanted) -> Outlook:
         return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
 
     limits = config.verdict
-    outlook = Outlook(
+    return Outlook(
         prospect(SCALE, limits.max_scale_sigma),
         prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)),
         now.method.estimates[PITCH].sigma)
-    if not wanted():
-        raise Abandoned
-    return outlook
 
 
 def _yaw_limit(now: Prediction, asked: float) -> str:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
@@ -12,6 +13,8 @@ from odocal_ros.live.smoother_so_far import Running, SmootherSoFar
 from odocal_ros.live.wheels_so_far import sources_of
 from odocal_ros.reasons import Verdict
 
+ONLY = ('smoother',)
+SCALE, YAW, PITCH = PARAMETERS
 BRISK = 1.5            # m/s^2, of an ordinary stop and start
 SLOWEST = 5.0          # m/s that one would do them from
 # the way goes with the sigma to the power of minus this: with white errors of the fixes, with slow
@@ -19,10 +22,9 @@ BY_WAY, BY_WAY_SLOW = 1.0, 2.0
 FAR_TOO_FEW = 50       # stops and starts: nobody does so many
 
 
-def with_smoother(outlook: Outlook, leg: Leg, config: Config, smoother: SmootherSoFar,
-                  wanted) -> Outlook:
+def look(leg: Leg, config: Config, smoother: SmootherSoFar | None, wanted) -> Running | None:
     """
-    Return an outlook with what the smoother tells so far, where the result will be by it.
+    Return the smoother's running estimate, None where it says nothing yet or is not asked.
 
     leg : the way so far.   wanted : asked between passes, Abandoned is raised when it says no.
 
@@ -32,44 +34,60 @@ def with_smoother(outlook: Outlook, leg: Leg, config: Config, smoother: Smoother
         Nothing can be told yet, and the smoother is the only method.
 
     """
-    if 'smoother' not in deciding(config.method):
-        return outlook
+    if smoother is None or 'smoother' not in deciding(config.method):
+        return None
     try:
-        running = smoother.look(leg, config, wanted)
+        return smoother.look(leg, config, wanted)
     except OdocalError:
-        if deciding(config.method) == ('smoother',):
+        if deciding(config.method) == ONLY:
             raise
-        return outlook
+        return None
+
+
+def gives_all(running: Running | None) -> bool:
+    """Return whether scale, yaw and pitch of the result will be the smoother's."""
+    return running is not None and running.method.verdict is not Verdict.REJECTED and all(
+        running.method.estimates[name].value is not None for name in PARAMETERS)
+
+
+def nothing_foreseen(config: Config) -> Outlook:
+    """Return an outlook that only tells what is asked."""
+    return Outlook(Prospect(None, config.verdict.max_scale_sigma, None),
+                   Prospect(None, config.verdict.max_yaw_sigma, None))
+
+
+def with_running(outlook: Outlook, running: Running, config: Config) -> Outlook:
+    """Return an outlook with a running estimate, where the result will be by it."""
     method = running.method
     if method.verdict is not Verdict.REJECTED:
         outlook = replace(outlook, methods=outlook.methods | {'smoother': method})
     given, _ = choose(outlook.methods, config.method)
     by = {name: e.method for name, e in given.items() if e.value is not None}
     scale, yaw, pitch = outlook.scale, outlook.yaw, outlook.pitch
-    if by.get('scale_factor') == 'smoother' or scale.sigma is None:
+    if by.get(SCALE) == 'smoother' or scale.sigma is None:
         scale = _scale(running, scale.asked)
-    if by.get('yaw_mounting_angle') == 'smoother' or yaw.sigma is None:
+    if by.get(YAW) == 'smoother' or yaw.sigma is None:
         yaw = _yaw(running, yaw.asked)
-    if by.get('pitch_mounting_angle') == 'smoother' or pitch is None:
+    if by.get(PITCH) == 'smoother' or pitch is None:
         pitch = float(running.sigmas[2])
     return replace(outlook, scale=scale, yaw=yaw, pitch=pitch)
 
 
 def _scale(running: Running, asked: float) -> Prospect:
-    e = running.method.estimates['scale_factor']
+    e = running.method.estimates[SCALE]
     slow = running.method.details['noise']['correlation_time'] > 0
     sigma = float(running.sigmas[0])
     metres = _metres(running, sigma / asked, BY_WAY_SLOW if slow else BY_WAY)
     now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
-    return Prospect(sigma, asked, metres, sources_of(running.method, 'scale_factor'),
+    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
                     f'no {FARTHEST / 1000:.0f} km more bring it to what is asked', now)
 
 
 def _yaw(running: Running, asked: float) -> Prospect:
     """Return the prospect of the yaw, of which acceleration, along or across, is what tells."""
-    e = running.method.estimates['yaw_mounting_angle']
+    e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
     ratio, lack = sigma / asked, ''
     if ratio > 1:
@@ -80,7 +98,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
     now = '' if e.value is None or e.sigma is None else _digits(
         math.degrees(e.value), math.degrees(e.sigma))
     return Prospect(sigma, asked, _metres(running, ratio, 2.0),
-                    sources_of(running.method, 'yaw_mounting_angle'), '', now, lack)
+                    sources_of(running.method, YAW), '', now, lack)
 
 
 def _metres(running, ratio, power) -> float | None:

@@ -36,14 +36,11 @@ from odocal_ros.reasons import Code
 from odocal_ros.screen import screen
 
 FINE, COARSE = 1.0, 2.0     # s between keyframes, of a leg up to LONG and beyond
-LONG = 900.0                # s
+LONG = 660.0                # s
 FEW_KEYS = 150              # keyframes of a fit from nothing: it takes ten times the passes
 PASSES, MORE = 2, 6         # from the last look, and where that was not enough
 GROWN = 1.5                 # of the leg, until the sort of fix errors is decided anew
 TOLD = 90.0                 # s of a leg in which slow errors of the fixes show as such
-# s of driving in which noise levels are so unsure that errors are sqrt(2) times the sigmas (of 36
-# town drives: 1.3 times after a minute, 1.15 after two, none after five)
-UNSURE = 30.0
 AGREE = 3.0                 # sigmas within which a fit from nothing bears the running one out
 
 
@@ -193,8 +190,7 @@ def _running(view, problem, best, config) -> Running:
     moving = steps > 0.5 * T
     way = max(float(steps.sum()), 1.0)
     sigmas = np.sqrt(np.diag(best.solved.covariance))[[LN_K, YAW, PITCH]]
-    short = np.sqrt(1 + UNSURE / max(float(T[moving].sum()), 1.0))
-    sigmas = np.hypot(sigmas * method.details['widened'] * short,
+    sigmas = np.hypot(sigmas * method.details['widened'],
                       _slow_yet_unseen(view, best, config, way))
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)

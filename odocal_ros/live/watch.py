@@ -15,7 +15,7 @@ from odocal_ros.live.worker import Worker
 from odocal_ros.samples import join
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
-SHARE = 1 / 25             # of one core is what looking may cost in the long run
+SHARE = 1 / 20             # of one core is what looking may cost in the long run
 
 
 class Watch:

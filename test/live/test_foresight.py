@@ -350,8 +350,8 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
         now_ns += EVERY_NS
         look.look(now_ns)
         finished(worker)
-    # the first comes with imports and goes free, the others 25 s apart: at 1, 2, 27, ... 102 s
-    assert len(looks) == 6
+    # the first comes with imports and goes free, the others 20 s apart: at 1, 2, 22, ... 102 s
+    assert len(looks) == 7
 
 
 # two wheels

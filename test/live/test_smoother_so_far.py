@@ -18,7 +18,7 @@ from odocal_ros.live.session import Session
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.sketch import Sketch
 from odocal_ros.live.smoother_carried import carried, rows_of
-from odocal_ros.live.smoother_outlook import with_smoother
+from odocal_ros.live.smoother_outlook import look, with_running
 from odocal_ros.live.smoother_so_far import PASSES, SmootherSoFar
 from odocal_ros.pipeline import calibrate
 from odocal_ros.samples import take
@@ -79,9 +79,9 @@ def test_at_the_end_it_is_the_result_within_half_a_sigma(drive, config, looks):
 
 def test_it_is_not_farther_from_the_truth_than_it_says(drive, looks):
     truth = drive.truth
-    for look in looks:
+    for seen in looks:
         for name, true in zip(NAMES, (truth.scale, truth.yaw, truth.pitch), strict=True):
-            e = look.running.method.estimates[name]
+            e = seen.running.method.estimates[name]
             assert abs(e.value - true) < 4 * e.sigma        # 24 of them: 1 in 700 by chance
 
 
@@ -180,8 +180,8 @@ def test_too_little_is_said_and_no_look_is_lost_by_it(config, looks, changed, wo
 
 # what is made foreseen
 
-def outlook_at(look, config, **settings):
-    return outlook_of(look.leg, 5.0, with_settings(config, settings), smoother=SmootherSoFar())
+def outlook_at(seen, config, **settings):
+    return outlook_of(seen.leg, 5.0, with_settings(config, settings), smoother=SmootherSoFar())
 
 
 def test_the_sigma_that_counts_is_of_the_method_that_will_give(config, looks):
@@ -203,23 +203,21 @@ def test_before_the_smoother_can_say_anything_the_end_points_are_foreseen(config
         def look(self, *_):
             raise OdocalError('too little')
 
-    before = Outlook(Prospect(0.1, 1e-3, 500.0), Prospect(None, 0.0087, None, (), 'not told'))
     leg = looks[0].leg
-    assert with_smoother(before, leg, Config(), Silent(), lambda: True) is before
+    assert look(leg, Config(), Silent(), lambda: True) is None
+    assert outlook_of(leg, 5.0, Config(), smoother=Silent()).scale.sources[0][0] == 'fix_end'
     with pytest.raises(OdocalError, match='too little'):
-        with_smoother(before, leg, with_settings(Config(), {'method': 'smoother'}), Silent(),
-                      lambda: True)
+        look(leg, with_settings(Config(), {'method': 'smoother'}), Silent(), lambda: True)
 
 
 def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(drive, config):
     white = with_settings(config, {'gnss.correlation_time': 0.0})
-    early, late = (look.running for look in looked(drive, white, (95.0, 240.0)))
+    early, late = (seen.running for seen in looked(drive, white, (95.0, 240.0)))
     assert late.distance > 1.6 * early.distance
     assert late.agility > 1.5 * early.agility
     # what was to be driven for the sigmas that came out, and what was driven
     before = Outlook(*(Prospect(None, float(sigma), None) for sigma in late.sigmas[:2]))
-    found = with_smoother(before, drive.leg(), config, SimpleNamespace(look=lambda *_: early),
-                          lambda: True)
+    found = with_running(before, early, config)
     # a law of one power stands for what starts, stops and turns make of it
     assert found.scale.metres == pytest.approx(late.distance - early.distance, rel=0.4)
     assert 'stop and start' in found.yaw.lack
@@ -227,17 +225,16 @@ def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(drive, confi
         (early.sigmas[1] / late.sigmas[1])**2, rel=0.5)
 
 
-def of_sigmas(look, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
+def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
     """Return an outlook made of a running estimate with other figures."""
-    method = look.running.method
+    method = seen.running.method
     found = dict(method.estimates)
     if not known:
         found['yaw_mounting_angle'] = Estimate(None, None, 'rad')
-    running = replace(look.running, method=replace(method, estimates=found), agility=agility,
+    running = replace(seen.running, method=replace(method, estimates=found), agility=agility,
                       sigmas=np.array([scale, yaw, 1e-3]), speed=10.0, distance=500.0)
     before = Outlook(Prospect(0.1, 1e-3, 500.0), Prospect(None, 0.01, None, (), 'not told'))
-    return with_smoother(before, look.leg, Config(),
-                         SimpleNamespace(look=lambda *_: running), lambda: True)
+    return with_running(before, running, Config())
 
 
 def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(looks):

@@ -1,0 +1,91 @@
+"""
+What looks at a leg cost while it is recorded, and how good the running estimate is.
+
+    python benchmarks/live_looks.py [--seconds 600] [--grade consumer] [--noise white]
+
+A simulated town drive is looked at as the node does, without ROS. Printed as the leg grows: CPU of
+a look, what of it is done ever less often, and when the next will be; at the end how far the
+running estimate is from the result of the whole leg.
+"""
+
+import argparse
+import math
+from pathlib import Path
+import sys
+import time
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from odocal_ros.config import Config, with_settings  # noqa: E402
+from odocal_ros.errors import OdocalError  # noqa: E402
+from odocal_ros.live.foresight import outlook_of  # noqa: E402
+from odocal_ros.live.sketch import Sketch  # noqa: E402
+from odocal_ros.live.smoother_so_far import SmootherSoFar  # noqa: E402
+from odocal_ros.live.watch import EVERY_NS, SHARE  # noqa: E402
+from odocal_ros.pipeline import calibrate  # noqa: E402
+from odocal_ros.samples import take  # noqa: E402
+from odocal_ros.sim.scenarios import SimOptions, simulate  # noqa: E402
+
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+LINES = 40       # printed of a leg
+
+
+def look(leg, config, state, before_ns, now_ns):
+    """Take a look at what has come between two stamps: outlook or None, s of CPU, s once."""
+    sketch, smoother = state
+    begin = time.thread_time()
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(leg, slot)
+        sketch.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
+    try:
+        seen = outlook_of(sketch.leg(leg.start_ns), sketch.fix_rate(), config, smoother=smoother)
+    except OdocalError:
+        seen = None
+    return seen, time.thread_time() - begin, smoother.once_s
+
+
+def show(leg, config, seconds):
+    """Print all looks at a leg; return the last outlook."""
+    print('   leg s   look s CPU   of that once   next after s   scale sigma ppm   yaw sigma deg')
+    state = Sketch(leg.form), SmootherSoFar()
+    before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + EVERY_NS, [], 0.0, -1.0
+    while before_ns < leg.stop_ns:
+        seen, cost, once = look(leg, config, state, before_ns, now_ns)
+        total += cost
+        pauses.append(max(EVERY_NS * 1e-9, cost + (cost - once) / SHARE))
+        t = (now_ns - leg.start_ns) * 1e-9
+        if seen is not None and (t > shown + seconds / LINES or now_ns >= leg.stop_ns):
+            shown = t
+            print(f'{t:8.0f} {cost:12.2f} {once:14.2f} {pauses[-1]:14.1f} '
+                  f'{seen.scale.sigma * 1e6:17.1f} {math.degrees(seen.yaw.sigma or 0.0):15.4f}')
+        next_ns = now_ns + round(pauses[-1] * 1e9)
+        before_ns, now_ns = now_ns, leg.stop_ns if now_ns < leg.stop_ns < next_ns else next_ns
+    middle, most = sorted(pauses)[len(pauses) // 2], max(pauses[1:])
+    print(f'{len(pauses)} looks, {100 * total / seconds:.1f} % of a core; from one to the next '
+          f'{middle:.1f} s in the middle, {most:.1f} s at most')
+    return seen
+
+
+def main() -> None:
+    """Drive, look, compare."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--seconds', type=float, default=600.0)
+    parser.add_argument('--imu', type=float, default=100.0)
+    parser.add_argument('--grade', default='consumer')
+    parser.add_argument('--noise', default='white', help='of the fixes: white, correlated, rtk')
+    parser.add_argument('--seed', type=int, default=1)
+    args = parser.parse_args()
+    config = with_settings(Config(), {'imu.grade': args.grade})
+    leg = simulate(SimOptions(scenario='town', duration=args.seconds, imu_rate=args.imu,
+                              imu_grade=args.grade, fix_noise=args.noise, seed=args.seed)).leg()
+    seen = show(leg, config, args.seconds)
+    result = calibrate(leg, config).methods['smoother'].estimates
+    for name in NAMES:
+        e, r = seen.methods['smoother'].estimates[name], result[name]
+        print(f'{name}: {(e.value - r.value) / r.sigma:+.2f} sigmas from the result, with '
+              f'{e.sigma / r.sigma:.2f} times its sigma')
+
+
+if __name__ == '__main__':
+    main()
