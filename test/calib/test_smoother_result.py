@@ -11,7 +11,12 @@ from smoother_legs import leg_of, made, truth
 from odocal_ros.calib.budget import total_covariance
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.outcome import not_settled
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.start import first_state
+from odocal_ros.calib.smoother.state import YAW
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -148,3 +153,18 @@ def test_an_imu_worse_than_its_grade_is_said():
     method = smooth(leg_of(replace(drive.leg(), imu=shaking), config), config)
     assert Code.IMU_WORSE_THAN_GRADE in codes(method)
     assert np.abs(off(drive, method)).max() < 3.3
+
+
+def test_what_does_not_settle_is_said_with_what_moves_and_what_the_drive_lacks():
+    _, config, leg = made(**SHORT)
+    even = replace(leg, t_begin=0.0, t_stop=60.0, standstills=np.empty((0, 2)))
+    for one, lacks in ((leg, False), (even, True)):
+        problem = Problem.of(one, config)
+        start = first_state(one, problem.imu, problem.priors).state
+        start.constants[YAW] += 0.1         # far off, and but one pass
+        method = not_settled(one, problem, fit(problem, start, problem.first_levels, 1), config)
+        assert method.verdict is Verdict.REJECTED
+        text = method.reasons[0].text
+        assert method.reasons[0].code is Code.NOT_CONVERGED
+        assert 'after 1 passes the yaw mounting angle still moves by' in text
+        assert ('; the drive ' in text and 'does not stop' in text) == lacks

@@ -118,7 +118,7 @@ def solve(normal: Normal) -> Solved:
     for k in range(N):
         root, info = dpotrf(D, lower=1)
         if info:
-            raise NotPositive(f'block {k} of {N} is not determined')
+            raise NotPositive(f'nothing holds keyframe {k} of {N}')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
         back[k], right[k] = X[:, :n + m], X[:, n + m]

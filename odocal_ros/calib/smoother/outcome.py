@@ -7,7 +7,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.shares import shares
-from odocal_ros.calib.smoother.slide import assumed
+from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
@@ -42,6 +42,20 @@ def refused(reasons, scale_unit, details=None) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     return MethodResult('smoother', tuple(reasons), _unknown(scale_unit), PARAMETERS, (),
                         details or {})
+
+
+def not_settled(leg, problem, fit, config) -> MethodResult:
+    """Return the refusal of a fit that goes to and fro: what moves, and what may be the cause."""
+    move = np.abs(fit.solved.step_border[:3]) / np.sqrt(np.diag(fit.solved.covariance))[:3]
+    worst = int(np.argmax(move))
+    text = (f'after {fit.iterations} passes {in_words([CONSTANTS[worst]])} still moves by '
+            f'{move[worst]:.2g} of its sigma')
+    lacks = [f'turns by {np.rad2deg(problem.turned):.0f} deg in all'] * (problem.turned < NO_TURN)
+    lacks += ['does not stop'] * (not problem.still.any())
+    if lacks:
+        text += f'; the drive {" and ".join(lacks)}'
+    _, odd = mismatch(problem, fit, fit.solved.neighbours(), config)
+    return refused([Reason(Code.NOT_CONVERGED, text), *odd], leg.scale_unit)
 
 
 def _unknown(scale_unit):

@@ -8,7 +8,7 @@ from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import outcome, refused
+from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
 from odocal_ros.calib.smoother.outside_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
@@ -46,13 +46,10 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}')],
-                       leg.scale_unit)
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}; '
+                               'samples are missing or wild there')], leg.scale_unit)
     if not best.settled:
-        sigma = np.sqrt(np.diag(best.solved.covariance))[:3]
-        move = np.abs(best.solved.step_border[:3] / sigma).max()
-        return refused([Reason(Code.NOT_CONVERGED, f'after {best.iterations} iterations the '
-                               f'estimate still moves by {move:.2g} sigmas')], leg.scale_unit)
+        return not_settled(leg, problem, best, config)
     return outcome(leg, problem, best, config)
 
 
