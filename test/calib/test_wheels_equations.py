@@ -10,7 +10,7 @@ import pytest
 from wheel_legs import wheel_leg
 
 from odocal_ros.calib.wheels.first import near_neighbours
-from odocal_ros.calib.wheels.judge_noise import evidence, inverse_root, judge_slip, slow_means
+from odocal_ros.calib.wheels.judge_noise import evidence, inverse_root, judge_turns, slow_means
 from odocal_ros.calib.wheels.leg import C_bv, wheel_factors
 from odocal_ros.calib.wheels.model import equations, make_bins, State
 from odocal_ros.calib.wheels.noise import walk_root
@@ -142,16 +142,55 @@ def test_evidence_is_the_restricted_likelihood_written_out():
     assert_allclose(found[0] - expected[0], np.linalg.slogdet(known)[1] / 2)
 
 
-def test_slip_is_found_as_large_as_it_is():
-    rng = np.random.default_rng(2)
-    n = 100
+def turns(slip, count_sigma, seed=2, n=100):
+    """Return what is judged of turns of known slip, m/sqrt(s), and rounding, m; believed: 1 mm."""
+    rng = np.random.default_rng(seed)
     walk = walk_root(np.full(n, 5.0))
-    known = 1e-6 * np.eye(n)
-    r = np.sqrt(2) * 0.01 * walk @ rng.standard_normal(walk.shape[1]) + 1e-3 * rng.standard_normal(
-        n)
-    found = judge_slip(r, np.ones((n, 1)), known, 2 * walk @ walk.T)
+    r = (np.sqrt(2) * slip * walk @ rng.standard_normal(walk.shape[1])
+         + count_sigma * rng.standard_normal(n))
+    return judge_turns(r, np.ones((n, 1)), 1e-12 * np.eye(n), 1e-6 * np.eye(n), 2 * walk @ walk.T)
+
+
+def test_slip_is_found_as_large_as_it_is():
     # 99 squared steps: the variance to sqrt(2 / 99), three sigmas 43 %
-    assert found == pytest.approx(1e-4, rel=0.43)
+    assert turns(0.01, 1e-3).slip == pytest.approx(1e-4, rel=0.43)
+
+
+@pytest.mark.parametrize('level', [0.3, 1.0, 4.0, 20.0])
+def test_rounding_is_found_as_large_as_it_is_and_is_no_slip(level):
+    found = turns(0.0, 1e-3 * np.sqrt(level))
+    # as above, and half a step of the levels tried, 26 %; the belief, 0.7 wide, draws ln(level) by
+    # (0.14 / 0.7)^2 = 4 % of itself
+    assert found.counts == pytest.approx(level, rel=0.43 + 0.26 + 0.04 * abs(np.log(level)))
+    # a slip that moves the track from bin to bin by a tenth of the rounding would go unseen
+    assert 5.0 * 2 * found.slip < 0.01 * level * 1e-6
+
+
+def test_rounding_of_which_a_drive_says_nothing_is_that_of_independent_rows():
+    n, walk = 100, walk_root(np.full(100, 5.0))
+    found = judge_turns(np.zeros(n), np.ones((n, 1)), np.eye(n), 1e-12 * np.eye(n), walk @ walk.T)
+    assert found.counts == pytest.approx(1.0, rel=1e-2)     # mean of the belief on its levels
+    # floats and speeds do not round: nothing to judge
+    none = judge_turns(np.zeros(n), np.ones((n, 1)), np.eye(n), np.zeros((n, n)), walk @ walk.T)
+    assert none.counts == pytest.approx(1.0)
+
+
+def test_rounding_at_one_speed_is_not_that_of_independent_rows():
+    """The closed form in noise.quantisation, against counts of discs that stand anywhere."""
+    n, rng = 60, np.random.default_rng(6)
+    m = np.arange(1, 2001)
+    for x in (23.0, 23.001, 23.25, 23.381966):
+        rolled = x * np.arange(n) + rng.uniform(size=(4000, 1))
+        mean = (np.floor(rolled) - rolled).mean(axis=1)
+        phasors = np.exp(2j * np.pi * x * np.outer(np.arange(n), m)).mean(axis=0)
+        expected = (np.abs(phasors)**2 / (2 * np.pi**2 * m**2)).sum()
+        # 4000 draws: the variance to 2.2 %, three sigmas 7 %; harmonics cut: 1 / (2 pi^2 2000)
+        assert mean.var() == pytest.approx(expected, rel=0.07, abs=1 / (2 * np.pi**2 * 2000))
+    steps = rng.uniform(size=(4000, 1))         # over all speeds: 1 / (12 n)
+    rolled = steps * np.arange(n) + rng.uniform(size=(4000, 1))
+    mean = (np.floor(rolled) - rolled).mean(axis=1)
+    # kurtosis up to n: the variance to sqrt(60 / 4000) = 12 %, three sigmas 37 %
+    assert mean.var() == pytest.approx(1 / (12 * n), rel=0.37)
 
 
 def test_outliers_are_told_from_slow_errors():

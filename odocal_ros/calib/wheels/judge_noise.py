@@ -1,5 +1,5 @@
 """
-How large and how slow the fixes' errors are, and how far wheels slip, judged from the residuals.
+How large and how slow the fixes' errors are, how far wheels slip and counts stray, by residuals.
 
 Restricted likelihood over a grid, together with what the receiver states: the covariance used is
 its mean over what is believable, so that a sigma holds what is not known of the noise itself.
@@ -17,6 +17,8 @@ SLOW = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated varianc
 BELIEF = 0.5          # ln: how far the stated variance may be off, before looking
 SLIPS = np.append(0.0, np.geomspace(1e-5, 0.1, 41))      # m/sqrt(s)
 WHITE_BELIEF = 0.8    # that nothing lasts, no wheel slips
+LEVELS = 2.0**(np.arange(-4, 8) / 1.5)    # of the variance of rounding in motion
+LEVEL_BELIEF = 0.7    # ln: how far it may be off, before looking
 LEAST_WHITE = 1e-4    # of the stated variance
 FEW = 20              # fixes below which their scatter says nothing
 
@@ -34,6 +36,19 @@ class FixNoise:
     slow: float
     time: float
     covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TurnNoise:
+    """
+    What was judged of the wheels' turn.
+
+    slip : m^2/s, variance rate of each wheel.   counts : level of rounding in motion, as noise.py
+    has it: variance of that of rows which round independently.
+    """
+
+    slip: float = 0.0
+    counts: float = 1.0
 
 
 def white_share(t_fix, residual, covariance_n, bins: Bins):
@@ -98,17 +113,29 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
                     float(times[best[0]]) if best[1] else np.nan, W + slow)
 
 
-def judge_slip(r, X, known, walk):
+def judge_turns(r, X, known, counts, walk) -> TurnNoise:
     """
-    Return the mean variance rate of a wheel's slip that is believable, m^2/s.
+    Judge how far rounding to counts and slips make the wheels' turn err.
 
-    r, X : (N,), (N, p) of the turn equation.  known, walk : (N, N) covariance of all else, and of
-    slips of 1 m/sqrt(s).
+    Parameters
+    ----------
+    r, X : (N,), (N, p) arrays
+        Residuals of the turn equation, and derivatives.
+    known, counts, walk : (N, N) arrays
+        Covariance of all else, of rounding in motion taken as independent draws, and of slips of
+        1 m/sqrt(s).
+
     """
-    log = evidence(r, X, inverse_root(known), walk, SLIPS**2)
-    log += np.log(np.where(SLIPS > 0, (1 - WHITE_BELIEF) / (len(SLIPS) - 1), WHITE_BELIEF))
+    levels = LEVELS if counts.any() else np.ones(1)
+    belief = -0.5 * ((np.log(levels) + LEVEL_BELIEF**2 / 2) / LEVEL_BELIEF)**2     # mean 1
+    belief = belief[:, None] + np.log(
+        np.where(SLIPS > 0, (1 - WHITE_BELIEF) / (len(SLIPS) - 1), WHITE_BELIEF))
+    roots = [inverse_root(known + level * counts) for level in levels]
+    log = belief + [evidence(r, X, root, walk, SLIPS**2) + np.log(np.diag(root)).sum()
+                    for root in roots]
     p = np.exp(log - log.max())
-    return float(p @ SLIPS**2 / p.sum())
+    p /= p.sum()
+    return TurnNoise(float((p @ SLIPS**2).sum()), float(levels @ p.sum(axis=1)))
 
 
 def inverse_root(covariance):

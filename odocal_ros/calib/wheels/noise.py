@@ -81,11 +81,11 @@ def walk_root(moving):
     return np.concatenate([so_far * np.sqrt(moving), np.diag(np.sqrt(moving / 12))], axis=1)
 
 
-def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, slip, config):
+def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, turns, config):
     """
     Return all parts but the fixes' own errors, their latency and the gyro's scale.
 
-    since : s, from when on the gyro errs.   slip : m^2/s, variance rate of each wheel's slip.
+    since : s, from when on the gyro errs.   turns : TurnNoise, what was judged of the wheels.
     """
     n = len(eq.turn)
     alignment, nothing = leg.alignment, np.zeros(n)
@@ -108,20 +108,31 @@ def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, s
              * config.gnss.lever_arm_sigma, shared=True),
         Part('odometer_delay', stacked(eq.late, -state.width * yaw_rate)[:, None]
              * config.odometer.time_sigma, shared=True),
-        Part('quantisation', covariance=_quantisation(leg, eq, bins, state))]
-    if slip:
-        parts.append(Part('wheel_slip', _slip_walk(eq) * np.sqrt(slip)))
+        Part('quantisation', covariance=quantisation(leg, eq, bins, state, turns.counts))]
+    if turns.slip:
+        parts.append(Part('wheel_slip', _slip_walk(eq) * np.sqrt(turns.slip)))
     return parts + _events(leg, eq, bins, state)
 
 
-def _quantisation(leg, eq, bins, state):
-    """Return the covariance of what rounding to counts makes: a draw a standstill, many moving."""
+def quantisation(leg, eq, bins, state, level):
+    """
+    Return the covariance of what rounding to counts makes: a draw a standstill, many moving.
+
+    Where the disc stands is open, so the rounding of two rows x counts apart has the covariance
+    1 / 12 - {x} (1 - {x}) / 2 = sum over m of cos(2 pi m x) / (2 pi^2 m^2), {x} the part beyond
+    whole counts. At a steady step of x a row, the mean of n rows has the variance
+    sum of |D_n(m x)|^2 / (2 pi^2 m^2), D_n the mean of n unit phasors 2 pi m x apart. Over all x
+    that is 1 / (12 n), as if each row were rounded anew; at one speed it is most often less, near
+    whole steps up to n times as much. Which, a drive must tell itself: ``level``.
+
+    level : variance of the bin means in motion, of 1 / (12 n).
+    """
     n = len(eq.turn)
     size = (leg.quantum * state.scale)**2 / 12         # of one reading of one wheel
     rows = np.diff(bins.edges) / max(leg.interval, 1e-3)
     draws = np.clip(np.minimum(eq.counts, rows), 1.0, None)
     moving = 1 - eq.rests.sum(axis=1)
-    of_mean = size * (eq.rests @ eq.rests.T + np.diag(moving**2 / draws))
+    of_mean = size * (eq.rests @ eq.rests.T + np.diag(level * moving**2 / draws))
     out = np.zeros((3 * n, 3 * n))
     for axis in range(2):       # of both wheels' mean: half; in whatever direction
         out[axis * n:(axis + 1) * n, axis * n:(axis + 1) * n] = of_mean / 2

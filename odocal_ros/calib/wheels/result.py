@@ -203,7 +203,8 @@ def _details(leg, solution: Solution, covariance, sources, scale, config):
         'fix_latency_sigma': float(np.sqrt(covariance[LATENCY, LATENCY])),
         'gyro_scale_seen': {'value': state.gyro_scale, 'sigma': float(np.sqrt(
             covariance[GYRO, GYRO]))},
-        'slip_walk': float(np.sqrt(solution.slip)),
+        'slip_walk': float(np.sqrt(solution.turns.slip)),
+        'count_noise': float(np.sqrt(solution.turns.counts)),   # 1: each row rounds anew
         'heading_source': leg.alignment.heading_source,
         'heading_drift': {'t': solution.bins.edges, 'rad': state.phi[:, 2]},
         'note': NOTE}

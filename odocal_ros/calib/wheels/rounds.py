@@ -6,7 +6,7 @@ import numpy as np
 
 from odocal_ros.calib.wheels.beliefs import Beliefs, WIDTH_SIGMA
 from odocal_ros.calib.wheels.height import solve_height
-from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_slip, white_share
+from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_turns, TurnNoise, white_share
 from odocal_ros.calib.wheels.least_squares import design, Drift, least_squares
 from odocal_ros.calib.wheels.model import (
     equations,
@@ -23,6 +23,7 @@ from odocal_ros.calib.wheels.noise import (
     known_parts,
     Part,
     phi_loading,
+    quantisation,
     tilted,
     unknown_width,
     walk_root,
@@ -47,7 +48,7 @@ class Rounds:
         self.since = leg.start.t if leg.alignment.heading_source == 'fixed' else leg.alignment.t
         n = len(bins.edges) - 1
         self.bad = np.zeros(n, bool)
-        self.slip, self.told, self.rounds = 0.0, False, 0
+        self.turns, self.told, self.rounds = TurnNoise(), False, 0
 
     def run(self, state, fixes):
         """Return the solution from a first state."""
@@ -68,8 +69,8 @@ class Rounds:
         L = phi_loading(eq, state.width)
         r = np.concatenate([eq.residual[:, 0], eq.residual[:, 1], eq.turn]) + L @ state.phi[:, 2]
         X = design(eq)
-        self._judge_slip(eq, state, r, X, judge)
-        parts = known_parts(leg, eq, self.bins, state, self.since, self.slip, self.config)
+        self._judge_turns(eq, state, r, X, judge)
+        parts = known_parts(leg, eq, self.bins, state, self.since, self.turns, self.config)
         parts.append(Part('pitch', np.concatenate(
             [eq.by[:, 0, 3], eq.by[:, 1, 3], 0 * eq.turn])[:, None] * height.pitch_sigma))
         parts.append(tilted(eq, state, height.tilt_variance))
@@ -93,7 +94,7 @@ class Rounds:
         step = fit.step / np.sqrt(np.diag(np.linalg.inv(fit.normal)))
         kept = int((~self.bad)[self.bins.of_fix].sum())
         return Solution(new, self.bins, eq, fit, fix[:, fit.use] @ fit.left, X,
-                        self._steps(state)[0], tuple(parts), height, self.noise, self.slip,
+                        self._steps(state)[0], tuple(parts), height, self.noise, self.turns,
                         kept, 0, self._bias(fit, L, eq), self.told, False), \
             step[[SCALE, RATIO, HEADING]]
 
@@ -146,20 +147,23 @@ class Rounds:
         self.bad |= far
         return True
 
-    def _judge_slip(self, eq, state, r, X, judge):
+    def _judge_turns(self, eq, state, r, X, judge):
         if not ((judge or self.rounds == 0) and self.turn_rate):
             return      # at first too: else the drift would take the slip upon itself
         n = len(eq.turn)
         turn = slice(2 * n, 3 * n)
         known = sum(p.whole()[turn, turn] for p in known_parts(
-            self.leg, eq, self.bins, state, self.since, 0.0, self.config))
+            self.leg, eq, self.bins, state, self.since, TurnNoise(counts=0.0), self.config))
         walk = walk_root(eq.moving)
         known = known + self.beliefs.nuisances(X[turn])
         columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
         if self.width:      # given, and so no free column: its belief is part of what is known
             known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
             columns = columns[:, [0, 2]]
-        self.slip = judge_slip(r[turn], columns, known, 2 * walk @ walk.T)
+        rounding = [quantisation(self.leg, eq, self.bins, state, level)[turn, turn]
+                    for level in (0.0, 1.0)]
+        self.turns = judge_turns(r[turn], columns, known, rounding[1] - rounding[0],
+                                 2 * walk @ walk.T)
 
     def _judge_fixes(self, eq, state, r, X, known, judge):
         leg, bins, n = self.leg, self.bins, len(eq.turn)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.height import Height
-from odocal_ros.calib.wheels.judge_noise import FixNoise
+from odocal_ros.calib.wheels.judge_noise import FixNoise, TurnNoise
 from odocal_ros.calib.wheels.least_squares import Fit
 from odocal_ros.calib.wheels.model import Bins, Equations, GYRO, LATENCY, State
 from odocal_ros.calib.wheels.noise import Part
@@ -35,7 +35,7 @@ class Solution:
     parts: tuple[Part, ...]
     height: Height
     noise: FixNoise
-    slip: float
+    turns: TurnNoise
     kept: int
     dropped: int
     bias_z: tuple[float, float]
