@@ -30,16 +30,7 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs Imu, odometer and fixes between the marks; see odocal '
                       'inspect for what is there')
-    geodetic = np.nan_to_num(inputs.geodetic)
-    near = int(np.argmin(np.abs(inputs.t_fix)))
-    origin = Origin(*(float(x) for x in geodetic[near]))
-    fixes_n = origin.to_n(geodetic)
-    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) \
-        or nominal_scale(config, inputs.scale_unit)
-    if not scale:
-        raise BadData('the scale is not known yet: the fixes moved too little, and '
-                      'odometer.nominal_scale is not set')
+    origin, fixes_n, scale = _placed(inputs, config)
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
     t = np.linspace(first, last, max(2, int((last - first) / max(STEP, (last - first) / 5e4))))
@@ -52,6 +43,35 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
     yaw = _yaw(inputs, spans, t)
     return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, fixes_n),
                         np.zeros_like(t), origin.latitude, origin.longitude, origin.height)
+
+
+def _placed(inputs, config):
+    """Return origin, fixes in n, (k, 3) m, and the rough scale; raise BadData without one."""
+    geodetic = np.nan_to_num(inputs.geodetic)
+    near = int(np.argmin(np.abs(inputs.t_fix)))
+    origin = Origin(*(float(x) for x in geodetic[near]))
+    fixes_n = origin.to_n(geodetic)
+    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) \
+        or nominal_scale(config, inputs.scale_unit)
+    if not scale:
+        raise BadData('the scale is not known yet: the fixes moved too little, and '
+                      'odometer.nominal_scale is not set')
+    return origin, fixes_n, scale
+
+
+def count_size(leg: Leg, config: Config) -> float:
+    """
+    Return the metres of one count of the odometer, 0 for speeds.
+
+    Raises
+    ------
+    BadData
+        The scale is not known.
+
+    """
+    inputs, _ = screen(leg, config)
+    return inputs.travel.quantum * _placed(inputs, config)[2]
 
 
 def _yaw(inputs, spans, t):

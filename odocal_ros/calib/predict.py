@@ -23,9 +23,11 @@ from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.reasons import Code, Reason, Verdict
 
 CORRELATION_TIME = 60.0     # s over which fixes of one receiver stay alike where nothing is said
+SWAY = 0.05                 # m/s, as the bounds of method.md have it
+SLIP = 0.01                 # m/sqrt(s), what the smoother believes at first
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
@@ -39,6 +41,8 @@ class Sigmas:
     the course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
     fix, fix_up : m, error of one fix, east and north each, and up (None: twice that).
     fix_rate : Hz.    quantum : m, size of an odometer count, 0 for speeds.
+    sway : m/s, white at 10 Hz, of the odometer's point to the side and up.    slip : m/sqrt(s) of
+    the wheels. Both while driving, for the smoother: the two-point method knows neither.
     """
 
     config: Config = Config()
@@ -46,6 +50,8 @@ class Sigmas:
     fix_up: float | None = None
     fix_rate: float = 5.0
     quantum: float = 0.0
+    sway: float = SWAY
+    slip: float = SLIP
 
     def __post_init__(self) -> None:
         up = 2 * self.fix if self.fix_up is None else self.fix_up
@@ -55,8 +61,10 @@ class Sigmas:
             if not (np.isfinite(value) and value > 0):
                 raise BadConfig(f'{what} {value:g}: want a number above 0; nothing is known '
                                 'exactly')
-        if not (np.isfinite(self.quantum) and self.quantum >= 0):
-            raise BadConfig(f'size of a count {self.quantum:g} m: want 0 or more')
+        for what, value in (('size of a count', self.quantum), ('sway', self.sway),
+                            ('slip', self.slip)):
+            if not (np.isfinite(value) and value >= 0):
+                raise BadConfig(f'{what} {value:g}: want 0 or more')
 
     @property
     def covariance_n(self):
@@ -77,7 +85,8 @@ class Prediction:
     What a drive will give by one method.
 
     method : as a result has it; scale factor 1, angles 0, sigmas and budget as they will be
-    (scale relative). reasons : what is said of drive and method.
+    (scale relative). reasons : what is said of drive and method.    of_drive : those of the drive
+    alone, whatever the method.
     distance, chord : m.    duration : s.    standing : s of rest for each mark, 0 in motion.
     """
 
@@ -88,6 +97,7 @@ class Prediction:
     chord: float
     duration: float
     standing: tuple[float, float]
+    of_drive: tuple[Reason, ...] = ()
 
     def sigma(self, parameter: str) -> float | None:
         """Return the sigma of a parameter, relative or rad; None: it will not be determined."""
@@ -131,7 +141,8 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
         reasons += judge(method.estimates, 1.0, config)
     return Prediction(method, reasons + method.reasons, alignment, distance,
                       float(np.linalg.norm((end.position_n - start.position_n)[:2])),
-                      drive.duration, (_rest(0.0, spans), _rest(drive.duration, spans)))
+                      drive.duration, (_rest(0.0, spans), _rest(drive.duration, spans)),
+                      tuple(r for r in said if r.code is not Code.LEG_NOT_STRAIGHT))
 
 
 def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,

@@ -4,14 +4,11 @@ import json
 import math
 from pathlib import Path
 import sys
-import textwrap
 
 from odocal_ros.errors import BadUsage
 
 HELP = 'predicted sigmas of a drive not yet driven'
-NOT_PREDICTED = ('wheels', 'smoother')
 NOISE = {'white': 0.0, 'correlated': 60.0}
-SHOWN = 1e-3       # share of a variance below which a source is not worth a line
 
 
 def add_arguments(parser) -> None:
@@ -39,8 +36,12 @@ def add_arguments(parser) -> None:
         'change from fix to fix (default correlated: what receivers do)')
     add('--fix-rate', type=float, metavar='HZ', help='fixes a second (default 5)')
     add('--rtk', action='store_true', help='fixes of 0.02 m')
-    add('--pulse', type=float, default=0.0, metavar='M', help='metres a pulse, for the '
-        'quantisation (default 0)')
+    add('--pulse', type=float, metavar='M', help='metres a pulse, for the quantisation (default '
+        '0; of --bag, its own)')
+    add('--sway', type=float, metavar='M/S', help='velocity to the side and up while driving, 1 '
+        'sigma, white at 10 Hz (default 0.05: an ordinary road)')
+    add('--slip-walk', type=float, metavar='M/SQRT(S)', help='slip of the wheels while driving '
+        '(default 0.01)')
     add('--config', metavar='FILE', help='ROS parameter file, as replay takes it')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
@@ -51,12 +52,13 @@ def add_arguments(parser) -> None:
 
 def run(args) -> int:
     """Predict and print; return 0."""
-    from odocal_ros.calib.predict import predict
+    from odocal_ros.calib.planned_methods import plan_methods
+    from odocal_ros.offline.plan_text import as_json, screen
     from odocal_ros.offline.what_helps import changes
     config = _config(args)
     drive, figures = _drive(args, config)
     sigmas = _sigmas(args, config, figures)
-    before = predict(drive, sigmas)
+    before = plan_methods(drive, sigmas)
     found = changes(drive, sigmas, before)
     if args.json:
         json.dump(as_json(before, sigmas, found), sys.stdout, indent=2, allow_nan=False)
@@ -126,87 +128,7 @@ def _sigmas(args, config, figures):
     fix = RTK if args.rtk else args.fix_sigma
     if fix is not None:
         figures = figures | {'fix': fix, 'fix_up': None}
-    if args.fix_rate is not None:
-        figures = figures | {'fix_rate': args.fix_rate}
-    return Sigmas(config=config, quantum=args.pulse, **figures)
-
-
-def as_json(before, sigmas, found) -> dict:
-    """Return the content of ``odocal plan --json``; sigmas of the scale are relative."""
-    method = before.method
-    return {
-        'drive': {'distance': before.distance, 'chord': before.chord,
-                  'duration': before.duration, 'standing': list(before.standing)},
-        'sigmas': {'imu_grade': sigmas.config.imu.grade,
-                   'heading_source': before.alignment.heading_source,
-                   'heading_sigma': before.alignment.heading_sigma, 'fix_sigma': sigmas.fix,
-                   'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time},
-        'verdict': before.verdict.value, 'reasons': [r.as_dict() for r in before.reasons],
-        'methods': {'two_point': {
-            'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
-                          for name, e in method.estimates.items() if name != 'scale_ratio'},
-            'budget': method.details.get('budget', {})}},
-        'methods_not_predicted': list(NOT_PREDICTED),
-        'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
-                    for c in found]}
-
-
-def screen(before, sigmas, found) -> str:
-    """Return the prediction as one screen of plain text."""
-    return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budget(before),
-                      *_helps(before, found), *_reasons(before)])
-
-
-def _head(before, sigmas):
-    from odocal_ros.output.figures import length, time_span
-    stands = [f'standing {time_span(s)}' if s else 'in motion' for s in before.standing]
-    tau, a = sigmas.correlation_time, before.alignment
-    noise = f'alike for {tau:g} s' if tau else 'white'
-    return [f'{length(before.distance)} in {time_span(before.duration)}, {stands[0]} at the start '
-            f'mark, {stands[1]} at the end mark, {length(before.chord)} apart',
-            f'Imu {sigmas.config.imu.grade}, heading by {a.heading_source} '
-            f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
-            f'{sigmas.fix_rate:.3g} Hz, {noise}']
-
-
-def _methods(before):
-    from odocal_ros.calib.budget import PARAMETERS
-    shown = [_shown(p, before.sigma(p)) for p in PARAMETERS]
-    return [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}',
-            f'  {"two_point":<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}',
-            f'  ({" and ".join(NOT_PREDICTED)}: not predicted)']
-
-
-def _shown(parameter, sigma):
-    if sigma is None:
-        return 'unknown'
-    if parameter == 'scale_factor':
-        return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
-    return f'{math.degrees(sigma):.3g} deg'
-
-
-def _budget(before):
-    """Return the sources that matter, with their shares of the variance."""
-    from odocal_ros.output.budget_table import budget_lines
-    lines = budget_lines(before.method.details.get('budget'), 1.0, SHOWN)
-    return [*lines, ''] if lines else []
-
-
-def _helps(before, found):
-    from odocal_ros.offline.what_helps import ranked, SCALE, YAW
-    lines = []
-    for word, parameter in (('scale', SCALE), ('yaw', YAW)):
-        best = ranked(found, before, parameter)
-        lines.append(f'  what would help the {word} most' if best else
-                     f'  nothing tried would help the {word}')
-        lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
-                  f'{_shown(parameter, c.sigma(parameter))}' for c in best[:4]]
-    return lines
-
-
-def _reasons(before):
-    lines = []
-    for reason in before.reasons:
-        lines += textwrap.wrap(f'{reason.code.name}: {reason.text}. {reason.remedy}', 96,
-                               initial_indent='  ', subsequent_indent='     ')
-    return ['', *lines] if lines else []
+    asked = {'fix_rate': args.fix_rate, 'quantum': args.pulse, 'sway': args.sway,
+             'slip': args.slip_walk}
+    figures = figures | {name: value for name, value in asked.items() if value is not None}
+    return Sigmas(config=config, **figures)

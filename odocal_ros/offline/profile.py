@@ -14,6 +14,10 @@ TURN_TIME = 8.0          # s of a turn of 90 deg
 MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
 GPX_STEP = 5.0           # m between points used: nearer ones are receiver noise
 GPX_REST, GPX_SLOW = 0.3, 0.1    # m/s, or of the median speed: slower steps were mostly a stop
+# s: what changes faster between points is their noise and spacing; rests, found too long by the
+# way to the next point used, lose half of it at each end
+GPX_SMOOTH = 4.0
+SLOPES = 5     # odd; times longer for slopes: heights are noisier, hills longer
 MOST_POINTS = 1_000_000
 
 
@@ -160,16 +164,24 @@ def _from_points(path, t, position_n, start) -> PlannedDrive:
     speed = np.where(moving, (way / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
-    return marked(grid, speed, np.interp(grid, middle, yaw),
-                  np.interp(grid, middle, arctan2(step[:, 2], level)),
+    wide = max(1, round(GPX_SMOOTH / (grid[1] - grid[0]) / 2)) * 2 + 1
+    return marked(grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
+                  _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), SLOPES * wide),
                   latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
+
+
+def _smooth(x, wide):
+    """Return means over so many rows, odd; the ends go on as they are."""
+    padded = np.pad(x, wide // 2, mode='edge')
+    total = np.concatenate([[0.0], np.cumsum(padded)])
+    return (total[wide:] - total[:-wide]) / wide
 
 
 def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.leg import LegRecorder
-    from odocal_ros.leg_profile import fix_figures, profile_of
+    from odocal_ros.leg_profile import count_size, fix_figures, profile_of
     from odocal_ros.messages import make_reader
     from odocal_ros.offline.legs import find_legs, marked_legs
     from odocal_ros.offline.topics import choose_topics
@@ -184,4 +196,4 @@ def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
             recorder.form_right = readers[chosen['odometer_right']].form
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    return profile_of(leg, config), fix_figures(leg, config)
+    return profile_of(leg, config), fix_figures(leg, config) | {'quantum': count_size(leg, config)}

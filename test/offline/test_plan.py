@@ -2,10 +2,16 @@
 
 import json
 import math
+from pathlib import Path
+import re
+import shlex
 
 import numpy as np
 import pytest
 
+from odocal_ros.calib.planned_manoeuvres import stop_and_start
+from odocal_ros.calib.planned_methods import plan_methods
+from odocal_ros.calib.planned_smoother import predict_smoother
 from odocal_ros.calib.predict import predict, Sigmas
 from odocal_ros.config import Config, with_settings
 from odocal_ros.nav.dead_reckoning import Origin
@@ -14,6 +20,9 @@ from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 
 PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']
+TWO_POINT = ['--set', 'method=two_point']
+STRAIGHT = ['--distance', '1000', '--speed', '15', '--imu-grade', 'industrial']
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
 def asked(capsys, *argv):
@@ -34,7 +43,8 @@ def refused(capsys, *argv):
 
 
 def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
-    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white')
+    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
+                   *TWO_POINT)
     assert answer['drive']['distance'] == pytest.approx(11_200, rel=1e-9)
     assert answer['drive']['standing'] == pytest.approx([300.0, 30.0])
     estimates = answer['methods']['two_point']['estimates']
@@ -48,11 +58,12 @@ def test_the_paper_drive_is_planned_as_it_is_predicted(capsys):
     for parameter in ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'):
         whole = math.sqrt(sum(row[parameter]**2 for row in budget.values()))
         assert estimates[parameter]['sigma'] == pytest.approx(whole, rel=1e-9)
-    assert answer['methods_not_predicted'] == ['wheels', 'smoother']
+    assert answer['methods_not_predicted'] == ['wheels']
 
 
 def test_changes_are_computed_not_told(capsys):
-    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white')
+    answer = asked(capsys, *PAPER[1:], '--heading-sigma-deg', '0.06', '--fix-noise', 'white',
+                   *TWO_POINT)
     before = answer['methods']['two_point']['estimates']
     scale, yaw = (before[n]['sigma'] for n in ('scale_factor', 'yaw_mounting_angle'))
     changes = {c['text']: c for c in answer['changes']}
@@ -69,17 +80,19 @@ def test_changes_are_computed_not_told(capsys):
 
 
 def test_a_gyrocompass_heading_averages_down_over_legs(capsys):
-    answer = asked(capsys, *PAPER[1:])
+    answer = asked(capsys, *PAPER[1:], *TWO_POINT)
     assert answer['sigmas']['heading_source'] == 'gyrocompass'
+    assert list(answer['methods']) == ['two_point']
     yaw = answer['methods']['two_point']['estimates']['yaw_mounting_angle']['sigma']
     other = next(c for c in answer['changes'] if 'second leg' in c['text'])
     assert other['yaw_mounting_angle'] == pytest.approx(yaw / math.sqrt(2), rel=1e-3)
 
 
-def test_the_screen_ranks_by_gain_and_fits(capsys):
-    assert main([*PAPER]) == 0
+@pytest.mark.parametrize('drive', [['plan', *STRAIGHT], [*PAPER, *TWO_POINT]])
+def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
+    assert main(drive) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) < 40
+    assert len(lines) < 45
     assert max(map(len, lines)) < 120
     begin = lines.index('  what would help the scale most')
     end = lines.index('  what would help the yaw most')
@@ -87,16 +100,19 @@ def test_the_screen_ranks_by_gain_and_fits(capsys):
     assert len(after) > 2
     assert after == sorted(after)
     assert 'RTK' in lines[begin + 1]
-    assert 'heading' in lines[end + 1]
+    assert ('heading' if 'method=two_point' in drive else 'stop and go') in lines[end + 1]
 
 
-def test_an_out_and_back_is_refused_with_what_would_help(capsys):
-    assert main(['plan', '--scenario', 'out_and_back', '--imu-grade', 'navigation']) == 0
+def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
+    drive = ['--scenario', 'out_and_back', '--imu-grade', 'navigation']
+    assert main(['plan', *drive, '--duration', '300']) == 0
     out = capsys.readouterr().out
     assert 'CHORD_TOO_SHORT' in out
-    answer = asked(capsys, '--scenario', 'out_and_back', '--imu-grade', 'navigation')
+    assert 'the result: all by smoother' in out
+    answer = asked(capsys, *drive, *TWO_POINT)
     assert answer['methods']['two_point']['estimates']['scale_factor']['sigma'] is None
     assert answer['verdict'] == 'rejected'
+    assert answer['estimates']['scale_factor'] == {'sigma': None, 'method': None}
     half = next(c for c in answer['changes'] if 'farthest off' in c['text'])
     motion = motion_of(resolved(SimOptions(scenario='out_and_back')))
     t = np.arange(0.0, motion.duration, 0.1)
@@ -107,6 +123,80 @@ def test_an_out_and_back_is_refused_with_what_would_help(capsys):
     expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
     # the stop is 30 s here and there, cut to a tenth of a second
     assert half['scale_factor'] == pytest.approx(expected.sigma('scale_factor'), rel=0.01)
+
+
+def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys):
+    answer = asked(capsys, *STRAIGHT, '--fix-noise', 'white', '--pulse', '0.02', '--sway', '0.1',
+                   '--slip-walk', '0.005')
+    assert list(answer['methods']) == ['smoother', 'two_point']
+    assert answer['verdict'] == 'accepted'      # the two-point method alone gives no yaw
+    drive = profile.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
+    sigmas = Sigmas(config=with_settings(Config(), {
+        'imu.grade': 'industrial', 'gnss.correlation_time': 0.0}), quantum=0.02, sway=0.1,
+        slip=0.005)
+    expected = predict_smoother(drive, sigmas)
+    for name in NAMES:
+        sigma = expected.estimates[name].sigma
+        assert answer['methods']['smoother']['estimates'][name]['sigma'] == sigma
+        assert answer['estimates'][name] == {'sigma': sigma, 'method': 'smoother'}
+    assert answer['methods']['smoother']['budget'] == expected.details['budget']
+    assert (answer['sigmas']['sway'], answer['sigmas']['slip_walk']) == (0.1, 0.005)
+    assert answer['methods']['two_point']['estimates']['yaw_mounting_angle']['sigma'] is None
+    assert 'YAW_NOT_SEPARABLE' not in {r['code'] for r in answer['reasons']}
+    changes = {c['text']: c for c in answer['changes']}
+    stop = predict_smoother(stop_and_start(drive), sigmas)
+    assert changes['a stop and a start on the way']['yaw_mounting_angle'] == pytest.approx(
+        stop.estimates['yaw_mounting_angle'].sigma, rel=1e-12)
+    # own errors are halved in variance, those shared by legs stay
+    other = changes['a second leg in the other direction']['yaw_mounting_angle']
+    yaw = expected.estimates['yaw_mounting_angle'].sigma
+    assert yaw / math.sqrt(2) * 0.9999 <= other < yaw
+
+
+def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
+    # two minutes of even driving, marked in motion
+    path = str(gpx(tmp_path / 'a.gpx', rest=0.0, corner=0.0, count=60))
+    assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
+    out = capsys.readouterr().out
+    assert 'the result: scale and pitch by smoother, yaw unknown' in out
+    said = ' '.join(out.split())
+    assert 'YAW_NOT_DETERMINED: the drive tells the yaw mounting to' in said
+    assert 'Drive with stops, starts and turns' in said
+    answer = asked(capsys, '--gpx', path, '--imu-grade', 'consumer')
+    assert answer['estimates']['yaw_mounting_angle'] == {'sigma': None, 'method': None}
+    changes = {c['text']: c['yaw_mounting_angle'] for c in answer['changes']}
+    assert changes['5 min more, stop and go with turns'] < math.radians(0.05)
+    lines = out.splitlines()
+    begin = lines.index('  what would help the yaw most')
+    assert 'unknown ->' in lines[begin + 1]
+
+
+@pytest.mark.parametrize(('method', 'shown', 'by'), [
+    ('auto', ['smoother', 'two_point'], 'smoother'), ('two_point', ['two_point'], 'two_point'),
+    ('smoother', ['smoother', 'two_point'], 'smoother'), ('wheels', ['two_point'], 'two_point')])
+def test_the_methods_asked_for_are_planned(method, shown, by):
+    config = with_settings(Config(), {'method': method, 'alignment.heading_source': 'fixed',
+                                      'alignment.heading_sigma': 0.002})
+    plan = plan_methods(profile.from_figures(15.0, 500.0, 10.0, 0, 1.0), Sigmas(config=config))
+    assert list(plan.methods) == shown
+    assert {plan.by(name) for name in NAMES[:2]} == {by}
+
+
+def test_the_readme_shows_what_is_printed(capsys):
+    readme = (Path(__file__).parents[2] / 'README.md').read_text(encoding='utf-8')
+    section = readme.partition('## Before driving')[2]
+    command = next(line for line in section.splitlines() if line.startswith('odocal plan '))
+    assert main(shlex.split(command)[1:]) == 0
+    shown = section.partition('```text\n')[2].partition('```')[0].split()
+    printed = capsys.readouterr().out.split()
+    assert len(shown) == len(printed)
+    for one, other in zip(shown, printed, strict=True):
+        if re.fullmatch(r'[\d.]+%?', one):
+            # another BLAS may round a last digit otherwise, of two
+            assert float(other.rstrip('%')) == pytest.approx(float(one.rstrip('%')), rel=0.06,
+                                                             abs=1.1 if '%' in one else 0)
+        else:
+            assert one == other
 
 
 def test_a_drive_of_figures_has_those_figures():
@@ -123,12 +213,15 @@ def test_a_drive_of_figures_has_those_figures():
     assert slow.distance == pytest.approx(100.0, rel=1e-6)
 
 
-def gpx(path, times=True, rest=30.0, count=200):
-    """Write a track: rest, east at 10 m/s with a point a second, north as far, rest."""
+def gpx(path, times=True, rest=30.0, count=200, corner=math.pi / 2):
+    """Write a track: rest, east at 10 m/s with a point a second, left as far, rest."""
     origin = Origin(math.radians(48.0), math.radians(11.0), 500.0)
     t = np.concatenate([[0.0, rest / 2], rest + np.arange(2 * count + 1), [2 * count + 2 * rest]])
     way = np.clip(t - rest, 0, 2 * count) * 10.0
-    east, north = np.minimum(way, count * 10.0), np.maximum(way - count * 10.0, 0.0)
+    first, second = np.minimum(way, count * 10.0), np.maximum(way - count * 10.0, 0.0)
+    east, north = first + second * math.cos(corner), second * math.sin(corner)
+    keep = np.diff(t, prepend=-1.0) > 0
+    t, way, east, north = t[keep], way[keep], east[keep], north[keep]
     geodetic = origin.to_geodetic(np.stack([east, north, np.zeros_like(way)], -1))
     points = []
     for (lat, lon, height), when in zip(geodetic, t, strict=True):
@@ -145,18 +238,20 @@ def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
     assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # the corner is cut by a point
     assert np.median(drive.speed[drive.speed > 0]) == pytest.approx(10.0, rel=1e-3)
     rest = drive.standstills(2.0)
-    assert [b - a for a, b in rest] == pytest.approx([30.0, 30.0], abs=1.1)   # a point a second
+    # a point a second, and 2 s at each end for a start that no car makes from 0 to 10 m/s at once
+    assert [b - a for a, b in rest] == pytest.approx([28.0, 28.0], abs=1.1)
+    assert np.abs(np.diff(drive.speed) / np.diff(drive.t)).max() < 10.0 / 4.0 * 1.05
     assert drive.yaw[0] == pytest.approx(0.0, abs=1e-3)            # east
     assert drive.yaw[-1] == pytest.approx(math.pi / 2, abs=1e-3)   # north
     assert math.degrees(drive.latitude) == pytest.approx(48.0)
-    answer = asked(capsys, '--gpx', str(tmp_path / 'a.gpx'))
+    answer = asked(capsys, '--gpx', str(tmp_path / 'a.gpx'), *TWO_POINT)
     assert answer['drive']['chord'] == pytest.approx(math.hypot(2000, 2000), rel=5e-3)
 
 
 def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
     path = str(gpx(tmp_path / 'a.gpx', times=False))
     assert 'no times; give --speed' in refused(capsys, '--gpx', path)
-    answer = asked(capsys, '--gpx', path, '--speed', '20')
+    answer = asked(capsys, '--gpx', path, '--speed', '20', *TWO_POINT)
     assert answer['drive']['duration'] == pytest.approx(200.0, rel=0.01)
 
 
@@ -189,6 +284,9 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     motion = motion_of(resolved(SimOptions(scenario='straight', duration=200.0)))
     assert answer['drive']['distance'] == pytest.approx(motion.distance, rel=0.01)
     assert answer['drive']['standing'] == pytest.approx([60.0, 60.0], abs=1.5)
+    assert answer['sigmas']['pulse'] == pytest.approx(0.0213, rel=0.02)     # its own counts
+    own = asked(capsys, '--bag', str(bag), '--pulse', '0.1', *TWO_POINT)
+    assert own['sigmas']['pulse'] == 0.1
     assert str(tmp_path / 'none') in refused(capsys, '--bag', str(tmp_path / 'none'))
 
 
@@ -216,6 +314,8 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     (['--scenario', 'paper', '--imu-grade', 'best'], 'not one of consumer'),
     (['--scenario', 'paper', '--heading-source', 'stars'], 'not one of auto'),
     (['--scenario', 'paper', '--pulse', '-1'], 'size of a count -1'),
+    (['--scenario', 'paper', '--sway', '-1'], 'sway -1'),
+    (['--scenario', 'paper', '--slip-walk', 'nan'], 'slip nan'),
     (['--scenario', 'paper', '--rtk', '--fix-sigma', '1'], 'give one'),
     (['--scenario', 'paper', '--set', 'imu.gyro_nois=1'], 'imu.gyro_noise'),
     (['--distance', '4', '--speed', '2', '--standstill', '0', '--fix-rate', '0.1'],

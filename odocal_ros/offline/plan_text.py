@@ -1,0 +1,123 @@
+"""What odocal plan prints: the prediction as one screen, or as JSON."""
+
+import math
+import textwrap
+
+from odocal_ros.calib.planned_methods import NOT_PREDICTED, Plan
+from odocal_ros.calib.planned_smoother import SWAY_RATE, WHITE_SHARE
+from odocal_ros.offline.what_helps import ranked, SCALE, YAW
+from odocal_ros.output.budget_table import budget_lines
+from odocal_ros.output.figures import length, time_span
+
+PITCH = 'pitch_mounting_angle'
+PARAMETERS = (SCALE, YAW, PITCH)
+SHOWN = 1e-3       # share of a variance below which a source is not worth a line
+WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
+
+
+def as_json(before: Plan, sigmas, found) -> dict:
+    """Return the content of ``odocal plan --json``; sigmas of the scale are relative."""
+    two_point, alignment = before.two_point, before.two_point.alignment
+    return {
+        'drive': {'distance': two_point.distance, 'chord': two_point.chord,
+                  'duration': two_point.duration, 'standing': list(two_point.standing)},
+        'sigmas': {'imu_grade': sigmas.config.imu.grade,
+                   'heading_source': alignment.heading_source,
+                   'heading_sigma': alignment.heading_sigma, 'fix_sigma': sigmas.fix,
+                   'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time,
+                   'pulse': sigmas.quantum, 'sway': sigmas.sway, 'slip_walk': sigmas.slip},
+        'verdict': before.verdict.value, 'reasons': [r.as_dict() for r in before.reasons],
+        'estimates': {name: {'sigma': before.sigma(name), 'method': before.by(name) or None}
+                      for name in PARAMETERS},
+        'methods': {name: {
+            'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
+                          for name, e in method.estimates.items() if name != 'scale_ratio'},
+            'reasons': [r.as_dict() for r in before.reasons_of(name)],
+            'budget': method.details.get('budget', {})}
+            for name, method in before.methods.items()},
+        'methods_not_predicted': list(NOT_PREDICTED),
+        'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
+                    for c in found]}
+
+
+def screen(before: Plan, sigmas, found) -> str:
+    """Return the prediction as one screen of plain text."""
+    return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budgets(before),
+                      *_helps(before, found), *_reasons(before)])
+
+
+def _head(before, sigmas):
+    two_point, a = before.two_point, before.two_point.alignment
+    stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
+    tau = sigmas.correlation_time
+    noise = f'alike for {tau:g} s' if tau else 'white'
+    lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
+             f'the start mark, {stands[1]} at the end mark, {length(two_point.chord)} apart',
+             f'Imu {sigmas.config.imu.grade}, heading by {a.heading_source} '
+             f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
+             f'{sigmas.fix_rate:.3g} Hz, {noise}']
+    if 'smoother' in before.methods:
+        slip, road = 1000 * sigmas.slip, 1000 * sigmas.sway / math.sqrt(SWAY_RATE)
+        own = ' needs no heading;' if a.heading_source in ('course', 'gyrocompass') else ''
+        white = f'; fixes {100 * WHITE_SHARE:.0f} % white' if tau else ''
+        lines.append(f'smoother:{own} wheels slip {slip:.2g} mm, slide and bounce {road:.2g} mm '
+                     f'in a second{white}')
+    return lines
+
+
+def _methods(before):
+    lines = [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}']
+    for name, method in before.methods.items():
+        shown = [_shown(p, method.estimates[p].sigma) for p in PARAMETERS]
+        lines.append(f'  {name:<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}')
+    return [*lines, f'  ({" and ".join(NOT_PREDICTED)}: not predicted; the result: '
+            f'{_result(before)})']
+
+
+def _result(before):
+    """Say which method will give which value."""
+    by = {}
+    for parameter in PARAMETERS:
+        by.setdefault(before.by(parameter), []).append(WORDS[parameter])
+    return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all"} '
+                     f'{"by " + method if method else "unknown"}' for method, names in by.items())
+
+
+def _shown(parameter, sigma):
+    if sigma is None:
+        return 'unknown'
+    if parameter == SCALE:
+        return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
+    return f'{math.degrees(sigma):.3g} deg'
+
+
+def _budgets(before):
+    """Return the sources that matter of each method that will give something."""
+    out = []
+    for name in before.giving:
+        method = before.methods[name]
+        hidden = [p for p in PARAMETERS if method.estimates[p].sigma is None]
+        lines = budget_lines(method.details.get('budget'), 1.0, SHOWN, hidden)
+        if lines and len(before.methods) > 1:
+            lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
+        out += [*lines, ''] if lines else []
+    return out
+
+
+def _helps(before, found):
+    lines = []
+    for parameter in (SCALE, YAW):
+        best, word = ranked(found, before, parameter), WORDS[parameter]
+        lines.append(f'  what would help the {word} most' if best else
+                     f'  nothing tried would help the {word}')
+        lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
+                  f'{_shown(parameter, c.sigma(parameter))}' for c in best[:4]]
+    return lines
+
+
+def _reasons(before):
+    lines = []
+    for reason in before.reasons:
+        lines += textwrap.wrap(f'{reason.code.name}: {reason.text}. {reason.remedy}', 96,
+                               initial_indent='  ', subsequent_indent='     ')
+    return ['', *lines] if lines else []

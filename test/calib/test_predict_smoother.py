@@ -1,0 +1,211 @@
+"""The smoother's predicted sigmas: against simulated drives, the table of method.md, itself."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from smoother_legs import made, truth
+
+from odocal_ros.calib.planned_drive import from_rates
+from odocal_ros.calib.planned_manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.calib.planned_samples import ideal
+from odocal_ros.calib.planned_smoother import (
+    planned_levels,
+    predict_smoother,
+    spacing_for,
+    WIDEST,
+)
+from odocal_ros.calib.predict import Sigmas
+from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.config import Config, with_settings
+from odocal_ros.errors import BadConfig
+from odocal_ros.reasons import Code
+
+NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
+WHITE = {'gnss.correlation_time': 0.0}
+
+
+def sigmas_of(method):
+    """Return the sigmas of scale, yaw and pitch, relative and rad."""
+    return np.array([method.estimates[n].sigma for n in NAMES], float)
+
+
+def planned(drive):
+    """Return a simulated drive as one that is planned."""
+    motion, o = drive.motion, drive.options
+    t = np.arange(0.0, motion.duration + 1e-9, 0.1)
+    return from_rates(t, motion.speed(t), motion.yaw_rate(t), o.heading, latitude=o.latitude,
+                      longitude=o.longitude, height=o.height)
+
+
+def figures(drive, config, tau=0.0):
+    return Sigmas(config=with_settings(config, {'gnss.correlation_time': tau}),
+                  fix=drive.options.fix_sigma, quantum=drive.options.scale, sway=0.05, slip=0.01)
+
+
+CELLS = [({'scenario': 'town', 'imu_grade': 'industrial'}, 0.0),
+         ({'scenario': 'town', 'imu_grade': 'consumer', 'fix_noise': 'correlated'}, 60.0),
+         ({'scenario': 'straight', 'imu_grade': 'tactical', 'fix_noise': 'rtk'}, 0.0)]
+
+
+@pytest.mark.parametrize(('options', 'tau'), CELLS)
+def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(options, tau):
+    drive, config, leg = made(**ROAD, **options)
+    sigmas = figures(drive, config, tau)
+    problem = Problem.of(leg, config)
+    true = bound(leg, config, truth(drive, config, leg), planned_levels(problem, sigmas))
+    sigma = np.sqrt(np.diag(true))[:3]
+    # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
+    # elsewhere: 5 % of what rests tell
+    np.testing.assert_allclose(sigmas_of(predict_smoother(planned(drive), sigmas)) / sigma, 1.0,
+                               atol=0.05)
+
+
+def test_the_sigma_predicted_is_the_one_that_the_smoother_states():
+    options, tau = CELLS[1]
+    drive, config, leg = made(**ROAD, **options)
+    config = with_settings(config, {'gnss.correlation_time': tau})
+    result = smooth(leg, config)
+    stated = sigmas_of(result) / [result.estimates[NAMES[0]].value, 1.0, 1.0]
+    # it finds the noise itself: slip and slide from some 400 intervals (1 / sqrt(800) = 3.5 %),
+    # gyro and accelerometer from 100 s at rest in three axes (4 %): three of their root sum
+    # squared would be 16 %, the rests and the shares that are certain take half of that
+    np.testing.assert_allclose(sigmas_of(predict_smoother(
+        planned(drive), figures(drive, config, tau))) / stated, 1.0, atol=0.12)
+
+
+def stop_and_go():
+    """Return the town drive of method.md, section 3: ten minutes."""
+    t = np.arange(0.0, 600.05, 0.1)
+    minute = (t // 60).astype(int)
+    turning = (t % 60 >= 22.0) & (t % 60 < 30.0)
+    speed = np.interp(t % 60, TOWN_T, TOWN_SPEED)
+    return from_rates(t, speed, np.where(turning, np.array(TOWN_SIDES)[minute % 4], 0.0)
+                      * np.pi / 16)
+
+
+def straight():
+    t = np.arange(0.0, 720.05, 0.1)
+    return from_rates(t, np.interp(t, [60, 85, 635, 660], [0, 12, 12, 0]), np.zeros_like(t))
+
+
+def paper():
+    t = np.arange(0.0, 900.05, 0.1)
+    return from_rates(t, np.interp(t, [300, 340, 860, 900], [0, 20, 20, 0]), np.zeros_like(t))
+
+
+@pytest.mark.parametrize(('drive', 'grade', 'white', 'pulses'), [
+    (stop_and_go, 'consumer', 128, 93), (stop_and_go, 'industrial', 110, 70),
+    (stop_and_go, 'tactical', 85, 21), (straight, 'industrial', 57, 11),
+    (paper, 'navigation', 35, 5.7)])
+def test_the_scale_bounds_of_method_md_come_out(drive, grade, white, pulses):
+    # an independent program made the table: lever arms and delays known, fixes white, no slip of
+    # the pulses; its filter knows no rests but by the odometer, hence not to the last digit
+    config = with_settings(Config(), WHITE | {
+        'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
+        'odometer.time_sigma': 0.0})
+    for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
+        method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
+        assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(table, rel=0.10)
+
+
+@pytest.fixture
+def town_sigmas():
+    return Sigmas(config=with_settings(Config(), WHITE))
+
+
+def test_fixes_are_thinned_without_loss(town_sigmas):
+    drive = stop_and_go().until(180.0, 10.0)
+    often = predict_smoother(drive, replace(town_sigmas, fix=2.0, fix_rate=16.0))
+    rare = predict_smoother(drive, replace(town_sigmas, fix=0.5, fix_up=1.0, fix_rate=1.0))
+    np.testing.assert_allclose(sigmas_of(often), sigmas_of(rare), rtol=1e-6)
+
+
+def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
+    drive = stop_and_go()
+    fine, coarse = (sigmas_of(predict_smoother(drive, town_sigmas, spacing))
+                    for spacing in (1.0, WIDEST))
+    # each keeps what a second has, but for what happens within: a tenth or so, to the safe side
+    assert (coarse >= fine).all()
+    assert (coarse < 1.15 * fine).all()
+    assert spacing_for(drive) == 1.0
+    assert spacing_for(replace(drive, t=drive.t * 6)) == pytest.approx(4.0, rel=0.01)
+    assert spacing_for(replace(drive, t=drive.t * 60)) == WIDEST
+
+
+def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
+    drive = stop_and_go().until(180.0, 10.0)
+    drive = replace(drive, slope=0.03 * np.sin(drive.travel / 100.0))
+    config = with_settings(town_sigmas.config, {
+        'imu.lever_arm': (1.0, 0.4, 0.8), 'odometer.lever_arm': (-0.5, 0.7, -0.2),
+        'gnss.lever_arm': (0.3, -0.6, 1.5)})
+    sigmas = replace(town_sigmas, config=config, fix=0.02)
+    one = ideal(drive, sigmas, 1.0)
+    problem = Problem.of(one.leg, config, one.imu)
+    equations = Equations(problem, one.state, problem.sums(one.state))
+    # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
+    # most, beside what a planned drive's own steps of 0.1 s leave
+    assert np.abs(equations.fixes.raw).max() < 0.03
+    r = equations.motion.residual
+    assert np.abs(r[:, 3:6]).max() < 0.1        # velocity
+    assert np.abs(r[:, 6:9]).max() < 0.01       # attitude
+    assert np.median(np.abs(r[:, 15:18]), axis=0).max() < 1e-3      # way by odometer, m
+    assert np.abs(r[:, 15:18]).max() < 0.03
+
+
+def test_a_heading_that_is_given_helps_as_far_as_it_is_known(town_sigmas):
+    drive = straight().until(300.0, 30.0)
+
+    def yaw(source, sigma):
+        config = with_settings(town_sigmas.config, {
+            'imu.grade': 'industrial', 'alignment.heading_source': source,
+            'alignment.heading_sigma': sigma})
+        return sigmas_of(predict_smoother(drive, replace(town_sigmas, config=config)))[1]
+
+    alone = yaw('auto', 0.1)
+    # two independent opinions of one angle: never better than their inverse squares' sum
+    both = 1 / math.hypot(1 / alone, 1 / math.radians(0.1))
+    assert both * 0.999 <= yaw('fixed', math.radians(0.1)) < alone
+    for source in ('heading_topic', 'imu_orientation'):
+        # all along the drive it tells how the gyro drifts, too; its own error stays
+        assert 0.9 * both <= yaw(source, math.radians(0.1)) < alone
+        assert yaw(source, 1.0) == alone        # the smoother takes none so bad
+    assert yaw('fixed', 1.0) == pytest.approx(alone, rel=2e-3)
+    assert yaw('course', 0.001) == alone == yaw('gyrocompass', 0.001)
+
+
+def test_what_the_smoother_would_refuse_is_refused(town_sigmas):
+    t = np.arange(0.0, 120.0, 0.1)
+    even = from_rates(t, np.full_like(t, 15.0), np.zeros_like(t))
+    method = predict_smoother(even, town_sigmas)
+    assert method.estimates['yaw_mounting_angle'].sigma is None
+    reason = next(r for r in method.reasons if r.code is Code.YAW_NOT_DETERMINED)
+    assert 'stops, starts and turns' in reason.remedy
+    short = from_rates(t[:150], np.full(150, 15.0), np.zeros(150))
+    method = predict_smoother(short, town_sigmas)
+    assert method.estimates['scale_factor'].sigma is None
+    assert [r.code for r in method.reasons] == [Code.SCALE_NOT_DETERMINED]
+    assert '74 fixes in 15 s' in method.reasons[0].text
+
+
+def test_more_slip_and_slide_cost_what_they_should(town_sigmas):
+    drive = stop_and_go()
+    at = [sigmas_of(predict_smoother(drive, replace(town_sigmas, sway=sway, slip=slip)))
+          for sway, slip in ((0.05, 0.01), (0.2, 0.01), (0.05, 0.05))]
+    assert at[1][1] > 1.5 * at[0][1]       # the yaw hangs on the sideways noise
+    assert at[1][0] < 1.2 * at[0][0]
+    assert at[2][0] > 1.5 * at[0][0]       # the scale on the slip
+    budget = predict_smoother(drive, town_sigmas).details['budget']
+    for i, name in enumerate(NAMES):
+        assert math.sqrt(sum(row[name]**2 for row in budget.values())) == pytest.approx(
+            at[0][i], rel=1e-6)
+
+
+@pytest.mark.parametrize('change', [{'sway': -0.1}, {'slip': math.nan}])
+def test_impossible_roads_are_refused(change):
+    with pytest.raises(BadConfig, match=f'{next(iter(change))} '):
+        Sigmas(**change)
