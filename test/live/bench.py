@@ -127,9 +127,11 @@ class Client:
 
     def until(self, **wanted) -> dict:
         """Return the first status from now on (the newest included) that has these values."""
-        def found():
-            status = self.status
-            return status if all(status.get(k) == v for k, v in wanted.items()) else None
+        first = max(0, len(self.statuses) - 1)
+
+        def found():     # in all that came: a state may be over before it is looked at
+            return next((status for status in self.statuses[first:] if all(
+                status.get(k) == v for k, v in wanted.items())), None)
         try:
             return wait_for(found, f'status with {wanted}')
         except AssertionError as error:

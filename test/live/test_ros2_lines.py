@@ -52,7 +52,7 @@ def driven(domain, tmp_path_factory):
             player.play(part(sent, mark, end), SPEED)
             seen.answers[name] = answer_of(future)
         client.until(leg_event='stopped')
-        seen.graph = dict(client.node.get_topic_names_and_types())
+        seen.graph = lambda: dict(client.node.get_topic_names_and_types())
         yield seen
     finally:
         seen.code = node.end()
@@ -107,10 +107,13 @@ def test_what_is_echoed_comes(driven):
         if topic in INPUT_TYPES:          # what the operator's drivers send
             assert has_field(INPUT_TYPES[topic], words[words.index('--field') + 1].split('.'))
             continue
-        kind, = driven.graph[topic]
+        kind, = wait_for(lambda topic=topic: driven.graph().get(topic), f'the type of {topic}')
         got = []
         # as ros2 topic echo does: latched where all that is offered is
-        offered = {p.qos_profile.durability for p in node.get_publishers_info_by_topic(topic)}
+        # messages may be here before discovery knows who sends them
+        publishers = wait_for(
+            lambda topic=topic: node.get_publishers_info_by_topic(topic), f'who sends {topic}')
+        offered = {p.qos_profile.durability for p in publishers}
         latched = offered == {DurabilityPolicy.TRANSIENT_LOCAL}
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
                          else DurabilityPolicy.VOLATILE)
@@ -143,4 +146,4 @@ def test_what_is_recorded_is_published(driven):
     for words in of('bag', 'record'):
         topics = [word for word in words if word.startswith('/')]
         assert set(topics) == {*TOPICS.values(), '/calibrator/status'}
-        assert set(topics) <= set(driven.graph)
+        wait_for(lambda topics=topics: set(topics) <= set(driven.graph()), 'the topics')

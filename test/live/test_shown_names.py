@@ -51,7 +51,10 @@ def test_the_node_publishes_and_serves_what_the_layouts_name(start, connect):
     wait_for(lambda: set(shown.published()) <= set(publishers()), 'all publishers')
     for topic, kind in shown.published().items():
         assert publishers()[topic] == [kind]
-        info, = node.get_publishers_info_by_topic(topic)
+        # a node that has just ended may still be there
+        info, = wait_for(lambda topic=topic: len(
+            found := node.get_publishers_info_by_topic(topic)) == 1 and found,
+            f'the one publisher of {topic}')
         if topic != '/diagnostics':      # the display asks for it: latched
             assert info.qos_profile.durability.name == 'TRANSIENT_LOCAL'
     assert shown.status_keys() <= set(status)
