@@ -145,7 +145,12 @@ class SmootherSoFar:
         problem.thin = self._thin
         begun = None if self._last is None else carried(self._last, problem)
         if begun is None:
-            return self._from_nothing(problem, config, trace), problem
+            begin = time.thread_time()
+            best = best_fit(problem, config, trace)
+            self._judged = duration
+            if self._last is not None:      # other cells, as a leg has them each time it doubles
+                self.once_s += time.thread_time() - begin
+            return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
         best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
@@ -154,10 +159,6 @@ class SmootherSoFar:
         if duration > GROWN * self._judged:
             best = self._borne_out(best, problem, config, trace)
         return best, problem
-
-    def _from_nothing(self, problem, config, trace):
-        self._judged = problem.leg.t_stop - problem.leg.t_begin
-        return best_fit(problem, config, trace)
 
     def _borne_out(self, best, problem, config, trace):
         """Return the fit as a coarse one from nothing bears it out, else one from nothing."""
