@@ -4,11 +4,10 @@ What the node costs while it records: beside a bare typed subscriber of the same
     python benchmarks/live_load.py [--seconds 20] [--imu 1000] [--odometer 250] [--fix 25]
                                     [--no-journal]
 
-A publisher process sends Imu, pulses and fixes; the calibrator and a bare rclpy node that
-subscribes to the same topics, typed, with an empty callback, run beside it, all at once. Printed:
-CPU of one core for each, messages lost, and the latency of a service call during a leg. The fixes
-drive east at 10 m/s while the pulses count, so that the node has something to foresee: how often
-it did, and how often there was a new running estimate, is printed too.
+A publisher process sends Imu, speed and fixes of a simulated town drive; the calibrator and a bare
+rclpy node that subscribes to the same topics, typed, with an empty callback, run beside it, all at
+once. Printed: CPU of one core for each, messages lost, the latency of a service call during a leg,
+how often something was foreseen, and how often there was a new running estimate.
 """
 
 import argparse
@@ -23,59 +22,55 @@ import time
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
-SPEED = 10.0          # m/s
-EAST = 85_390.0       # m in a degree of longitude, at latitude 40
+REST, BEFORE = 20.0, 15.0      # s, standstill that the drive begins with, part of it played
 TICKS = 100   # per second in /proc/<pid>/stat, on every Linux
 
 
-def publish(rates) -> None:
-    """Send the three topics in their rhythm, by wall-clock stamps, until ended."""
+def publish(rates, seconds) -> None:
+    """Send a town drive from just before its first start, by its own stamps, until ended."""
+    from player import messages_of, part
     import rclpy
     from rclpy.qos import QoSProfile
-    from sensor_msgs.msg import Imu, NavSatFix
-    from std_msgs.msg import Int64
+
+    from odocal_ros.live.inputs import message_class
+    from odocal_ros.sim.scenarios import SimOptions, simulate
+    drive = simulate(SimOptions(scenario='town', duration=REST + seconds + 60.0, odometer='speed',
+                                **dict(zip(('imu_rate', 'odometer_rate', 'fix_rate'), rates,
+                                           strict=True))))
+    types, messages = messages_of(drive)
+    messages = part(messages, REST - BEFORE, REST + seconds + 60.0)
     rclpy.init()
     node = rclpy.create_node('load')
-    qos = QoSProfile(depth=1000)
-    imu, fix = Imu(), NavSatFix()
-    imu.header.frame_id, fix.header.frame_id = 'imu_link', 'gnss'
-    imu.linear_acceleration.z, imu.orientation_covariance[0] = 9.81, -1.0
-    fix.status.status = 0
-    fix.latitude, fix.longitude, fix.position_covariance_type = 40.0, 116.0, 2
-    fix.position_covariance[0] = fix.position_covariance[4] = fix.position_covariance[8] = 1.0
-    pulses = Int64()
-    topics = [(node.create_publisher(type(m), name, qos), m, 1 / rate) for m, name, rate in
-              zip((imu, pulses, fix), ('imu/data', 'odometer', 'fix'), rates, strict=True)]
-    while any(publisher.get_subscription_count() < 2 for publisher, _, _ in topics):
+    names = {'imu': 'imu/data', 'odometer': 'odometer', 'fix': 'fix'}
+    publishers = {slot: node.create_publisher(message_class(kind), names[slot],
+                                              QoSProfile(depth=1000))
+                  for slot, kind in types.items()}
+    while any(publisher.get_subscription_count() < 2 for publisher in publishers.values()):
         time.sleep(0.05)   # both listeners: nothing sent before may count as lost
-    begin, sent, last = time.monotonic(), [0, 0, 0], 0.0
+    begin, first_ns, last, sent = time.monotonic(), messages[0].stamp_ns, 0.0, dict.fromkeys(
+        names, 0)
     try:
-        while True:
+        for one in messages:
             now = time.monotonic() - begin
-            for i, (publisher, message, period) in enumerate(topics):
-                while sent[i] * period <= now:
-                    if hasattr(message, 'header'):
-                        message.header.stamp = node.get_clock().now().to_msg()
-                    else:
-                        message.data += 1
-                    if message is fix:
-                        fix.longitude = 116.0 + SPEED / EAST * sent[i] * period
-                    publisher.publish(message)
-                    sent[i] += 1
+            while now < (one.stamp_ns - first_ns) * 1e-9:
+                time.sleep(0.0005)
+                now = time.monotonic() - begin
+            publishers[one.slot].publish(one.raw)
+            sent[one.slot] += 1
             if now > last + 0.2:
                 last = now
-                print(*sent, flush=True)
-            time.sleep(0.0005)
+                print(*sent.values(), flush=True)
     except (KeyboardInterrupt, Exception):
-        print(*sent, flush=True)
+        pass
+    print(*sent.values(), flush=True)
 
 
 def listen() -> None:
     """Subscribe typed with empty callbacks; count nothing but messages."""
+    from geometry_msgs.msg import TwistStamped
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Imu, NavSatFix
-    from std_msgs.msg import Int64
     rclpy.init()
     node = rclpy.create_node('bare')
     qos = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -83,7 +78,7 @@ def listen() -> None:
     def nothing(_):
         return
 
-    for kind, name in ((Imu, 'imu/data'), (Int64, 'odometer'), (NavSatFix, 'fix')):
+    for kind, name in ((Imu, 'imu/data'), (TwistStamped, 'odometer'), (NavSatFix, 'fix')):
         node.create_subscription(kind, name, nothing, qos)
     try:
         rclpy.spin(node)
@@ -108,10 +103,10 @@ def measure(args) -> None:
     bare = subprocess.Popen([*me, '--role', 'listen'])
     client = Client()
     client.until(state='waiting')
-    load = subprocess.Popen([*me, '--role', 'publish', '--rates', *map(str, rates)],
-                            stdout=subprocess.PIPE, text=True)
+    load = subprocess.Popen([*me, '--role', 'publish', '--rates', *map(str, rates), '--seconds',
+                             str(args.seconds)], stdout=subprocess.PIPE, text=True)
     try:
-        client.until(state='idle')
+        client.until(state='idle')   # so early that the whole drive is in the leg
         wait_for(lambda: float(client.status['imu_rate_hz']) > 0.9 * args.imu, 'the full rate')
         assert client.call('start_leg').success
         before = [cpu_s(p.pid) for p in (node.process, bare)]
@@ -147,7 +142,7 @@ def report(args, client, sent, used, latencies, told) -> None:
     health = [client.health[f'calibrator: {name}'] for name in ('imu', 'odometer', 'gnss')]
     lost = [int(h['dropped']) for h in health]
     ordered = sorted(latencies)
-    print(f'rates {args.imu:g} / {args.odometer:g} / {args.fix:g} Hz (Imu, pulses, fixes), '
+    print(f'rates {args.imu:g} / {args.odometer:g} / {args.fix:g} Hz (Imu, speed, fixes), '
           f'{args.seconds:g} s in a leg')
     print(f'sent {sent}; received {[int(h["messages"]) for h in health]}; lost by sequence '
           f'numbers {lost}')
@@ -177,7 +172,7 @@ def main() -> None:
     parser.add_argument('--rates', nargs=3, type=float, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.role == 'publish':
-        publish(args.rates)
+        publish(args.rates, args.seconds)
     elif args.role == 'listen':
         listen()
     else:
