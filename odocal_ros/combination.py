@@ -5,6 +5,7 @@ from dataclasses import replace
 from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.one_vehicle import unlike_legs
 from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
@@ -31,7 +32,7 @@ def combine(legs, config: Config) -> Calibration:
     """
     legs = tuple(legs)
     good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
-    twice = _driven_twice(good)
+    twice = driven_twice(good)
     good = [leg for leg in good if leg not in twice]
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
@@ -45,8 +46,9 @@ def combine(legs, config: Config) -> Calibration:
         own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
                if len(legs) == 1 or r.code is Code.LEGS_DISAGREE]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
-                    if (r.code, r.text) not in known and (r.code not in PER_LEG or len(legs) == 1)]
+                    if (r.code, r.text) not in known]
         reasons = list(dict.fromkeys(reasons))
+    reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
     if len(good) < config.verdict.min_legs and good:
         reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} good leg'
                               f'{"s" * (len(good) > 1)} of {config.verdict.min_legs}'))
@@ -56,7 +58,7 @@ def combine(legs, config: Config) -> Calibration:
     return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy)
 
 
-def _driven_twice(legs):
+def driven_twice(legs):
     """Return legs that share more than a tenth of their time with one before: not independent."""
     twice = []
     for i, leg in enumerate(legs):

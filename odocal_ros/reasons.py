@@ -128,6 +128,8 @@ class Code(Enum):
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
+    LEGS_UNLIKE = REJECT, ('Combine legs of one vehicle, one mounting and one set of topics and '
+                           'settings; calibrate the others by themselves.')
     LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'
     LEG_REJECTED = CAUTION, 'See the reasons of that leg; drive it again or leave it out.'
     MORE_LEGS_NEEDED = CAUTION, 'Drive more legs: verdict.min_legs.'

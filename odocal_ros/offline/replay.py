@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 import sys
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadUsage, OdocalError
 
 HELP = 'calibrate from recorded bags'
+NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
 
 
 class LegDropped(BadUsage):
@@ -50,28 +51,49 @@ def run(args) -> int:
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
     from odocal_ros.config import with_settings
+    from odocal_ros.offline.bags import about, look_at_all, once, told_apart
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.pipeline import combine
-    legs, inputs, dropped, imu_frame = [], [], None, ''
-    for path in map(Path, args.bags):
+    paths, again = once([Path(bag) for bag in args.bags])
+    for path in again:
+        _tell(args, f'{path} is given twice: it is read once')
+    if len(paths) > 1:
+        look_at_all(paths, lambda path: _look(path, args))
+    used, legs, inputs, dropped, imu_frame, unit = [], [], [], None, '', None
+    for path in paths:
         journal = journal_notes(path)
         config = _config(args, journal)
         try:
-            new, described, frame = _legs_of(path, args, asked, config, journal)
+            new, described, frame, unit = _legs_of(path, args, asked, config, journal, unit)
         except LegDropped as error:
             dropped = error
-            if len(args.bags) > 1:
+            if len(paths) > 1:
                 _tell(args, str(error))
             continue
-        legs += new
+        except OdocalError as error:
+            if len(paths) == 1:
+                raise
+            raise BadUsage(about(path, error)) from None
+        used.append(path)
+        legs.append(new)
         inputs.append(described)
         imu_frame = imu_frame or frame
     if dropped and not legs:
         raise dropped
     if not config.frames.imu and imu_frame:
         config = with_settings(config, {'frames.imu': imu_frame})
+    legs, inputs = told_apart(used, legs, inputs)
     calibration = combine(legs, config)
     return _report(calibration, config, inputs, output, args)
+
+
+def _look(path, args) -> None:
+    """Open a bag and see that it has what a replay wants of it."""
+    from odocal_ros.bagio.read import open_bag
+    from odocal_ros.offline.journal import journal_notes
+    journal = journal_notes(path)
+    with open_bag(path) as bag:
+        _readers(bag, args, _config(args, journal), journal)
 
 
 def _tell(args, note: str) -> None:
@@ -90,13 +112,30 @@ def _config(args, journal=None):
     return with_settings(config, {'method': args.method}) if args.method else config
 
 
-def _legs_of(path, args, asked, config, journal):
-    """Return the results of a bag's legs, its entry for calibration.json, the Imu's frame."""
+def _readers(bag, args, config, journal):
+    """Return slot -> topic of a bag, and topic -> reader."""
+    from odocal_ros.messages import make_reader
+    from odocal_ros.offline.topics import choose_topics
+    overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
+        'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
+    overrides = {slot: topic for slot, topic in overrides.items() if topic}
+    if journal:
+        overrides = journal.topics_in(bag.topics) | overrides
+    topics = choose_topics(bag.topics, config, overrides)
+    return topics, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
+                    for slot, topic in topics.items()}
+
+
+def _legs_of(path, args, asked, config, journal, unit):
+    """
+    Return the results of a bag's legs, its entry for calibration.json, the Imu's frame, the unit.
+
+    unit : of the scale in the bags before, None for the first; another one is refused.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.leg import LegRecorder
-    from odocal_ros.messages import make_reader
     from odocal_ros.offline.legs import (
         dropped_legs,
         find_legs,
@@ -105,25 +144,23 @@ def _legs_of(path, args, asked, config, journal):
         OPEN_LEG,
     )
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.offline.topics import choose_topics
     quiet = args.quiet or args.json
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
-        overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
-            'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
-        overrides = {slot: topic for slot, topic in overrides.items() if topic}
         if journal:
             _tell(args, f'{bag.name} is a journal: settings and topics from {journal.path}; '
                   'options go before them')
-            overrides = journal.topics_in(bag.topics) | overrides
-        topics = choose_topics(bag.topics, config, overrides)
-        readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
-                   for slot, topic in topics.items()}
+        topics, readers = _readers(bag, args, config, journal)
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
         with Phase(f'reading {bag.name}', quiet) as phase:
             bag.read(readers, recorder.feed, phase)
         recorder.form = readers[topics['odometer']].form or recorder.form
+        if recorder.form.scale_unit != (unit or recorder.form.scale_unit):
+            raise BadUsage(f'{path}: the scale of its odometer {topics["odometer"]} is in '
+                           f'{NAMED[recorder.form.scale_unit]}, that of the bags before in '
+                           f'{NAMED[unit]}: there is no mean of them; calibrate them apart, or '
+                           'name topics of one kind')
         if 'odometer_right' in topics:
             recorder.form_right = readers[topics['odometer_right']].form
         marks = [] if asked else marked_legs(bag)
@@ -142,7 +179,7 @@ def _legs_of(path, args, asked, config, journal):
         with Phase(f'checksum of {bag.name}', quiet):
             described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
-    return results, described, frame
+    return results, described, frame, recorder.form.scale_unit
 
 
 def _calibrated(recorder, spans, config, notes, name, args):

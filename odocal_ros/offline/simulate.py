@@ -48,6 +48,8 @@ DEGREES = {
     'orientation_sigma': 'the Imu sends its orientation, with a heading error of this size',
     'heading_sigma': 'a topic /heading is sent, with an error of this size',
 }
+DAY_NS = 86_400 * 10**9
+DAYS = 3650          # then the days of the seeds begin anew
 LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
 
 
@@ -58,7 +60,8 @@ def add_arguments(parser) -> None:
         help='paper, straight, out_and_back or town')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
         'calibrator.yaml go beside it')
-    add('--seed', type=int, metavar='N', help='of all random numbers (default 1)')
+    add('--seed', type=int, metavar='N', help='of all random numbers (default 1); each is '
+        'driven on a day of its own')
     add('--imu-grade', metavar='GRADE',
         help='consumer, industrial, tactical, navigation or perfect')
     add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
@@ -111,6 +114,9 @@ def options_of(args):
     for name in LEVER_ARMS:
         if getattr(args, name) is not None:
             given[name] = tuple(getattr(args, name))
+    # drives of two seeds are two drives, not one time driven twice
+    seed = given.get('seed', SimOptions.seed)
+    given['start_ns'] = SimOptions.start_ns + (seed - 1) % DAYS * DAY_NS
     if args.mounting_rpy_deg is not None:
         given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
     if args.outages:

@@ -9,6 +9,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
+from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import known, MEANING, overall, sentence
 from odocal_ros.reasons import Reason, Verdict
 
@@ -88,7 +89,7 @@ def _context(calibration, config, content):
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     """Return reasons by gravity, the gravest first: (gravity, title, reasons)."""
-    groups = [(v.value, title, [r for r in reasons if r.code.gravity is v])
+    groups = [(v.value, title, [r for r in shared(reasons) if r.code.gravity is v])
               for v, title in TITLES.items()]
     return [group for group in groups if group[2]]
 

@@ -3,14 +3,14 @@
 from dataclasses import replace
 from datetime import datetime, UTC
 import math
-import textwrap
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, time_span, with_sigma
-from odocal_ros.output.verdicts import shown_verdict
-from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.output.reason_lines import bag_lines, reason_lines
+from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
+from odocal_ros.reasons import Verdict
 
 WIDTH = 98
 PPM = 1e6
@@ -37,7 +37,7 @@ def screen(calibration: Calibration, styled: bool = False) -> str:
     """
     parts = [_head(calibration, styled), _values(calibration), _leg_table(calibration.legs),
              _method_table(calibration), _check(calibration.legs), _budget(calibration),
-             _reasons(calibration.reasons)]
+             reason_lines(calibration.reasons, WIDTH)]
     return '\n\n'.join('\n'.join(part) for part in parts if part)
 
 
@@ -178,8 +178,9 @@ def _angle_text(angle):
 def _leg_table(legs):
     rows = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes', 'scale factor', 'yaw, deg',
              'verdict')]
-    rows += [(str(number), *_leg_row(leg)) for number, leg in enumerate(legs, 1)]
-    return _columns(rows) if legs else []
+    rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
+        zip(legs, leg_verdicts(legs), strict=True), 1)]
+    return _columns(rows) + bag_lines(legs, WIDTH) if legs else []
 
 
 def _columns(rows):
@@ -210,8 +211,7 @@ def _leg_row(leg: LegResult):
     return (f'{started:%m-%d %H:%M:%S}', length(leg.distance), f'{minutes}:{seconds:02d}',
             str(leg.fixes),
             '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
-            '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True),
-            leg.verdict.value)
+            '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
@@ -252,20 +252,3 @@ def _budget(calibration):
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
     return budget_lines(method.details.get('budget'), scale.value, SHOWN, hidden)
-
-
-def _reasons(reasons: tuple[Reason, ...]):
-    lines = []
-    for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'take care'),
-                           (Verdict.ACCEPTED, 'notes')):
-        for reason in (r for r in reasons if r.code.gravity is verdict):
-            lines += [f'  {title}'] if title else []
-            title = ''
-            lines += _wrapped(f'{reason.code.name}: {reason.text}', '    ')
-            lines += _wrapped(f'-> {reason.remedy}', '      ')
-    return lines
-
-
-def _wrapped(text, indent):
-    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + '   ',
-                         break_long_words=False, break_on_hyphens=False)

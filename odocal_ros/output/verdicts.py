@@ -1,6 +1,7 @@
 """The verdict of a method as it is shown: no better than that of the data it was fed with."""
 
 from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.combination import driven_twice
 from odocal_ros.reasons import Verdict, verdict_of
 
 
@@ -13,9 +14,16 @@ def shown_verdict(method: MethodResult, legs: tuple[LegResult, ...]) -> str:
 
     legs : those the figures rest on; of several that are good in part, the good ones count.
     """
-    of_data = [verdict_of(leg.reasons) for leg in legs]
+    twice = driven_twice([leg for leg in legs if verdict_of(leg.reasons) is not Verdict.REJECTED])
+    of_data = [verdict_of(leg.reasons) for leg in legs if leg not in twice]
     used = [v for v in of_data if v is not Verdict.REJECTED] or of_data
     worst = Verdict.worst([method.verdict, *used])
     if worst is method.verdict:
         return worst.value
     return f'{worst.value} (leg{"s" * (len(legs) > 1)})'
+
+
+def leg_verdicts(legs: tuple[LegResult, ...]) -> list[str]:
+    """Return the verdict of each leg, 'not used' where it is good and an earlier one is used."""
+    twice = driven_twice([leg for leg in legs if leg.verdict is not Verdict.REJECTED])
+    return ['not used' if leg in twice else leg.verdict.value for leg in legs]

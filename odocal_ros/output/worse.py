@@ -7,6 +7,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.stored import read_stored, Stored
+from odocal_ros.reasons import Code, Verdict
 
 CLEARLY = 2.0     # times the sigma: four times as many such legs would be needed
 JUDGED = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle')
@@ -24,7 +25,9 @@ def is_worse(old: Stored, new: Stored) -> str:
     if not old.usable:
         return ''
     if not new.usable:
-        codes = ', '.join(dict.fromkeys(new.reasons[:3]))
+        rejecting = [name for name in new.reasons if name in Code.__members__
+                     and Code[name].gravity is Verdict.REJECTED]
+        codes = ', '.join(dict.fromkeys(rejecting[:3] or new.reasons[:3]))
         return f'the new one is rejected ({codes}), the old one is {old.verdict.value}'
     if old.legs and old.legs < new.legs:
         return ''

@@ -28,7 +28,8 @@ def test_a_bag_its_truth_and_its_settings(tmp_path, capsys):
     assert odocal(*SHORT, '--out', out, '--seed', 7) == 0
     assert files(out.parent) == ['calibrator.yaml', 'drive', 'truth.yaml']
     assert files(out) == ['drive.mcap', 'metadata.yaml']
-    drive = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=50.0, seed=7))
+    drive = simulate(SimOptions(scenario='town', duration=140.0, imu_rate=50.0, seed=7,
+                                start_ns=SimOptions.start_ns + 6 * 86_400 * 10**9))   # day 7
     truth = load(out.parent / 'truth.yaml')
     assert truth['bag'] == 'drive'
     assert truth['scale'] == {'value': 0.0213, 'ratio': 0.0213 / 0.02, 'unit': 'm/pulse',

@@ -7,14 +7,21 @@ import pytest
 from odocal_ros.config import Config
 from odocal_ros.output import report_tables
 from odocal_ros.output.files import as_json
+from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
-from odocal_ros.output.verdicts import shown_verdict
+from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Code, Reason
 
 DEAD = Reason(Code.WHEEL_DEAD, 'the left wheel does not count')
 SLIP = Reason(Code.WHEEL_SLIP, 'a wheel spun')
 FAR = Reason(Code.SCALE_FAR_FROM_NOMINAL, 'far off')
+
+
+def later(leg, hours, **changes):
+    """Return a leg driven hours later."""
+    shift = hours * 3600 * 10**9
+    return replace(leg, start_ns=leg.start_ns + shift, stop_ns=leg.stop_ns + shift, **changes)
 
 
 @pytest.mark.parametrize(('of_method', 'of_legs', 'shown'), [
@@ -29,7 +36,7 @@ FAR = Reason(Code.SCALE_FAR_FROM_NOMINAL, 'far off')
     ((), [(DEAD,), (DEAD,)], 'rejected (legs)')])
 def test_the_row_is_no_better_than_its_legs(good, of_method, of_legs, shown):
     method = replace(good.methods['two_point'], reasons=of_method)
-    legs = tuple(replace(good.legs[0], reasons=reasons) for reasons in of_legs)
+    legs = tuple(later(good.legs[0], k, reasons=reasons) for k, reasons in enumerate(of_legs))
     assert shown_verdict(method, legs) == shown
 
 
@@ -43,6 +50,39 @@ def test_screen_and_report_show_it(good):
     assert [row.endswith('rejected (leg)') for row in rows] == [True, True]
     assert '0.0500000 ± 0.0000012' in rows[0]
     assert report_tables.method_table(methods, (leg,))['verdicts'] == ['rejected (leg)'] * 2
-    both = replace(calibration, legs=(leg, replace(leg, reasons=())))
+    both = replace(calibration, legs=(leg, later(leg, 1, reasons=())))
     page = report_html(both, Config(), as_json(both, Config(), [], ''))
     assert page.count('<td>rejected (leg)</td>') == 2      # in the table of the first leg
+
+
+def test_a_drive_given_twice_is_not_used_and_its_data_do_not_count(good):
+    leg = good.legs[0]
+    legs = (leg, replace(leg, reasons=(SLIP,), bag='copy'))
+    assert shown_verdict(good.methods['two_point'], legs) == 'accepted'
+    assert leg_verdicts(legs) == ['accepted', 'not used']
+    text = screen(replace(good, legs=legs))
+    first, second = (line for line in text.splitlines() if '08-02 08:53:20' in line)
+    assert first.endswith('accepted')
+    assert second.endswith('not used')
+    assert '\n  leg 1: drive; leg 2: copy\n' in text
+
+
+def test_one_bag_is_not_named_on_every_leg(good):
+    assert 'drive' not in screen(good)
+
+
+def test_what_several_legs_share_is_said_once():
+    slip, dead = Code.WHEEL_SLIP, Code.WHEEL_DEAD
+    said = ((slip, 'leg 1: it spun'), (slip, 'leg 3: it spun'), (slip, 'leg 2: it slid'),
+            (slip, 'it spun'), (dead, 'leg 2: it spun'), (slip, 'leg 4: it spun'))
+    assert [(r.code, r.text) for r in shared(tuple(Reason(*one) for one in said))] == [
+        (slip, 'legs 1, 3 and 4: it spun'), (slip, 'leg 2: it slid'), (slip, 'it spun'),
+        (dead, 'leg 2: it spun')]
+
+
+def test_long_names_of_bags_keep_the_width(good):
+    names = ['rosbag2_of_a_very_long_drive_2026_11_22-02_11', 'rosbag2_of_a_long_drive_2026_11_23']
+    text = screen(replace(good, legs=tuple(later(good.legs[0], k, bag=names[k % 2])
+                                           for k in range(3))))
+    assert max(map(len, text.splitlines())) <= 98
+    assert f'legs 1 and 3: {names[0]}; leg 2:' in text

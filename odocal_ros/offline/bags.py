@@ -1,0 +1,63 @@
+"""Several bags of one replay: each once, all of them looked at before the first is read."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from odocal_ros.errors import BadUsage, OdocalError
+
+
+def once(paths: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the bags, one given twice once, and those that were given again."""
+    first: dict[Path, Path] = {}
+    again = []
+    for path in paths:
+        if path.resolve() in first:
+            again.append(path)
+        first.setdefault(path.resolve(), path)
+    return list(first.values()), again
+
+
+def about(path: Path, error: Exception) -> str:
+    """Return what is wrong with one of several bags, beginning with the bag."""
+    text = str(error)
+    if text.startswith(str(path)):
+        return text
+    for name in (path.name, path.stem):      # some sentences begin with the bag's name
+        text = text.removeprefix(f'{name}: ')
+    return f'{path}: {text}'
+
+
+def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
+    """
+    Look at each of several bags, so that all that is wrong is told at once and before the work.
+
+    Raises
+    ------
+    BadUsage
+        ``look`` raised for one bag or more.
+
+    """
+    troubles = []
+    for path in paths:
+        try:
+            look(path)
+        except OdocalError as error:
+            troubles.append(about(path, error))
+    if troubles:
+        raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used, nothing was '
+                       f'calibrated: {"; ".join(troubles)}')
+
+
+def told_apart(paths: list[Path], legs: list[list], inputs: list[dict]):
+    """
+    Return legs and inputs named so that no two bags have one name: by their paths if need be.
+
+    legs : of each bag.   inputs : what is written of each.
+    """
+    names = [entry['bag'] for entry in inputs]
+    if len(set(names)) == len(names):
+        return [leg for some in legs for leg in some], inputs
+    return ([replace(leg, bag=str(path)) for path, some in zip(paths, legs, strict=True)
+             for leg in some],
+            [entry | {'bag': str(path)} for path, entry in zip(paths, inputs, strict=True)])

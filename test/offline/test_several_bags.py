@@ -1,0 +1,95 @@
+"""odocal replay with several bags: what is wrong with which, and legs of two vehicles."""
+
+import json
+import shutil
+
+import pytest
+
+from odocal_ros.bagio.write import drive_topics, write_bag
+from odocal_ros.offline.cli import main
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+DAY_NS = 86_400 * 10**9
+SHORT = {'scenario': 'straight', 'duration': 220.0, 'imu_rate': 50.0, 'odometer_rate': 20.0}
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    """Return a folder of bags, each of another day."""
+    folder = tmp_path_factory.mktemp('several')
+    for day, (name, more) in enumerate({
+            'one': {}, 'other': {'scale': 0.03}, 'speed': {'odometer': 'speed'},
+            'nofix': {'outages': ((0.0, 220.0),)}, 'wheels': {'two_wheels': True}}.items()):
+        options = SimOptions(**SHORT, seed=day + 1,
+                             start_ns=SimOptions.start_ns + day * DAY_NS, **more)
+        write_bag(folder / name, drive_topics(simulate(options)))
+    whole = next((folder / 'other').glob('*.mcap'))
+    (folder / 'cut.mcap').write_bytes(whole.read_bytes()[:whole.stat().st_size * 9 // 10])
+    (folder / 'foreign.txt').write_text('hello')
+    return folder
+
+
+def replay(bags, names, out, *options):
+    return main(['replay', *(str(bags / name) for name in names), '--output', str(out), '--method',
+                 'two_point', *options])
+
+
+def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path, capsys):
+    names = ['one', 'cut.mcap', 'nofix', 'wheels', 'foreign.txt', 'nosuch']
+    assert replay(bags, names, tmp_path / 'out') == 2
+    told = capsys.readouterr()
+    assert told.out == ''
+    line, = told.err.splitlines()
+    assert line.startswith('odocal: 4 of 6 bags cannot be used, nothing was calibrated: ')
+    for name, why in (('nofix', 'no fix (a topic'), ('wheels', '2 topics could be the odometer'),
+                      ('foreign.txt', 'is no bag'), ('nosuch', 'no such file')):
+        assert f'{bags / name}: {why}' in line
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_leg_asked_for_in_vain_says_of_which_bag(bags, tmp_path, capsys):
+    assert replay(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
+    assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 holds nothing' in \
+        capsys.readouterr().err
+
+
+def test_a_counter_and_a_speed_have_no_mean(bags, tmp_path, capsys):
+    assert replay(bags, ['one', 'speed'], tmp_path / 'out') == 2
+    line, = (x for x in capsys.readouterr().err.splitlines() if x.startswith('odocal: '))
+    assert str(bags / 'speed') in line
+    assert 'm per m (a speed), that of the bags before in m/pulse (a counter)' in line
+
+
+def test_two_vehicles_are_rejected(bags, tmp_path, capsys):
+    assert replay(bags, ['one', 'other'], tmp_path / 'out') == 1
+    said = capsys.readouterr().out
+    assert 'LEGS_UNLIKE: the scale of leg 2 is 40.' in ' '.join(said.split())    # 0.03 / 0.0213
+    assert '  leg 1: one; leg 2: other' in said.splitlines()
+
+
+def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
+    assert replay(bags, ['other', 'cut.mcap'], tmp_path / 'out', '--json') == 0
+    told = json.loads(capsys.readouterr().out)
+    codes = {r['code'] for r in told['reasons']}
+    assert 'LEGS_OVERLAP' in codes
+    assert 'BAG_TRUNCATED' not in codes         # of a leg that is not used
+    assert 'BAG_TRUNCATED' in {r['code'] for r in told['legs'][1]['reasons']}
+
+
+def test_a_bag_given_twice_is_read_once(bags, tmp_path, capsys):
+    assert replay(bags, ['one', f'../{bags.name}/one'], tmp_path / 'out', '--json') == 0
+    told = capsys.readouterr()
+    assert 'is given twice: it is read once' in told.err
+    assert len(json.loads(told.out)['legs']) == 1
+
+
+def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):
+    for name in ('one', 'other'):
+        shutil.copytree(bags / name, tmp_path / name / 'bag')
+    code = main(['replay', str(tmp_path / 'one' / 'bag'), str(tmp_path / 'other' / 'bag'),
+                 '--method', 'two_point', '--output', str(tmp_path / 'out'), '--json'])
+    assert code == 1
+    told = json.loads(capsys.readouterr().out)
+    paths = [str(tmp_path / name / 'bag') for name in ('one', 'other')]
+    assert [leg['bag'] for leg in told['legs']] == paths
+    assert [entry['bag'] for entry in told['inputs']] == paths
