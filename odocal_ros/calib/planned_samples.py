@@ -19,6 +19,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy, transpose
 
 Floats = NDArray[np.float64]
 RATE = 20.0           # Hz: the noise of a second does not hang on how often it is sampled
+ENOUGH = 50           # samples between keyframes that lie far apart
 SENT = ('heading_topic', 'imu_orientation')
 
 
@@ -70,8 +71,9 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = max(min(0.0, float(before[-1][0])), -config.leg.preroll) if before else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
+    rate = min(RATE, ENOUGH / spacing)
     t = np.linspace(t_begin, drive.duration,
-                    max(2, round((drive.duration - t_begin) * RATE) + 1))
+                    max(2, round((drive.duration - t_begin) * rate) + 1))
     motion = _motion(drive, t, origin, config)
     t_fix = _times(t_begin, drive.duration, sigmas.fix_rate, spacing)
     antenna = motion.p_n + motion.C_nb @ np.subtract(config.gnss.lever_arm, config.imu.lever_arm)

@@ -16,8 +16,10 @@ from odocal_ros.calib.smoother.smoother import FEWEST_FIXES, SHORTEST
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
 
-MOST_INTERVALS = 900      # between keyframes: those of longer drives lie farther apart,
-WIDEST = 5.0              # s, but no farther: sigmas come out 5 % too large by then, never smaller
+# keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at WIDEST, more
+# beyond two hours, which is more than a live leg may last; never too small
+ENOUGH_INTERVALS, MOST_INTERVALS = 600, 1440
+WIDEST = 5.0              # s
 SWAY_RATE = 10.0          # Hz of the white noise that sigmas.sway is said for
 WHITE_SHARE = 0.2         # of the sigma of a fix where errors stay alike: the receiver's own noise
 
@@ -58,7 +60,8 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
 
 def spacing_for(drive: PlannedDrive) -> float:
     """Return the seconds between keyframes that a drive is predicted with."""
-    return float(np.clip(drive.duration / MOST_INTERVALS, SPACING, WIDEST))
+    usual = np.clip(drive.duration / ENOUGH_INTERVALS, SPACING, WIDEST)
+    return float(max(usual, drive.duration / MOST_INTERVALS))
 
 
 def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:

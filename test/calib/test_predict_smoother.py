@@ -133,8 +133,10 @@ def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     assert (coarse >= fine).all()
     assert (coarse < 1.15 * fine).all()
     assert spacing_for(drive) == 1.0
-    assert spacing_for(replace(drive, t=drive.t * 6)) == pytest.approx(4.0, rel=0.01)
-    assert spacing_for(replace(drive, t=drive.t * 60)) == WIDEST
+    assert spacing_for(replace(drive, t=drive.t * 3)) == pytest.approx(3.0, rel=0.01)
+    assert spacing_for(replace(drive, t=drive.t * 10)) == WIDEST
+    day = replace(drive, t=drive.t * 60)
+    assert day.duration / spacing_for(day) == pytest.approx(1440.0)
 
 
 def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):

@@ -215,14 +215,18 @@ def test_a_drive_of_figures_has_those_figures():
 
 def gpx(path, times=True, rest=30.0, count=200, corner=math.pi / 2):
     """Write a track: rest, east at 10 m/s with a point a second, left as far, rest."""
-    origin = Origin(math.radians(48.0), math.radians(11.0), 500.0)
     t = np.concatenate([[0.0, rest / 2], rest + np.arange(2 * count + 1), [2 * count + 2 * rest]])
+    t = t[np.diff(t, prepend=-1.0) > 0]
     way = np.clip(t - rest, 0, 2 * count) * 10.0
     first, second = np.minimum(way, count * 10.0), np.maximum(way - count * 10.0, 0.0)
     east, north = first + second * math.cos(corner), second * math.sin(corner)
-    keep = np.diff(t, prepend=-1.0) > 0
-    t, way, east, north = t[keep], way[keep], east[keep], north[keep]
-    geodetic = origin.to_geodetic(np.stack([east, north, np.zeros_like(way)], -1))
+    return gpx_of(path, t, east, north, times)
+
+
+def gpx_of(path, t, east, north, times=True):
+    """Write a track through points, m."""
+    origin = Origin(math.radians(48.0), math.radians(11.0), 500.0)
+    geodetic = origin.to_geodetic(np.stack([east, north, np.zeros_like(east)], -1))
     points = []
     for (lat, lon, height), when in zip(geodetic, t, strict=True):
         stamp = f'<time>2026-01-01T00:{int(when) // 60:02d}:{when % 60:04.1f}Z</time>'
@@ -231,6 +235,25 @@ def gpx(path, times=True, rest=30.0, count=200, corner=math.pi / 2):
     path.write_text('<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1">'
                     f'<trk><trkseg>{"".join(points)}</trkseg></trk></gpx>')
     return path
+
+
+@pytest.mark.parametrize(('scenario', 'noise'), [('straight', 0.0), ('straight', 0.05),
+                                                 ('town', 0.2)])
+def test_the_jerks_of_a_gpx_tell_no_heading(tmp_path, scenario, noise):
+    motion = motion_of(resolved(SimOptions(scenario=scenario)))
+    t = np.arange(0.0, motion.duration, 0.05)
+    step = motion.speed(t) * 0.05 * np.exp(1j * np.cumsum(motion.yaw_rate(t) * 0.05))
+    place = np.cumsum(step)[::20]      # a point a second
+    place = place + noise * np.random.default_rng(3).normal(size=(2, len(place))).T.copy().view(
+        complex)[:, 0]
+    sigmas = Sigmas()
+    own, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
+        profile.from_scenario(scenario, None),
+        profile.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
+    # points 5 m apart hide how a start of 0.5 m/s^2 sets in, 4 s of it: of 25 s, a sixth, and
+    # noise adds to it; steps of speed at each point would halve the sigma of the straight drive
+    for name in NAMES[:2]:
+        assert drawn[name].sigma > 0.75 * own[name].sigma
 
 
 def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
