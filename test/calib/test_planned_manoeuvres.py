@@ -30,6 +30,7 @@ def test_turns_both_ways_lead_back_to_the_direction_they_began_with():
     changed = turns_both_ways(drive)
     assert changed.yaw[-1] == pytest.approx(drive.yaw[-1])
     assert np.ptp(changed.yaw) == pytest.approx(np.pi / 2)
+    assert changed.yaw.max() > drive.yaw[0] + 1.5           # first to the left
     turn = np.pi / 2 * 15.0 / 2.0           # 2 m/s^2 to the side at 15 m/s
     assert changed.duration - drive.duration == pytest.approx(2 * turn + 5.0)
     rate = np.diff(changed.yaw) / np.diff(changed.t)
