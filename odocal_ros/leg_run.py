@@ -21,6 +21,7 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
+from odocal_ros.slow_slip import held
 from odocal_ros.smoother_run import smoother
 from odocal_ros.two_point_run import two_point
 from odocal_ros.wheels_run import wheels
@@ -84,6 +85,7 @@ class LegRun:
         methods, paths = {}, {}
         for name in self._asked():
             method, paths[name] = METHODS[name](self)
+            method = held(method, self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))

@@ -6,7 +6,7 @@ difference is rounding and gyro noise, millimetres over seconds; a wheel that sp
 its own stands out of it by centimetres, where the Imu's acceleration alone sees half a metre.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from odocal_ros.calib.wheels.whole_drive import (
 from odocal_ros.reasons import Code, Reason
 
 STEP = 0.1            # s, grid
-GAPS = (10, 30, 80, 200)   # steps between the ends: slips of up to 1, 3, 8, 20 s are seen whole
+GAPS = (10, 30, 80, 200, 500)   # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
 BLUR = 0.005          # m, what two tyres on real ground may do in any window, 1 sigma
 TURN_DOUBT = 0.01     # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
 CHANCE = 5.0          # log of the odds at which a wheel is named
@@ -41,12 +41,14 @@ class WheelSlips:
 
     begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
     wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
+    change : of the ratio right over left, from the first half of the way to the second.
     """
 
     begin: NDArray[np.float64]
     end: NDArray[np.float64]
     size: NDArray[np.float64]
     wheel: NDArray[np.int64]
+    change: float = 0.0
 
     @property
     def t(self):
@@ -100,15 +102,16 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     reasons = swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
                        track_width)
     reasons += unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
-    reasons += changed(two, signals, metres_per_unit)
+    found, change = changed(two, signals, metres_per_unit)
+    reasons += found
     apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
     width = track_width or abs(x[1]) * per_right
     events = _events(two, apart, per_right * (1 + ratio) / 2, width)
     if not events:
-        return reasons, NO_SLIPS
+        return reasons, replace(NO_SLIPS, change=change)
     mean = (two.left * ratio + two.right) / 2 * per_right
     wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
-    slips = _slips(events, wheel)
+    slips = replace(_slips(events, wheel), change=change)
     return reasons + _slip_reason(slips), slips
 
 

@@ -70,22 +70,23 @@ def swapped(width, sigma, track_width):
 
 
 def changed(two, signals, metres_per_unit):
-    """Say that the ratio of the wheels is not the same in both halves of the way."""
+    """Say that the wheels' ratio is not the same in both halves of the way; by how much, or 0."""
     way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
     middle = int(np.searchsorted(way, way[-1] / 2))
     late = np.where(np.arange(len(way)) > middle, two.left - two.left[middle], 0.0)
     x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
     if x is None or x[0] <= 0:
-        return ()
+        return (), 0.0
     change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
     if abs(change) <= max(CHANGE, SURE * sigma):
-        return ()
+        return (), 0.0
     return (Reason(Code.WHEEL_SLIP, f'from the first half of the way to the second, at '
                    f't = {two.t[middle]:.0f} s, the right wheel comes to count '
                    f'{100 * abs(change):.2f} % (+-{100 * sigma:.2f}) '
                    f'{"more" if change > 0 else "less"} on the way of the left one, against the '
-                   'gyro: a wheel that slips all along, or loses air. The factors are a mean of '
-                   'both, beyond their sigmas'),)
+                   'gyro: a wheel that slips all along, or loses air. Which half is right nothing '
+                   f'tells: the sigma of the scale holds {25 * abs(change):.2f} % for it, that of '
+                   f'each wheel {50 * abs(change):.2f} %'),), float(change)
 
 
 def unlike(ratio, width, limit):
