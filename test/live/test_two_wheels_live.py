@@ -27,14 +27,15 @@ def drive():
 def session(drive, domain, tmp_path_factory):
     """Drive one leg; keep what the node said."""
     folder = tmp_path_factory.mktemp('two')
-    wheels = {'left': drive.odometer, 'right': drive.odometer_right}
+    # no setting says which joints are the wheels: their names do
+    wheels = {'left_steering': drive.odometer_right, 'right_steering': drive.odometer,
+              'wheel_left': drive.odometer, 'wheel_right': drive.odometer_right}
     topics = {'imu': encode.imu('imu/data', drive.imu), 'fix': encode.fix('fix', drive.fix),
               'odometer': encode.joints('odometer', wheels)}
     sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)),
                   key=lambda one: one.stamp_ns)
     start_s = (drive.leg().start_ns - sent[0].stamp_ns) * 1e-9
     settings = {'output.directory': folder, 'method': 'wheels',
-                'odometer.left': 'left', 'odometer.right': 'right',
                 'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': 0.002,
                 'wheels.radius': 0.3, 'imu.grade': 'tactical'}
     node = NodeProcess(*(x for name, value in settings.items() for x in (
