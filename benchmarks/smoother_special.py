@@ -32,8 +32,9 @@ def special(simulated, true_levels, drives, parts):
 
 
 def _print_dull(simulated, true_levels, drives):
-    print('Sigma of the yaw against bounds at the truth, deg (levels of the simulation: wheels\n'
-          'that never slide; and of method.md: 0.05 m/s sideways at 10 Hz)')
+    print('Sigma of the yaw against bounds at the truth, deg. bound: levels of the simulation,\n'
+          'none below the least believed on such a drive. sliding: as method.md has it, 0.05 m/s\n'
+          'sideways at 10 Hz, but not at rest (with that too, 0.101 and 0.0070 deg)')
     for number, (options, promise) in enumerate(DULL):
         first = FIRST_SEED + 1000 * number
         _dull(simulated, true_levels, range(first, first + drives), options, promise)

@@ -26,8 +26,8 @@ SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant i
 UNKNOWN = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
 FIRST_TAILS, LAST_TAILS = 3, 12     # iterations in which heavy tails are looked for
 QUIET = 0.01         # relative change of the sigmas of scale and mounting, the same
-# pseudo-observations that a level is as first believed (Imu), or as it is (the others: more of them
-# end the way to a small noise too early)
+# pseudo-observations that a level is as first believed (Imu), or as it is (the others: more of
+# them end the way to a small noise too early)
 SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 INERTIA = 1.0
 HASTE = 1.6          # power on the steps of levels: the fixed point is slow where a noise is small
