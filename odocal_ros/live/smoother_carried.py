@@ -95,6 +95,6 @@ def _reckoned(state: State, problem: Problem) -> State:
     on['v_n'][n:] = (C[n:] @ f) * speed[:, None]
     gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
         on['p_n'][n:], leg.origin)
-    for k in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
-        on['v_n'][n + k] = on['v_n'][n + k - 1] + gained[k]
+    for late in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
+        on['v_n'][n + late] = on['v_n'][n + late - 1] + gained[late]
     return State(**on, constants=c)
