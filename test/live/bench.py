@@ -154,6 +154,13 @@ class Client:
         """Call one of the node's Trigger services and return its answer."""
         return answer_of(self.ask(name))
 
+    def start(self):
+        """Start a leg as soon as the node has heard what was just sent; return the answer."""
+        def begun():
+            answer = self.call('start_leg')
+            return answer if answer.success else None
+        return wait_for(begun, 'a leg that starts')
+
     def get(self, *names: str) -> list:
         """Return values of parameters."""
         from rcl_interfaces.srv import GetParameters

@@ -60,13 +60,14 @@ def session(domain, tmp_path_factory):
         seen.live = json.loads((Path(seen.status['saved']) / 'calibration.json').read_text())
         # a leg that is cancelled, and one that is undone after it was joined
         player.play(part(sent, 117, 118), SPEED)
-        client.call('start_leg')
+        client.start()
         player.play(part(sent, 118, 122), SPEED)
         client.call('cancel_leg')
         seen.cancelled = Path(wait_for(lambda: client.status['journal'] != str(seen.kept)
                                        and client.status['journal'], 'another journal'))
-        client.call('start_leg')
-        player.play(part(sent, 122, 125), SPEED)
+        player.play(part(sent, 122, 123), SPEED)
+        client.start()
+        player.play(part(sent, 123, 125), SPEED)
         stopping = client.ask('stop_leg')
         player.play(part(sent, 125, 127), SPEED)
         answer_of(stopping)
@@ -215,7 +216,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect
     wait_for(lambda: not client.status['journal_trouble'], 'the end of the warning')
     assert client.call('reset').success
     player.play(part(slow[1], 60, 60.5), SPEED)
-    assert client.call('start_leg').success
+    client.start()
     status = client.until(state='recording')
     assert (status['journal'], status['journal_trouble'], status['level']) == ('', '', b'\0')
 

@@ -90,9 +90,10 @@ def _first_leg(seen, client, player, sent):
     # a look that is due comes after the last message too: it sees 50 s of the leg or more
     seen.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
                              and client.status, 'a running estimate')
+    # no more is sent until the answer: what the leg holds must not depend on how busy all is
+    player.play(part(sent, 115, 117), SPEED)
     stopping = client.ask('stop_leg')
     seen.computing = client.until(state='computing')
-    player.play(part(sent, 115, 117), SPEED)
     seen.stop = answer_of(stopping)
     seen.calibrated = client.until(state='calibrated')
     seen.saved = client.until(state='calibrated', saved=wait_for(
@@ -110,11 +111,12 @@ def _first_leg(seen, client, player, sent):
 
 def _second_leg(seen, client, player, sent):
     player.play(part(sent, 117, 118), SPEED)   # a topic silent for 2 s would count as gone
-    client.call('start_leg')
+    client.start()
     seen.cancel = client.call('cancel_leg')
     seen.cancelled = client.until(leg_event='cancelled')
-    client.call('start_leg')
-    player.play(part(sent, 118, 125), SPEED)
+    player.play(part(sent, 118, 119), SPEED)
+    client.start()
+    player.play(part(sent, 119, 125), SPEED)
     stopping = client.ask('stop_leg')
     player.play(part(sent, 125, 127), SPEED)
     seen.second = answer_of(stopping)
