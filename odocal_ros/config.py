@@ -70,6 +70,8 @@ class ImuConfig:
                                      "accelerometer bias; NaN: the grade's.")
     gyro_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the gyro scale, '
                                       "relative, 1 sigma; NaN: the grade's.")
+    accel_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the accelerometer '
+                                       "scale, relative, 1 sigma; NaN: the grade's.")
     gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on turn rates as sent: '
                                 '0.017453292519943295 for an Imu that sends deg/s.')
     accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on specific force as sent: '

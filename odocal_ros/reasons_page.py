@@ -155,8 +155,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
     'Several legs': {
         Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow. The sigma of the '
         'combination holds that.',
-        Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, far '
-        'beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
+        Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
+        'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
         'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '
         'changed in between. A mean of them would be of no vehicle.',
         Code.LEGS_OVERLAP: 'Two legs share time, so that they are not two opinions; the later one '

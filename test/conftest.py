@@ -29,6 +29,7 @@ DOMAIN, _lock = _own_domain()
 os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it would win
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')      # as the commands have it: the same digits
 
 
 def pytest_report_header() -> list[str]:

@@ -6,6 +6,7 @@ from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.calib.planned_samples import Ideal, ideal
 from odocal_ros.calib.predict import Sigmas
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.accel_scale import scale_priors
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
@@ -52,6 +53,10 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels)
+        priors, _ = scale_priors(problem.priors, fit.solved, None, sigmas.config)
+        if priors is not problem.priors:
+            problem.priors = priors
+            fit = _fit(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
                        '1')

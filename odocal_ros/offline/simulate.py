@@ -19,6 +19,7 @@ NUMBERS = {
     'fix_rate': ('HZ', 'rate of /fix (default 5)'),
     'heading_rate': ('HZ', 'rate of /heading (default 10)'),
     'gyro_scale_error': ('X', 'by which the gyro reads too much, relative (default 0)'),
+    'accel_scale_error': ('X', 'by which the accelerometer does (default 0)'),
     'scale': ('K', 'true scale factor, m/pulse, m/rad or 1'),
     'nominal_scale': ('K0', 'scale factor as configured'),
     'speed_noise': ('M/S', 'white noise of --odometer speed'),

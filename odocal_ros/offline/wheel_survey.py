@@ -1,4 +1,4 @@
-"""How each value of a list (joints, an array of counters) moves: which could be wheels, by data."""
+"""How each value of a list (joints, an array of counters) moves: what could be wheels."""
 
 import numpy as np
 

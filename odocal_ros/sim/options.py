@@ -44,6 +44,7 @@ class SimOptions:
     mounting_rpy: Vector = ORIGIN          # rad, nominal, Imu frame to b
     imu_lever_arm: Vector = ORIGIN
     gyro_scale_error: float = 0.0          # relative, of all axes
+    accel_scale_error: float = 0.0         # relative, of all axes
     orientation_sigma: float | None = None  # rad; None: the Imu sends no orientation
 
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
@@ -94,9 +95,9 @@ NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise'
                 'outlier_size', 'seed')
 # largest size, and how a person gives it: rad inside, degrees on the command line
 LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
-          'gyro_scale_error': 0.5, 'odometer_delay': 10.0, 'fix_delay': 10.0,
-          'duration': 36_000.0, 'imu_rate': 10_000.0, 'odometer_rate': 10_000.0,
-          'fix_rate': 1000.0, 'heading_rate': 1000.0}
+          'gyro_scale_error': 0.5, 'accel_scale_error': 0.5, 'odometer_delay': 10.0,
+          'fix_delay': 10.0, 'duration': 36_000.0, 'imu_rate': 10_000.0,
+          'odometer_rate': 10_000.0, 'fix_rate': 1000.0, 'heading_rate': 1000.0}
 ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0, 'yaw': 180.0,
           'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}
 MOST_SAMPLES = 20_000_000   # of one topic; more would not fit in memory

@@ -88,7 +88,7 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
         variance = np.full(len(t), options.orientation_sigma**2)
     stamp = options.start_ns + ns
     return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_i + gyro,
-                      f_v @ C_vi + accel, q_ni, variance)
+                      f_v @ C_vi * (1 + options.accel_scale_error) + accel, q_ni, variance)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:

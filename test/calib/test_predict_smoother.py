@@ -107,7 +107,7 @@ def test_the_scale_bounds_of_method_md_come_out(drive, grade, white, pulses):
     # the pulses; its filter knows no rests but by the odometer, hence not to the last digit
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
-        'odometer.time_sigma': 0.0})
+        'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(table, rel=0.10)

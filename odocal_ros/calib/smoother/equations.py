@@ -61,7 +61,7 @@ class Equations:
         self.motion = Motion(leg, state, intervals, (gyro_change, delay_change))
         self.noise = interval_noise(
             self.motion, leg, self.still[:-1] & self.still[1:], spread)
-        self.fixes = Fixes(leg, state, sums.points, intervals.mean_rate, problem.use, fix_change)
+        self.fixes = Fixes(leg, state, sums.points, intervals, problem.use, fix_change)
         self.root = problem.root
         self.thin = problem.thin
         self.outside = outside_rows(problem, state, sums.outside, fix_change)

@@ -5,6 +5,7 @@ import numpy as np
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
+    ACCEL_SCALE,
     BA,
     BARE,
     BG,
@@ -33,8 +34,8 @@ class Fixes:
     later : s by which the delay of the fixes exceeds that of the points.
     """
 
-    def __init__(self, leg, state, points, mean_rate, use, later=0.0):
-        self.state, self.points = state, points
+    def __init__(self, leg, state, points, intervals, use, later=0.0):
+        self.state, self.points, self.mean_force = state, points, intervals.mean_force
         k, tau = points.interval, points.tau[:, None]
         self.k = k
         self.C = state.C_nb[k]
@@ -52,7 +53,7 @@ class Fixes:
             + state.slow_n[k + 1] * self.share[:, None]
         self.dp = dp
         self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
-            self.C_t, np.cross(mean_rate[k], arm_b))
+            self.C_t, np.cross(intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[use] - place - self.arm_n - slow
         self.raw = np.nan_to_num(raw) + self.v_n * later
@@ -79,6 +80,7 @@ class Fixes:
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
+        c[:, :, ACCEL_SCALE] = J[:, :, BA][:, :, :2] * self.mean_force[self.k, None, :2]
         return J, c
 
 

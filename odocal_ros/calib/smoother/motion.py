@@ -11,6 +11,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
+    ACCEL_SCALE,
     BA,
     BG,
     C_bv_gradient,
@@ -128,7 +129,9 @@ class Motion:
         c[:, D, ODO_ARM] = swing @ state.C_bv
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self._faster()
-        # a scale error is a bias in proportion to the turn rate
+        # a scale error is a bias in proportion to the turn rate, or to the force
         c[:, :, GYRO_SCALE] = a[:, :, BG.start + 2] * s.mean_rate[:, 2:]
         c[:, BG, GYRO_SCALE] = 0.0
+        c[:, :, ACCEL_SCALE] = a[:, :, BA][:, :, :2] * s.mean_force[:, None, :2]
+        c[:, BA, ACCEL_SCALE] = 0.0
         return c

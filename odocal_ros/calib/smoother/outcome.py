@@ -11,6 +11,7 @@ from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
+    ACCEL_SCALE,
     BG,
     CONSTANTS,
     GNSS_ARM,
@@ -35,7 +36,9 @@ UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
 OPTIONAL = [i for i, name in enumerate(CONSTANTS)
-            if i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
+            if i < ACCEL_SCALE.start and i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
+
+SCALES = range(ACCEL_SCALE.start, ACCEL_SCALE.stop)
 
 
 def refused(reasons, scale_unit, details=None) -> MethodResult:
@@ -87,7 +90,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
             found[name] = Estimate(value, float(sigma[i]), 'rad')
     reasons += _undetermined(sigma, limit, config, yaw)
     after = np.sqrt(np.diag(fit.solved.covariance)) / problem.priors.constants
-    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, GYRO_SCALE)}
+    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, GYRO_SCALE, *SCALES)}
     for i in OPTIONAL:
         name = CONSTANTS[i]
         if ratio[name] < INFORMED:
@@ -180,8 +183,8 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'iterations': fit.iterations, 'widened': float(widen),
         'outside': _outside(leg, problem, fit, sigma),
         'posterior_to_prior': ratio,
-        'gyro_scale_z': {'value': float(state.constants[GYRO_SCALE]),
-                         'sigma': float(sigma[GYRO_SCALE])},
+        **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
+           for i in (GYRO_SCALE, *SCALES)},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((w.fix_r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((w.fix_weight[:, 0] < 0.5).sum()),

@@ -43,6 +43,7 @@ class Intervals:
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
     S_bg: Floats     # (K, 3, 3) derivative of S @ forward by the gyro bias
     mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
+    mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
 
@@ -105,6 +106,10 @@ class ImuRows:
         t = leg.t_imu[rows]
         return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
 
+    def mean_force(self) -> Floats:
+        """Return the mean specific force of each interval as measured: (K, 3) m/s^2."""
+        return _mean(self.t, self.f_b, self.key)
+
 
 def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forward, t_points,
                  derivatives=True):
@@ -156,6 +161,12 @@ def _joined(cls, parts):
                   for f in fields(cls)})
 
 
+def _mean(t, x, key):
+    """Return the means of x (n, 3) between keyframes, by the trapezoid rule: (K, 3)."""
+    step = (x[:-1] + x[1:]) * (np.diff(t) / 2)[:, None]
+    return np.add.reduceat(step, key[:-1]) / np.diff(t[key])[:, None]
+
+
 def _cross(a, M):
     """Return [a x] M: (n, 3), (n, 3, 3)."""
     x, y, z = (a[:, i, None] for i in range(3))
@@ -170,7 +181,7 @@ class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
     def __init__(self, t, f_b, turn, key, gyro_bias, accel_bias):
-        self.t, self.key, self.turn = t, key, turn
+        self.t, self.key, self.turn, self.f_b = t, key, turn, f_b
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         dt = self.dt = np.diff(t)
         q = np.empty((len(t), 4))
@@ -222,7 +233,7 @@ class _Chunk:
             turned = _cross(self.Rs @ forward, self.A_before) + _cross(self.Re @ forward, A_after)
             _, S_bg = self._running(turned * self._widen(ds, turned))
         return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, self.A, AA, dv_bg, dp_bg,
-                         S, S_bg, turn / T[:, None],
+                         S, S_bg, turn / T[:, None], _mean(self.t, self.f_b, self.key),
                          np.maximum.reduceat(self.dt, self.key[:-1]))
 
     def points(self, t, interval, first) -> Points:

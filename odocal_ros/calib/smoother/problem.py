@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.sanity import G
 from odocal_ros.calib.smoother.equations import Priors
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -13,6 +14,7 @@ from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, p
 from odocal_ros.calib.smoother.slide import least_slide, SIDEWAYS, turned
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
+    ACCEL_SCALE,
     GNSS_ARM,
     GNSS_DELAY,
     GYRO_SCALE,
@@ -33,6 +35,7 @@ SPACING = 1.0        # s between keyframes
 ROAD = 0.01          # m/sqrt(s), what slip and slide are believed to be at first
 LEAST_ROAD = 2e-4    # m/sqrt(s) along
 LEAST_FIX = 0.005    # m
+NO_SCALE = 1e-5      # relative, of the accelerometer: as good as none, until the fit is judged
 GYRO_SCALE_SIGMA = {'consumer': 3e-3, 'industrial': 2e-3, 'tactical': 3e-4, 'navigation': 1e-5}
 
 
@@ -103,7 +106,8 @@ class Problem:
         all_t = np.concatenate(times)
         order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
-            self.imu, state.gyro_bias[:-1], state.accel_bias[:-1], c[GYRO_SCALE],
+            self.imu, state.gyro_bias[:-1],
+            state.accel_bias[:-1] + self.imu.mean_force() * _level(c), c[GYRO_SCALE],
             lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order])
         if not self.outside:
             return Sums(state, intervals, points, {})
@@ -128,7 +132,9 @@ class Sums:
         gyro = (a.gyro_bias - b.gyro_bias)[:-1]
         gyro = gyro + (a.constants[GYRO_SCALE] - b.constants[GYRO_SCALE]) * (
             self.intervals.mean_rate * [0.0, 0.0, 1.0])
-        return gyro, (a.accel_bias - b.accel_bias)[:-1], a.constants - b.constants
+        c = a.constants - b.constants
+        accel = (a.accel_bias - b.accel_bias)[:-1] + self.intervals.mean_force * _level(c)
+        return gyro, accel, c
 
     def near(self, state):
         """Return intervals for a state nearby, and what they leave to be taken in."""
@@ -192,5 +198,12 @@ def _priors(config, grade, leg) -> Priors:
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade]
     sigma[HEADING] = leg.heading.sigma
-    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), np.full(3, max(grade.accel_bias, 1e-6)),
-                  sigma, np.zeros(M))
+    sigma[ACCEL_SCALE] = NO_SCALE
+    accel_bias = np.full(3, max(grade.accel_bias, 1e-6))
+    accel_bias[2] = np.hypot(accel_bias[2], grade.accel_scale_error * G)
+    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, np.zeros(M))
+
+
+def _level(constants):
+    """Return the accelerometer's scale errors by axis, as a bias in proportion to the force."""
+    return np.append(constants[ACCEL_SCALE], 0.0)

@@ -6,6 +6,7 @@ from odocal_ros.calib.result import Source
 from odocal_ros.calib.smoother.components import units
 from odocal_ros.calib.smoother.noise import INTERVAL
 from odocal_ros.calib.smoother.state import (
+    ACCEL_SCALE,
     BA,
     BG,
     E,
@@ -29,6 +30,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
           'fix_latency': slice(GNSS_DELAY, GNSS_DELAY + 1),
           'gyro_scale': slice(GYRO_SCALE, GYRO_SCALE + 1),
+          'accelerometer_scale': ACCEL_SCALE,
           'heading': slice(HEADING, HEADING + 1)}
 P = 3        # parameters: ln K, yaw, pitch
 

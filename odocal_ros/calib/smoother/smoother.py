@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.accel_scale import judge_scale
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import fit
@@ -71,8 +72,10 @@ def best_fit(problem, config, trace=None):
     problem.thin = {rows.name: alike(rows) for rows in best.weighted.outside}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
-        return with_slow_errors(problem, best, asked, trace)
-    return fit(problem, best.state, best.levels, about=best, trace=trace)
+        found = with_slow_errors(problem, best, asked, trace)
+    else:
+        found = fit(problem, best.state, best.levels, about=best, trace=trace)
+    return judge_scale(problem, found, config)
 
 
 def _too_little(leg):

@@ -25,11 +25,14 @@ BARE, WITH_SLOW = 16, 19     # unknowns of a block
 CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
-             'odometer_delay', 'gnss_delay', 'gyro_scale_z', 'heading_offset')
+             'odometer_delay', 'gnss_delay', 'gyro_scale_z', 'heading_offset',
+             'accelerometer_scale_x', 'accelerometer_scale_y')
 LN_K, YAW, PITCH = 0, 1, 2
 ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY, GYRO_SCALE = 9, 10, 11
 HEADING = 12                 # error of the outside heading, the same through the leg, rad
+# of what is measured, the part that is too much; up, it is no other than a bias
+ACCEL_SCALE = slice(13, 15)
 M = len(CONSTANTS)
 
 

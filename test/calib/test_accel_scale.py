@@ -1,0 +1,54 @@
+"""The accelerometer's scale error: judged from the drive, held by the sigma."""
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.accel_scale import believed
+from odocal_ros.calib.smoother.problem import NO_SCALE
+from odocal_ros.config import with_settings
+
+GRADE, BELIEF = 3e-3, 0.8
+TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
+
+
+def seen(sigma, error):
+    """Return covariance and values under the belief of none, of data that tell both so well."""
+    data = 1 / sigma**2
+    both = data + 1 / NO_SCALE**2
+    return np.eye(2) / both, np.full(2, data * error / both)
+
+
+def test_weights_are_the_evidence_written_out():
+    prior, weight = believed(*seen(1e-3, 2e-3), GRADE, BELIEF)
+    # each axis: the value seen is N(0, s^2) without a scale error, N(0, s^2 + grade^2) with one
+    total = 1e-3**2 + GRADE**2
+    odds = BELIEF / (1 - BELIEF) * (1e-6 / total * np.exp(4e-6 * (1 / 1e-6 - 1 / total)))
+    assert weight == pytest.approx(odds / (1 + odds), rel=2e-3)      # NO_SCALE and 1e-3 of belief
+    # the posterior of that prior has the mean square of both beliefs: w var + w (1 - w) mean^2
+    var, mean = 1 / (1e6 + GRADE**-2), 2e-3 * GRADE**2 / total
+    square = weight * var + weight * (1 - weight) * mean**2
+    expected = min(1 / (1 / square - 1e6), GRADE**2) if square < 1e-6 else GRADE**2
+    assert prior**2 == pytest.approx(expected, rel=5e-3)
+
+
+def test_a_drive_that_tells_there_is_none_is_believed():
+    prior, weight = believed(*seen(1e-4, 0.0), GRADE, BELIEF)
+    assert weight < 0.01
+    assert prior.max() < 2e-5
+    # and one that tells nothing is not
+    blind, weight = believed(*seen(0.1, 0.0), GRADE, BELIEF)
+    assert weight == pytest.approx(BELIEF, rel=2e-3)
+    assert blind.max() > 0.8 * GRADE
+
+
+@pytest.mark.parametrize('noise', ['white', 'correlated'])
+def test_the_sigma_of_the_scale_holds_it(noise):
+    drive, config, leg = made(**TOWN, fix_noise=noise, accel_scale_error=GRADE, seed=4)
+    graded = with_settings(config, {'imu.accel_scale_sigma': np.nan})     # that of its grade
+    scale = smooth(leg, graded).estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma       # 1 in 370
+    # of an Imu said to have none, the error is many sigmas: what this is for
+    wrong = smooth(leg, config).estimates['scale_factor']
+    assert abs(wrong.value - drive.truth.scale) > 4.0 * wrong.sigma
