@@ -17,7 +17,7 @@ from odocal_ros.calib.smoother.state import ACCEL_SCALE
 from odocal_ros.grades import grade_of
 
 # that an accelerometer has the scale error of its grade: makers of the better ones take it out
-BELIEF = {'consumer': 0.8, 'industrial': 0.8, 'tactical': 0.2, 'navigation': 0.2}
+BELIEF = {'consumer': 0.5, 'industrial': 0.5, 'tactical': 0.2, 'navigation': 0.2}
 NO_MATTER = 0.01     # relative change of the scale's sigma that is no matter
 TAKEN = 0.5          # weight from which a scale error is there
 FEW = 6              # passes to bring it in
