@@ -1,5 +1,9 @@
 """The smoother on one leg: all samples at once, no outside heading."""
 
+from dataclasses import replace
+
+import numpy as np
+
 from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.dead_reckoning import dead_reckon
@@ -15,7 +19,8 @@ def smoother(run):
     Returns
     -------
     MethodResult, and the antenna's path (t to (n, 3), but for a constant) that dead reckoning
-    makes from the attitude at the start with the values found; None where refused.
+    makes from the attitude at the start with all values found, delays and lever arms too; t is as
+    the fixes stamp it. None where refused.
 
     """
     leg = smoother_leg(run.inputs, run.config, run.origin, run.fixes_n, run.spans, run.rough,
@@ -27,6 +32,24 @@ def smoother(run):
     note_delays(run, {name: (e.value, e.sigma) for name, e in delays.items()
                       if e.value is not None})
     start = method.details['start']      # its gyro bias is taken as constant
+    # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
+    late = {name: e.value or 0.0 for name, e in delays.items()}
+    travel = run.inputs.travel
     track = dead_reckon(*run.attitude_from(start['t'], quat_from_matrix(start['C_nb']),
-                                           start['gyro_bias']), run.inputs.travel)
-    return method, run.path(method.details['f'], track)
+                                           start['gyro_bias']),
+                        replace(travel, t=travel.t - late['odometer']))
+    lever_b, f = _lever(method.estimates, run.config), method.details['f']
+
+    def path(t):
+        t = t - late['gnss']
+        return track.at(t) @ f + track.C_nb_at(t) @ lever_b
+    return method, path
+
+
+def _lever(estimates, config):
+    """Return the antenna from the odometer's point as found, else as set: (3,) m, in b."""
+    antenna, odometer = (
+        np.array([given if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
+                  for axis, given in zip('xyz', section.lever_arm, strict=True)])
+        for name, section in (('antenna', config.gnss), ('odometer', config.odometer)))
+    return antenna - odometer

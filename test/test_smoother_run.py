@@ -1,6 +1,7 @@
 """The smoother as a member of the pipeline."""
 
 from drives import drive, settings
+import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
@@ -54,3 +55,16 @@ def test_all_says_of_each_method_why_it_gives_nothing(made):
     (why,) = leg.methods['wheels'].reasons[-1:]
     assert 'two wheels' in why.text
     assert leg.verdict is Verdict.ACCEPTED
+
+
+def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
+    """A late fix lies behind by delay times speed: at rest nowhere, at 15 m/s by 4.5 m."""
+    late = drive(scenario='town', duration=240.0, imu_grade='tactical', fix_noise='rtk',
+                 fix_delay=0.3, seed=12)
+    leg = calibrate(late.leg(), settings(late, **ASKED))
+    evidence = leg.evidence
+    assert leg.methods['smoother'].estimates['gnss_delay'].value == pytest.approx(0.3, abs=0.02)
+    behind = 0.3 * evidence.speed.max()
+    assert behind > 3.0
+    assert leg.after.max < behind / 3
+    assert np.nanmax(np.abs(evidence.sections.ratio - 1)) < 0.003
