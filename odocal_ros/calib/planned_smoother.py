@@ -52,11 +52,10 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     problem = Problem.of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
-        fit = _fit(problem, made, levels)
-        priors, _ = scale_priors(problem.priors, fit.solved, None, sigmas.config)
-        if priors is not problem.priors:
-            problem.priors = priors
-            fit = _fit(problem, made, levels)
+        fit = _fit(problem, made, levels, problem.priors)
+        priors, _ = scale_priors(fit.priors, fit.solved, None, sigmas.config)
+        if priors is not fit.priors:
+            fit = _fit(problem, made, levels, priors)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
                        '1')
@@ -94,11 +93,11 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
-def _fit(problem, made: Ideal, levels) -> Fit:
+def _fit(problem, made: Ideal, levels, priors) -> Fit:
     """Return the fit that stands where it is: no step is taken."""
     state = made.state
-    weighted = Equations(problem, state, problem.sums(state)).at(levels)
-    return Fit(state, levels, problem.priors, np.ones((len(state.t) - 1, 3)), weighted,
+    weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
+    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), weighted,
                solve(weighted.normal()), True, 0)
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.smoother.accel_scale import with_scales
 from odocal_ros.calib.smoother.equations import Priors
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import ImuRows, preintegrate
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import GYRO_SCALE, ODO_DELAY, State
+from odocal_ros.calib.smoother.state import ACCEL_SCALE, GYRO_SCALE, ODO_DELAY, State
 from odocal_ros.nav.strapdown import rotation_increments
 
 SPEED_WINDOW = 0.4          # s each side, over which a speed is taken
@@ -25,11 +26,17 @@ NEW = 3.0                   # s, last part of the old keyframes that may be othe
 
 @dataclass(frozen=True, eq=False)
 class Footing:
-    """What a fit goes on from; spread : (K, 3) factors on the odometer's variances, slips."""
+    """
+    What a fit goes on from.
+
+    priors, first : as the data left them, and before any gave way; the accelerometer's scale in
+    both as it was last judged.   spread : (K, 3) factors on the odometer's variances, slips.
+    """
 
     state: State
     levels: Levels
     priors: Priors
+    first: Priors
     spread: np.ndarray
 
 
@@ -66,7 +73,9 @@ def carried(last: Footing, problem: Problem) -> Footing | None:
     spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
     levels = Levels(problem.first_levels.values | last.levels.values,
                     last.levels.correlation_time)
-    return Footing(_reckoned(state, problem) if n < len(t) else state, levels, last.priors, spread)
+    first = with_scales(problem.priors, last.first.constants[ACCEL_SCALE])
+    return Footing(_reckoned(state, problem) if n < len(t) else state, levels, last.priors, first,
+                   spread)
 
 
 def _reckoned(state: State, problem: Problem) -> State:

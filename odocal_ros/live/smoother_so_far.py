@@ -1,9 +1,10 @@
 """
 What the smoother makes of the way so far: run on the sketch of a leg, each look from the last.
 
-A look starts from the state, noise levels and slips that the one before ended with, reckons on
-over what is new, and is there after two passes. What is decided once for a leg, the sort of fix
-errors and where the Imu faces, is decided anew from nothing whenever the leg has grown by half.
+A look starts from the state, noise levels, beliefs and slips that the one before ended with,
+reckons on over what is new, and is there after two passes. What is decided once for a leg, the
+sort of fix errors, the accelerometer's scale error and where the Imu faces, is decided anew from
+nothing whenever the leg has grown by half.
 """
 
 from collections.abc import Callable
@@ -16,13 +17,19 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.sanity import imu_sanity
 from odocal_ros.calib.smoother import smoother_leg
+from odocal_ros.calib.smoother.accel_scale import judge_scale, with_scales
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.smoother import best_fit, FEWEST_FIXES, SHORTEST
-from odocal_ros.calib.smoother.state import LN_K, PITCH, YAW
+from odocal_ros.calib.smoother.smoother import (
+    best_fit,
+    FEWEST_FIXES,
+    likeliest_fit,
+    SHORTEST,
+)
+from odocal_ros.calib.smoother.state import ACCEL_SCALE, LN_K, PITCH, YAW
 from odocal_ros.config import Config
 from odocal_ros.errors import BadData
 from odocal_ros.leg import Leg
@@ -39,7 +46,7 @@ FINE, COARSE = 1.0, 2.0     # s between keyframes, of a leg up to LONG and beyon
 LONG = 660.0                # s
 FEW_KEYS = 150              # keyframes of a fit from nothing: it takes ten times the passes
 PASSES, MORE = 2, 6         # from the last look, and where that was not enough
-GROWN = 1.5                 # of the leg, until the sort of fix errors is decided anew
+GROWN = 1.5                 # of the leg, until what is decided once is decided anew
 TOLD = 90.0                 # s of a leg in which slow errors of the fixes show as such
 AGREE = 3.0                 # sigmas within which a fit from nothing bears the running one out
 
@@ -111,7 +118,7 @@ class SmootherSoFar:
         if not best.settled:
             self._last = None
             raise BadData('the smoother has not settled on the way so far')
-        self._last = Footing(best.state, best.levels, best.priors, best.spread)
+        self._last = Footing(best.state, best.levels, best.priors, best.first, best.spread)
         self._thin = problem.thin
         return _running(view, problem, best, config)
 
@@ -166,22 +173,35 @@ class SmootherSoFar:
         view = problem.leg
         duration = view.t_stop - view.t_begin
         other = Problem.of(view, config, rows_of(view, max(FINE, duration / FEW_KEYS)))
-        anew = best_fit(other, config, trace)
+        anew = likeliest_fit(other, config, trace)
         self._judged = duration
-        sigma = np.sqrt(np.diag(anew.solved.covariance))
-        apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
         if anew.settled:
             problem.thin = other.thin
-        if anew.settled and apart.max() > AGREE:
-            best = best_fit(problem, config, trace)
-        elif anew.settled and (anew.levels.correlation_time or best.levels.correlation_time):
-            fixes = {name: anew.levels[name] for name in ('fix', 'fix_up', 'slow', 'slow_up')}
-            levels = best.levels.but(correlation_time=anew.levels.correlation_time, **fixes)
-            state = best.state if levels.correlation_time else replace(
-                best.state, slow_n=np.zeros_like(best.state.slow_n))
-            best = fit(problem, state, levels, MORE, about=best, trace=trace)
+            best = _decided_anew(best, anew, problem, config, trace)
         self.once_s += time.thread_time() - begin
         return best
+
+
+def _decided_anew(best, anew, problem, config, trace):
+    """Return a fit with the fix errors of another, and judged as one from nothing is."""
+    slow = anew.levels.correlation_time or best.levels.correlation_time
+    none = with_scales(best.first, problem.priors.constants[ACCEL_SCALE])
+    unjudged = (none.constants == best.first.constants).all()
+    state, levels = best.state, best.levels
+    if slow:
+        fixes = {name: anew.levels[name] for name in ('fix', 'fix_up', 'slow', 'slow_up')}
+        levels = levels.but(correlation_time=anew.levels.correlation_time, **fixes)
+    if not levels.correlation_time:
+        state = replace(state, slow_n=np.zeros_like(state.slow_n))
+    if slow or not unjudged:
+        about = replace(best, first=none, priors=with_scales(
+            best.priors, problem.priors.constants[ACCEL_SCALE]))
+        best = fit(problem, state, levels, MORE, about=about, trace=trace)
+    sigma = np.sqrt(np.diag(anew.solved.covariance))
+    apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
+    if apart.max() > AGREE:
+        return best_fit(problem, config, trace)
+    return judge_scale(problem, best, config, trace)
 
 
 def _running(view, problem, best, config) -> Running:

@@ -43,6 +43,19 @@ def test_a_drive_that_tells_there_is_none_is_believed():
     assert blind.max() > 0.8 * GRADE
 
 
+def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():
+    error = 5e-4      # as its grade allows, and ten times what such fixes tell it to
+    _, config, leg = made(scenario='town', duration=250.0, imu_grade='tactical', fix_noise='rtk',
+                          accel_scale_error=error, seed=4)
+    details = smooth(leg, with_settings(config, {'imu.accel_scale_sigma': np.nan})).details
+    for axis in 'xy':
+        found = details[f'accelerometer_scale_{axis}']
+        assert abs(found['value'] - error) < 3.0 * found['sigma']
+        # a belief of none that had given way by steps would hold it to less than its grade
+        assert details['posterior_to_prior'][f'accelerometer_scale_{axis}'] == pytest.approx(
+            found['sigma'] / error, rel=0.01)
+
+
 @pytest.mark.parametrize('noise', ['white', 'correlated'])
 def test_the_sigma_of_the_scale_holds_it(noise):
     drive, config, leg = made(**TOWN, fix_noise=noise, accel_scale_error=GRADE, seed=4)

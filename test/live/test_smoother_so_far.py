@@ -135,6 +135,21 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(drive, config, looks):
     assert state.C_nb[-1] == pytest.approx(last.C_nb[-1], abs=2e-3)
 
 
+def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(config):
+    drive = drive_of(fix_noise='correlated')     # then metres come from the accelerometer
+    graded = with_settings(config, {'imu.accel_scale_sigma': math.nan})
+    first, later, last = (x.running for x in looked(drive, graded, (100.0, 112.0, 165.0)))
+    # the same beliefs and a tenth more to see: by the way squared 1.2 times smaller at most
+    assert 1 / 1.2 < later.sigmas[0] / first.sigmas[0] < 1.02
+    assert later.method.details['posterior_to_prior']['accelerometer_scale_x'] < 1.0
+    leg = looked(drive, graded, (165.0,))[0].running
+    # both stop within 0.1 sigma, so the log odds z^2 / 2 of scale errors 1 to 2 sigmas off differ
+    # by 0.2 at most, the mean square of both beliefs by a tenth; noise levels by another tenth
+    assert last.sigmas[0] == pytest.approx(leg.sigmas[0], rel=0.15)
+    blind = looked(drive, config, (165.0,))[0].running
+    assert last.sigmas[0] > 1.5 * blind.sigmas[0]      # it does decide
+
+
 @pytest.mark.parametrize('allowed', [0, 3])
 def test_a_look_gives_up_between_passes_and_the_next_begins_anew(config, looks, allowed):
     so_far, asked = SmootherSoFar(), []

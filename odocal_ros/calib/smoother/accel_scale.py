@@ -84,15 +84,19 @@ def with_scales(priors, sigmas):
     return replace(priors, constants=constants)
 
 
-def judge_scale(problem, now: Fit, config) -> Fit:
-    """Return a fit whose sigmas hold the accelerometer's scale error; changes problem.priors."""
+def judge_scale(problem, now: Fit, config, trace=None) -> Fit:
+    """
+    Return a fit whose sigmas hold the accelerometer's scale error.
+
+    now : made with the belief that there is none.   trace : as for ``fit``.
+    """
     found = now.state.constants[ACCEL_SCALE]
     priors, weight = scale_priors(now.priors, now.solved, found, config)
     if priors is now.priors:
         return now
-    problem.priors = with_scales(problem.priors, priors.constants[ACCEL_SCALE])
-    about = replace(now, priors=priors)
+    about = replace(now, priors=priors,
+                    first=with_scales(now.first, priors.constants[ACCEL_SCALE]))
     # noise judged with a scale error that was not taken for one is to be judged again
     taken = weight >= TAKEN
     return fit(problem, now.state, now.levels, 2 * FEW if taken else FEW, about=about,
-               frozen=not taken)
+               frozen=not taken, trace=trace)

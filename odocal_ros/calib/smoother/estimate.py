@@ -15,8 +15,8 @@ from odocal_ros.calib.smoother.chain import solve, Solved
 from odocal_ros.calib.smoother.components import components, road_noise
 from odocal_ros.calib.smoother.equations import Equations, Priors, Weighted
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import M, PITCH, State, YAW
+from odocal_ros.calib.smoother.problem import NO_SCALE, Problem
+from odocal_ros.calib.smoother.state import ACCEL_SCALE, M, PITCH, State, YAW
 
 MOST = 25            # iterations
 SETTLED = 0.03       # sigmas that the constants may still move
@@ -44,7 +44,8 @@ class Fit:
 
     state: State
     levels: Levels
-    priors: Priors
+    priors: Priors           # as the data left them
+    first: Priors            # as they were before any gave way
     spread: np.ndarray       # (K, 3) factors on the odometer's variances: slips
     weighted: Weighted
     solved: Solved
@@ -78,7 +79,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
 
     """
     before, settled = np.ones(3), False
-    priors = about.priors if about else problem.priors
+    priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
     tails = 1 if about else FIRST_TAILS
     for count in range(1, most + 1):
@@ -105,8 +106,8 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             levels = update(weighted, near, levels, problem, haste)
             if tails <= count <= LAST_TAILS:
                 spread = slips(weighted, near, spread)
-                priors = beliefs(problem.priors, priors, state, solved, near)
-    return Fit(state, levels, priors, spread, weighted, solved, settled, count)
+                priors = beliefs(first, priors, state, solved, near)
+    return Fit(state, levels, priors, first, spread, weighted, solved, settled, count)
 
 
 def update(weighted, neighbours, levels, problem, haste=HASTE) -> Levels:
@@ -133,15 +134,23 @@ def slips(weighted, neighbours, spread):
 
 
 def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
-    """Return priors widened where the data are far from their centre."""
+    """
+    Return priors widened where the data are far from their centre.
+
+    That the accelerometer has no scale error does not give way by steps: it is weighed as a whole
+    against its having one (accel_scale), from the data as they are under that belief.
+    """
     n = solved.step.shape[1]
     P0 = np.diagonal(neighbours[0])[:n]
+    constants = _wider(first.constants, now.constants, state.constants - first.centre,
+                       np.diag(solved.covariance))
+    if (first.constants[ACCEL_SCALE] <= NO_SCALE).all():
+        constants[ACCEL_SCALE] = first.constants[ACCEL_SCALE]
     return replace(
         now,
         gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),
         accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[12:15]),
-        constants=_wider(first.constants, now.constants, state.constants - first.centre,
-                         np.diag(solved.covariance)))
+        constants=constants)
 
 
 def _wider(first, now, off, variance):

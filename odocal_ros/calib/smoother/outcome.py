@@ -89,7 +89,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
         if sigma[i] <= limit:
             found[name] = Estimate(value, float(sigma[i]), 'rad')
     reasons += _undetermined(sigma, limit, config, yaw)
-    after = np.sqrt(np.diag(fit.solved.covariance)) / problem.priors.constants
+    after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, GYRO_SCALE, *SCALES)}
     for i in OPTIONAL:
         name = CONSTANTS[i]
@@ -99,7 +99,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
-        ratio[name] = float(bias_sigma[i] / problem.priors.gyro_bias[i])
+        ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
         if ratio[name] < INFORMED:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
     unsaid = [name for name in ratio if name in found and found[name].value is None]

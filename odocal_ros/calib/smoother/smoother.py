@@ -55,6 +55,11 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 
 def best_fit(problem, config, trace=None):
+    """Return the likeliest fit, the accelerometer's scale error judged."""
+    return judge_scale(problem, likeliest_fit(problem, config, trace), config, trace)
+
+
+def likeliest_fit(problem, config, trace=None):
     """Return the likeliest fit of those from several starts, slow fix errors judged."""
     fits = []
     start = first_state(problem.leg, problem.imu, problem.priors)
@@ -72,10 +77,8 @@ def best_fit(problem, config, trace=None):
     problem.thin = {rows.name: alike(rows) for rows in best.weighted.outside}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
-        found = with_slow_errors(problem, best, asked, trace)
-    else:
-        found = fit(problem, best.state, best.levels, about=best, trace=trace)
-    return judge_scale(problem, found, config)
+        return with_slow_errors(problem, best, asked, trace)
+    return fit(problem, best.state, best.levels, about=best, trace=trace)
 
 
 def _too_little(leg):
