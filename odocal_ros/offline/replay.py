@@ -4,7 +4,9 @@ from datetime import datetime, UTC
 import json
 import os
 from pathlib import Path
+from shutil import get_terminal_size
 import sys
+from textwrap import fill
 
 from odocal_ros.errors import BadUsage, OdocalError
 
@@ -203,6 +205,14 @@ def _styled(stream) -> bool:
     return stream.isatty() and 'NO_COLOR' not in os.environ and os.environ.get('TERM') != 'dumb'
 
 
+def _size(stream) -> tuple[int, int | None]:
+    """Return the columns, 98 at most, and the rows of a terminal; no rows for what is none."""
+    if not stream.isatty():
+        return 98, None
+    columns, rows = get_terminal_size()      # 80, 24 where it tells none
+    return max(40, min(98, columns)), rows
+
+
 def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.offline.phases import Phase
@@ -227,11 +237,14 @@ def _report(calibration, config, inputs, output, args) -> int:
         json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
         print()
     elif not args.quiet:
-        print(screen(calibration, styled=_styled(sys.stdout)))
+        columns, rows = _size(sys.stdout)
+        print(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
         if args.holdout:
             print('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
         others = ', '.join(p.name for p in written if p.name != REPORT)
-        print(f'\nwritten: {output}/ ({others})')
+        text = f'written: {output}/ ({others})'
+        print('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
+                           break_on_hyphens=False) if rows else text))
         if output / REPORT in written and not troubles:
             print(f'report:  {output / REPORT}')
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK

@@ -6,11 +6,13 @@ import textwrap
 from odocal_ros.output.figures import two_digits
 
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
+LABELS = {'legs': "the legs' own errors"}
 HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
-WIDTHS = (14, 16, 16)
+NAME, WIDTHS = 24, (13, 15, 15)      # with 'shared' within 80 columns
 
 
-def budget_lines(table: dict, scale: float, shown: float, hidden=()) -> list[str]:
+def budget_lines(table: dict, scale: float, shown: float, hidden=(), width=98,
+                 small_too=True) -> list[str]:
     """
     Return the lines of a budget, none without one.
 
@@ -24,15 +26,20 @@ def budget_lines(table: dict, scale: float, shown: float, hidden=()) -> list[str
         Share of the variance below which a source is but named.
     hidden : collection of str
         Parameters that are not determined: their column stays empty.
+    width : int
+        Columns of the screen.
+    small_too : bool
+        Name the small ones.
 
     """
     if not table:
         return []
     factor = {COLUMNS[0]: 1e6 / scale}
     wholes = [sum(row.get(p, 0.0)**2 for row in table.values()) for p in COLUMNS]
-    lines = [f'  {"error budget":<20}' + ''.join(
-        f'{word:>{width}}' for word, width in zip(HEAD, WIDTHS, strict=True))]
+    lines = [f'  {"error budget":<{NAME}}' + ''.join(
+        f'{word:>{columns}}' for word, columns in zip(HEAD, WIDTHS, strict=True))]
     small = []
+    shared = '   shared by all legs' if width > 90 else '  shared'
     for name, row in table.items():
         shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
                   for p, whole in zip(COLUMNS, wholes, strict=True)]
@@ -42,9 +49,11 @@ def budget_lines(table: dict, scale: float, shown: float, hidden=()) -> list[str
         cells = ['-' if share < shown else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(COLUMNS, shares, strict=True)]
-        lines.append(f'  {name.replace("_", " "):<20}' + ''.join(
-            f'{cell:>{width}}' for cell, width in zip(cells, WIDTHS, strict=True))
-            + ('   shared by all legs' if row.get('shared') else ''))
+        lines.append(f'  {LABELS.get(name, name).replace("_", " "):<{NAME}}' + ''.join(
+            f'{cell:>{columns}}' for cell, columns in zip(cells, WIDTHS, strict=True))
+            + (shared if row.get('shared') else ''))
+    if not (small and small_too):
+        return lines
     rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
-    return lines + textwrap.wrap(rest.replace('_', ' '), 96, initial_indent='  ',
+    return lines + textwrap.wrap(rest.replace('_', ' '), width - 2, initial_indent='  ',
                                  subsequent_indent='    ')

@@ -12,7 +12,11 @@ def decimals(sigma: float) -> int:
 
 def with_sigma(value: float, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
-    """Return 'value ± sigma', both times ``factor``, with the digits that the sigma leaves."""
+    """
+    Return 'value ± sigma', both times ``factor``, with the digits that the sigma leaves.
+
+    Of a sigma of 100 or more two digits count too: -32000 ± 15000.
+    """
     if not math.isfinite(value):
         return 'unknown'
     value *= factor
@@ -20,6 +24,9 @@ def with_sigma(value: float, sigma: float | None, factor: float = 1.0,
         return f'{value:+.6g}' if signed else f'{value:.6g}'
     sigma *= factor
     places = decimals(sigma)
+    if sigma >= 100:
+        whole = 1 - math.floor(math.log10(sigma))
+        value, sigma = round(value, whole), round(sigma, whole)
     return f'{value:{"+" if signed else ""}.{places}f} ± {sigma:.{places}f}'
 
 
@@ -31,6 +38,13 @@ def two_digits(x: float) -> str:
         return f'{x:.2g}'
     places = 1 - math.floor(math.log10(abs(x)))
     return f'{round(x, places):.{max(0, places)}f}'
+
+
+def beyond_one(ratio: float, sigma: float | None) -> str:
+    """Return by how much a ratio differs from 1: ppm, or per cent where the sigma is 1 % or so."""
+    coarse = sigma is not None and math.isfinite(sigma) and sigma >= 0.01
+    factor, unit = (100.0, '%') if coarse else (1e6, 'ppm')
+    return f'{with_sigma(ratio - 1, sigma, factor, signed=True)} {unit}'
 
 
 def share(relative: float) -> str:

@@ -19,7 +19,7 @@ from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.report import NAME as REPORT, report_or_why
-from odocal_ros.output.summary import overall
+from odocal_ros.output.track_table import overall
 
 SCHEMA = 1
 MAIN = 'calibration.json'

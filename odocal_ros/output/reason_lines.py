@@ -36,12 +36,17 @@ def bag_lines(legs, width: int) -> list[str]:
     return _wrapped(told, '  ', width)
 
 
-def reason_lines(reasons: tuple[Reason, ...], width: int) -> list[str]:
-    """Return reasons with their remedies for a terminal."""
+def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -> list[str]:
+    """Return reasons with their remedies for a terminal; brief: of notes the codes alone."""
     lines = []
     for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'take care'),
                            (Verdict.ACCEPTED, 'notes')):
-        for reason in (r for r in shared(reasons) if r.code.gravity is verdict):
+        found = [r for r in shared(reasons) if r.code.gravity is verdict]
+        if brief and found and verdict is Verdict.ACCEPTED:
+            codes = ', '.join(dict.fromkeys(r.code.name for r in found))
+            lines += _wrapped(f'notes, see the report: {codes}', '  ', width)
+            continue
+        for reason in found:
             lines += [f'  {title}'] if title else []
             title = ''
             lines += _wrapped(f'{reason.code.name}: {reason.text}', '    ', width)

@@ -10,7 +10,8 @@ from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.reason_lines import shared
-from odocal_ros.output.summary import known, MEANING, overall, sentence
+from odocal_ros.output.summary import known, MEANING, sentence
+from odocal_ros.output.track_table import overall
 from odocal_ros.reasons import Reason, Verdict
 
 NAME = 'report.html'

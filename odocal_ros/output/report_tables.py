@@ -5,12 +5,13 @@ import math
 
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.config import Config, flat, SETTINGS
-from odocal_ros.output.figures import length, share, two_digits, with_sigma
-from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known, PPM
+from odocal_ros.output.budget_table import LABELS as SOURCES
+from odocal_ros.output.figures import beyond_one, length, share, two_digits, with_sigma
+from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
 from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 
-LABELS = {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
+LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
           'yaw_mounting_angle': 'yaw mounting angle',
           'pitch_mounting_angle': 'pitch mounting angle',
           'scale_factor_left': 'scale factor, left wheel',
@@ -44,8 +45,7 @@ def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
         return f'{with_sigma(value, sigma, 1e3, signed=True)} ms', native, ''
     if name.startswith('scale'):
         relative = share(sigma / abs(value)) if sigma and value else ''
-        other = inverse(estimate) if unit in COUNTS else (
-            f'{with_sigma(value - 1, sigma, PPM, signed=True)} ppm')
+        other = inverse(estimate) if unit in COUNTS else beyond_one(value, sigma)
         return native, other, relative
     return native, '', ''
 
@@ -75,7 +75,7 @@ def largest_source(method: MethodResult | None, name: str) -> str:
     largest = max(shares, key=lambda source: shares[source], default='')
     if not largest or not shares[largest]:
         return ''
-    return "the legs' own errors" if largest == 'legs' else label(largest)
+    return label(largest)
 
 
 def method_table(methods: dict[str, MethodResult], legs: tuple[LegResult, ...]) -> dict | None:
@@ -134,7 +134,7 @@ def _number(row, name):
 def _column(name, estimate):
     """Return the head of a budget's column, and the factor on its numbers."""
     if name.startswith('scale'):
-        return f'{label(name)}, ppm', PPM / abs(estimate.value or 1.0)
+        return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
     if estimate.unit == 'rad':
         return f'{label(name)}, deg', DEG
     return f'{label(name)}, {estimate.unit}', 1.0

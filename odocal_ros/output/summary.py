@@ -5,15 +5,15 @@ from datetime import datetime, UTC
 import math
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, TrackCheck
-from odocal_ros.output.budget_table import budget_lines
-from odocal_ros.output.figures import length, time_span, with_sigma
+from odocal_ros.calib.result import Calibration, Estimate, LegResult
+from odocal_ros.output.budget_table import budget_lines, LABELS
+from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
+from odocal_ros.output.track_table import track_lines
 from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
 WIDTH = 98
-PPM = 1e6
 SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
@@ -29,16 +29,35 @@ ORDER = list(Verdict)
 NONE = Estimate(None, None, '')
 
 
-def screen(calibration: Calibration, styled: bool = False) -> str:
+def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
+           rows: int | None = None) -> str:
     """
     Return everything a person needs to judge a calibration, as plain text.
 
-    styled : the verdict in bold and in colour, for a terminal.
+    Parameters
+    ----------
+    calibration : Calibration
+        Of all legs.
+    styled : bool
+        The verdict in bold and in colour, for a terminal.
+    width : int
+        Columns; below 98 what is said twice or is of less use is left out.
+    rows : int, optional
+        Lines there are. Where they do not do, small errors, notes and the whole budget, in this
+        order, are left to the report: verdict, values and what to do are not.
+
     """
-    parts = [_head(calibration, styled), _values(calibration), _leg_table(calibration.legs),
-             _method_table(calibration), _check(calibration.legs), _budget(calibration),
-             reason_lines(calibration.reasons, WIDTH)]
-    return '\n\n'.join('\n'.join(part) for part in parts if part)
+    for small, notes, budget in ((True, True, True), (False, True, True), (False, False, True),
+                                 (False, False, False)):
+        parts = [_head(calibration, styled), _values(calibration, width),
+                 _leg_table(calibration.legs, width), _method_table(calibration),
+                 track_lines(calibration.legs),
+                 _budget(calibration, width, small) if budget else [],
+                 reason_lines(calibration.reasons, width, brief=not notes)]
+        text = '\n\n'.join('\n'.join(part) for part in parts if part)
+        if rows is None or text.count('\n') < rows:
+            break
+    return text
 
 
 def sentence(calibration: Calibration) -> str:
@@ -101,18 +120,17 @@ def _head(calibration, styled):
             f'{time_span(duration)}']
 
 
-def _values(calibration):
+def _values(calibration, width):
     estimates = calibration.estimates
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale) + _mostly(calibration, 'scale_factor'))]
     if scale.value and scale.unit in COUNTS:
         lines.append(_line('', inverse(scale)))
     if ratio.value is not None:
-        ppm = with_sigma(ratio.value - 1, ratio.sigma, PPM, signed=True)
         lines.append(_line('  against nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
-                           f'({ppm} ppm)'))
+                           f'({beyond_one(ratio.value, ratio.sigma)})'))
     for name, word in ANGLES.items():
-        text = _angle_text(known(estimates, name)) + _mostly(calibration, name)
+        text = _angle_text(known(estimates, name), width) + _mostly(calibration, name)
         lines.append(_line(f'{word} mounting', text))
     for name in estimates:
         estimate = known(estimates, name)
@@ -120,7 +138,8 @@ def _values(calibration):
                 and name[:-2] not in ARMS and estimate.value is not None:
             text = _with_unit(estimate)
             if name == 'heading_error':
-                text = f'{_angle_text(estimate)}   heading and (reversed) mounting together'
+                text = _angle_text(estimate, 0) + (
+                    '   heading and (reversed) mounting together' if width >= WIDTH else '')
             lines.append(_line(name.replace('_', ' '), text))
     lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
     biases = [known(estimates, name) for name in BIASES]
@@ -132,7 +151,8 @@ def _values(calibration):
         rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
-    return [line for line in lines if line]
+    return [line if len(line) <= width or width >= WIDTH else line.partition('   mostly ')[0]
+            for line in lines if line]
 
 
 def _arm(estimates, arm, word):
@@ -152,7 +172,7 @@ def _mostly(calibration, name):
     row = method.parameters.index(name)
     shares = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
     largest = max(shares, key=lambda source: shares[source], default='')
-    label = "the legs' own errors" if largest == 'legs' else largest.replace('_', ' ')
+    label = LABELS.get(largest, largest).replace('_', ' ')
     return f'   mostly {label}' if largest and shares[largest] else ''
 
 
@@ -164,23 +184,26 @@ def _scale_text(scale):
     if scale.value is None:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
-        f'   ({scale.sigma / abs(scale.value) * PPM:.0f} ppm)')
+        f'   ({share(scale.sigma / abs(scale.value))})')
     return _with_unit(scale) + relative
 
 
-def _angle_text(angle):
+def _angle_text(angle, width):
     if angle.value is None:
         return 'not determined'
-    return (f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg   '
-            f'({with_sigma(angle.value, angle.sigma, signed=True)} rad)')
+    rad = f'   ({with_sigma(angle.value, angle.sigma, signed=True)} rad)' if width >= WIDTH else ''
+    return f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
 
 
-def _leg_table(legs):
+def _leg_table(legs, width):
     rows = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes', 'scale factor', 'yaw, deg',
              'verdict')]
     rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
         zip(legs, leg_verdicts(legs), strict=True), 1)]
-    return _columns(rows) + bag_lines(legs, WIDTH) if legs else []
+    if width < WIDTH:        # without the date, the duration and the number of fixes
+        rows = [(row[0], row[1].removesuffix(', UTC').rpartition(' ')[2], row[2], *row[5:])
+                for row in rows]
+    return _columns(rows) + bag_lines(legs, width) if legs else []
 
 
 def _columns(rows):
@@ -214,41 +237,12 @@ def _leg_row(leg: LegResult):
             '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
-def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
-    """
-    Return one check for many legs, each (check, fixes), None if there is none.
-
-    rms and mean are pooled over fixes; max, end and percent are those of the worst leg.
-    """
-    have = [(check, n) for check, n in checks if check is not None and n]
-    if not have:
-        return None
-    total = sum(n for _, n in have)
-    return TrackCheck(
-        rms=math.sqrt(sum(n * check.rms**2 for check, n in have) / total),
-        mean=sum(n * check.mean for check, n in have) / total,
-        **{name: max(getattr(check, name) for check, _ in have)
-           for name in ('max', 'end', 'percent_of_distance')})
-
-
-def _check(legs):
-    rows = []
-    for label, name in (('as configured', 'before'), ('as calibrated', 'after')):
-        check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
-        if check is not None:
-            cells = (length(check.rms), length(check.mean), length(check.max), length(check.end),
-                     f'{check.percent_of_distance:.3f} %')
-            rows.append(f'  {label:<20}' + ''.join(f'{cell:>12}' for cell in cells))
-    head = ('rms', 'mean', 'max', 'at the end', 'of distance')
-    return [f'  {"track against fixes":<20}' + ''.join(f'{word:>12}' for word in head), *rows] \
-        if rows else []
-
-
-def _budget(calibration):
+def _budget(calibration, width, small):
     estimates = calibration.estimates
     scale = known(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)
     if method is None or not scale.value:
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
-    return budget_lines(method.details.get('budget'), scale.value, SHOWN, hidden)
+    return budget_lines(method.details.get('budget'), scale.value, SHOWN, hidden,
+                        width, small)

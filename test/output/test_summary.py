@@ -7,8 +7,10 @@ import re
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, TrackCheck
-from odocal_ros.output.figures import length, time_span, with_sigma
-from odocal_ros.output.summary import overall, screen, sentence
+from odocal_ros.output.figures import beyond_one, length, time_span, with_sigma
+from odocal_ros.output.summary import screen, sentence
+from odocal_ros.output.track_table import overall
+from odocal_ros.reasons import Code, Reason
 
 
 @pytest.mark.parametrize(('value', 'sigma', 'text'), [
@@ -130,3 +132,47 @@ def test_the_coordinates_of_a_lever_arm_share_a_line(good):
     lines = screen(replace(good, estimates=dict(good.estimates) | arm)).splitlines()
     assert [line for line in lines if 'odometer at' in line or 'lever' in line] == [
         '  odometer at x, z    -0.0058 ± 0.0031, +0.250 ± 0.060 m']
+
+
+def test_large_sigmas_have_two_digits_and_per_cent():
+    assert with_sigma(-32050.0, 15191.0) == '-32000 ± 15000'
+    assert with_sigma(1234.5, 560.0) == '1230 ± 560'
+    assert beyond_one(0.968, 0.0152) == '-3.2 ± 1.5 %'
+    assert beyond_one(1.065044, 78e-6) == '+65044 ± 78 ppm'
+    assert beyond_one(1.1, None) == '+100000 ppm'
+
+
+def whole(good):
+    """Return a calibration with all that a screen can show, and many reasons."""
+    found = good.methods['two_point']
+    budget = {name: {'scale_factor': size, 'yaw_mounting_angle': size, 'shared': True}
+              for name, size in (('accelerometer_bias_walk', 1e-4), ('fixes', 9e-5),
+                                 ('heading', 1e-9))}
+    methods = {name: replace(found, name=name, details=found.details | {'budget': budget})
+               for name in ('two_point', 'wheels', 'smoother')}
+    notes = tuple(Reason(Code.TOPIC_GAP, f'a gap of {n} s in what the odometer sent, and more '
+                         'words than fit on a line') for n in range(4))
+    return replace(good, methods=methods, reasons=(Reason(Code.WHEEL_SLIP, 'it spun'), *notes),
+                   estimates=good.estimates | {
+                       'heading_error': Estimate(-0.0167, 0.0005, 'rad', 'wheels')})
+
+
+def test_a_narrow_terminal_has_no_broken_lines(good):
+    text = screen(whole(good), width=80)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    for part in ('0.0500000 ± 0.0000012 m/pulse', '-1.0000 ± 0.0029 deg', 'wheels', 'WHEEL_SLIP',
+                 'error budget', 'TOPIC_GAP: a gap of 3 s', '08:53:20', 'heading error'):
+        assert part in text, part
+
+
+def test_a_low_terminal_leaves_the_lesser_things_to_the_report(good):
+    full = screen(whole(good), width=80).splitlines()
+    fits = {rows: screen(whole(good), width=80, rows=rows) for rows in (99, len(full) - 1, 30)}
+    assert fits[99].splitlines() == full
+    assert 'under 1 %' in fits[99]
+    assert 'under 1 %' not in fits[len(full) - 1]
+    assert 'TOPIC_GAP: a gap' in fits[len(full) - 1]
+    assert len(fits[30].splitlines()) <= 30
+    assert 'notes, see the report: TOPIC_GAP' in fits[30]
+    assert 'error budget' not in fits[30]
+    assert 'Drive gently' in fits[30], 'what to do is never left out'
