@@ -9,6 +9,8 @@ from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import quat_from_matrix
 
+ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
+
 
 def smoother(run):
     """
@@ -40,10 +42,20 @@ def smoother(run):
                         replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, run.config), method.details['f']
 
+    return method, _late_path(track, f, lever_b, late['gnss'])
+
+
+def _late_path(track, f, lever_b, late):
+    """Return the path by stamps that are so many s late; beyond the track's ends it runs on."""
     def path(t):
-        t = t - late['gnss']
-        return track.at(t) @ f + track.C_nb_at(t) @ lever_b
-    return method, path
+        t = t - late
+        inside = np.clip(t, track.t[0], track.t[-1])
+        beyond = np.clip(t - inside, -abs(late), abs(late))
+        P = track.at(inside)
+        before = track.at(inside - np.copysign(ONWARD, beyond))
+        P = P + (P - before) * (np.abs(beyond) / ONWARD)[..., None, None]
+        return P @ f + track.C_nb_at(inside) @ lever_b
+    return path
 
 
 def _lever(estimates, config):

@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Verdict
+from odocal_ros.smoother_run import _late_path
 
 SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
 ASKED = {'method': 'smoother', 'heading_sigma': None}      # no heading from outside
@@ -68,3 +71,11 @@ def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
     assert behind > 3.0
     assert leg.after.max < behind / 3
     assert np.nanmax(np.abs(evidence.sections.ratio - 1)) < 0.003
+
+
+def test_the_path_runs_on_for_the_delay_beyond_the_data():
+    t = np.linspace(0.0, 10.0, 101)
+    track = dead_reckon(t, np.tile([0.0, 0.0, 0.0, 1.0], (101, 1)), Travel(t, 5.0 * t, 0.0))
+    path = _late_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)
+    assert path(np.array([0.0, 4.0, 9.9, 10.0]))[:, 0] == pytest.approx([3.0, 43.0, 102.0, 103.0])
+    assert path(np.array(12.0))[0] == pytest.approx(103.0), 'no farther than the delay'

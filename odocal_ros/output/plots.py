@@ -68,8 +68,12 @@ def _track(found, name):
     ax.plot(*after[thinned(after)].T, '-', color=BLUE, label='as calibrated')
     ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
     ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
+    middle = after.mean(axis=0)
     for point, word in ((after[0], 'start'), (after[-1], 'stop')):
-        ax.annotate(word, point, xytext=(6, 5), textcoords='offset points')
+        # away from the rest of the track
+        side, up = np.where(point < middle, -1, 1)
+        ax.annotate(word, point, xytext=(7 * side, 6 * up), textcoords='offset points',
+                    ha='right' if side < 0 else 'left', va='top' if up < 0 else 'bottom')
     ax.set(xlabel=f'east of the start, {unit}', ylabel=f'north of the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.06)
@@ -90,6 +94,8 @@ def _residuals(found, name):
                         label='± sigma of a fix')
         ax.axhline(0.0, color=GREY, linewidth=0.8)
         ax.plot(way[rows], column[rows], '-', color=BLUE, linewidth=0.9, label='as calibrated')
+        for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
+            ax.plot(way[band], edge, '--', color='black', linewidth=0.6)
         ax.set_ylabel(f'{word}, m')
     rows = thinned(found.residual_before)
     for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
@@ -98,7 +104,8 @@ def _residuals(found, name):
                      label=f'as configured, {word}')
     axes[2].axhline(0.0, color=GREY, linewidth=0.8)
     axes[2].set(xlabel=f'distance driven, {unit}', ylabel='as configured, m')
-    axes[2].legend(loc='best', ncols=2)
+    axes[2].legend(loc='lower center', bbox_to_anchor=(0.5, 0.97), ncols=2, borderaxespad=0.0)
+    figure.subplots_adjust(hspace=0.24)
     key(figure, axes[0])
     figure.align_ylabels(axes)
     says = ('Dead reckoning less fix. Along > 0: it runs ahead of the fix; across > 0: it lies '

@@ -4,66 +4,68 @@ import math
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.plots_svg import BAND, BLUE, GREEN, GREY, PINK, RED, relative, sheet, svg
-from odocal_ros.output.summary import DEG, known
+from odocal_ros.output.summary import ANGLES, DEG, known
 
 STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))
 MOST_LEGS = 40
-YAW = 'yaw_mounting_angle'
 
 
 def compared(calibration: Calibration, name: str) -> list[tuple]:
-    """Draw scale and yaw by method and leg; empty where there is but one to show."""
+    """Draw scale, yaw and pitch by method and leg; empty where there is but one to show."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
             for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
     for number, leg in enumerate(calibration.legs[:MOST_LEGS], 1):
         rows += [(f'leg {number}, {m.replace("_", " ")}', m, found.estimates)
                  for m, found in leg.methods.items()]
     panels = [(title, points, band) for title, points, band in (
-        _scale(calibration, rows), _yaw(calibration, rows)) if len(points) > 1]
-    return [_draw(rows, panels, name)] if panels else []
+        _scale(calibration, rows), *(_angle(calibration, rows, angle) for angle in ANGLES))
+        if len(points) > 1]
+    return [_draw(panels, name, len(calibration.legs))] if panels else []
 
 
 def _scale(calibration, rows):
+    """Return title, (text, method, value, sigma) of what has one, and the band of the result."""
     result = known(calibration.estimates, 'scale_factor')
-    found = [(place, method, known(estimates, 'scale_factor'))
-             for place, (_, method, estimates) in enumerate(rows)]
-    found = [(place, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
-             for place, method, e in found if e.value is not None and result.value]
+    found = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
+    found = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
+             for text, method, e in found if e.value is not None and result.value]
     times, word = relative(max((abs(off) + sigma for _, _, off, sigma in found), default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * times) if result.value else None
     return f'scale less result, {word}', [
-        (place, method, off * times, sigma * times) for place, method, off, sigma in found], band
+        (text, method, off * times, sigma * times) for text, method, off, sigma in found], band
 
 
-def _yaw(calibration, rows):
-    result = known(calibration.estimates, YAW)
+def _angle(calibration, rows, name):
+    result = known(calibration.estimates, name)
     points = []
-    for place, (_, method, estimates) in enumerate(rows):
-        e = known(estimates, YAW)
+    for text, method, estimates in rows:
+        e = known(estimates, name)
         if e.value is not None:
-            points.append((place, method, e.value * DEG, (e.sigma or 0.0) * DEG))
+            points.append((text, method, e.value * DEG, (e.sigma or 0.0) * DEG))
     band = None if result.value is None else (result.value * DEG, (result.sigma or 0.0) * DEG)
-    return 'yaw mounting angle, deg', points, band
+    return f'{ANGLES[name]} mounting angle, deg', points, band
 
 
-def _draw(rows, panels, name):
-    height = 0.75 + 0.24 * len(rows)
-    figure, axes = sheet(len(panels) * height, len(panels), sharex=False)
-    figure.subplots_adjust(left=0.27, hspace=0.75 / height, top=1 - 0.1 / (height * len(panels)))
-    shapes = {m: STYLES[i % len(STYLES)]
-              for i, m in enumerate(dict.fromkeys(m for _, m, _ in rows))}
+def _draw(panels, name, legs):
+    heights = [0.24 * len(points) for _, points, _ in panels]
+    whole = sum(heights) + 0.75 * len(panels)
+    figure, axes = sheet(whole, len(panels), sharex=False, heights=heights)
+    figure.subplots_adjust(left=0.27, hspace=0.75 * len(panels) / sum(heights),
+                           top=1 - 0.1 / whole)
+    methods = dict.fromkeys(m for _, points, _ in panels for _, m, _, _ in points)
+    shapes = {m: STYLES[i % len(STYLES)] for i, m in enumerate(methods)}
     for ax, (title, points, band) in zip(axes, panels, strict=True):
         if band is not None and all(map(math.isfinite, band)):
             ax.axvspan(band[0] - band[1], band[0] + band[1], color=BAND, linewidth=0)
             ax.axvline(band[0], color=GREY, linewidth=0.8)
-        for place, method, value, sigma in points:
+        for place, (_, method, value, sigma) in enumerate(points):
             shape, colour = shapes[method]
             ax.errorbar(value, place, xerr=sigma, fmt=shape, color=colour, markersize=5,
                         capsize=3, linewidth=1.1)
-        ax.set_yticks(range(len(rows)), [text for text, _, _ in rows])
-        ax.set_ylim(len(rows) - 0.5, -0.5)
+        ax.set_yticks(range(len(points)), [text for text, *_ in points])
+        ax.set_ylim(len(points) - 0.5, -0.5)
         ax.set_xlabel(title)
-    says = ('Each bar is one sigma to either side; the grey band is the result. Legs share some '
-            'errors (heading source, lever arms), so bars may overlap more than chance would have '
-            'it.')
+    says = 'Each bar is one sigma to either side; the grey band is the result.' + (
+        ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
+        'chance would have it.' if legs > 1 else '')
     return 'Side by side', says, svg(figure, f'{name}-compared', says)

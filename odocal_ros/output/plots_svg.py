@@ -28,11 +28,15 @@ def look():
         yield
 
 
-def sheet(height, rows=1, sharex=True):
-    """Return a figure of ``height`` inch and its axes, one above the other, as an array."""
+def sheet(height, rows=1, sharex=True, heights=None):
+    """
+    Return a figure of ``height`` inch and its axes, one above the other, as an array.
+
+    heights : of the axes, in any unit; None: all alike.
+    """
     from matplotlib.figure import Figure
     figure = Figure(figsize=(WIDTH, height))
-    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False)[:, 0]
+    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False, height_ratios=heights)[:, 0]
     figure.subplots_adjust(left=0.135, right=0.975, top=1 - 0.32 / height,
                            bottom=0.48 / height, hspace=0.16)
     for ax in axes:

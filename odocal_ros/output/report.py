@@ -1,5 +1,6 @@
 """report.html: one page that needs no network, for the eye that must believe a calibration."""
 
+from collections import Counter
 from datetime import datetime, UTC
 from html import escape
 from importlib.resources import files
@@ -10,7 +11,7 @@ from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.reason_lines import shared
-from odocal_ros.output.summary import known, MEANING, sentence
+from odocal_ros.output.summary import DEG, known, MEANING, sentence
 from odocal_ros.output.track_table import overall
 from odocal_ros.reasons import Reason, Verdict
 
@@ -72,17 +73,18 @@ def _context(calibration, config, content):
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     checks = [overall([(getattr(leg, name), leg.fixes) for leg in legs])
               for name in ('before', 'after')]
+    methods = _leading(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
-        'title': ', '.join(bags) or 'live drive', 'created': content['created'],
+        'title': ', '.join(bags) or 'live drive', 'created': _made(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
         'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
                f'{time_span(duration)}',
-        'values': tables.value_rows(calibration), 'rotation': calibration.imu_rotation_rpy,
+        'values': tables.value_rows(calibration), 'rotation': _degrees(calibration),
         'reasons': grouped(calibration.reasons), 'check': tables.check_rows(*checks),
-        'methods': tables.method_table(calibration.methods, legs),
-        'budgets': _budgets(calibration.methods), 'inputs': content['inputs'],
+        'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
+        'inputs': content['inputs'],
         'settings': tables.changed_settings(config),
         'versions': tables.versions(content['software']),
         'digits': tables.full_digits(content)}
@@ -93,6 +95,26 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     groups = [(v.value, title, [r for r in shared(reasons) if r.code.gravity is v])
               for v, title in TITLES.items()]
     return [group for group in groups if group[2]]
+
+
+def _leading(methods, estimates):
+    """Return methods, those first that gave most of the result."""
+    given = Counter(e.method for e in estimates.values() if e.value is not None)
+    return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
+
+
+def _degrees(calibration):
+    # + 0.0: no minus before a zero
+    return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
+                     for angle in calibration.imu_rotation_rpy or ())
+
+
+def _made(created):
+    """Return a date as people write it, or as it is."""
+    try:
+        return f'{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
+    except ValueError:
+        return created
 
 
 def _budgets(methods):
@@ -123,13 +145,14 @@ def _drawn(calibration):
 
 def _leg(number, leg: LegResult, figures, several):
     rows, findings = tables.left_out(leg)
+    methods = _leading(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
             'start': _utc(leg.start_ns), 'stop': _utc(leg.stop_ns), 'figures': figures,
             'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),
                       ('Imu samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
-            'methods': tables.method_table(leg.methods, (leg,)),
-            'budgets': _budgets(leg.methods) if several else [],
+            'methods': tables.method_table(methods, (leg,)),
+            'budgets': _budgets(methods) if several else [],
             'check': tables.check_rows(leg.before, leg.after) if several else [],
             'reasons': grouped(leg.reasons) if several else [],
             'left_out': rows, 'findings': findings}

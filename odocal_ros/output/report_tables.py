@@ -17,6 +17,7 @@ LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nomi
           'scale_factor_left': 'scale factor, left wheel',
           'scale_factor_right': 'scale factor, right wheel'}
 LOST = 'not determined'
+SMALL = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}      # of a budget's figures
 WORTH_A_ROW = 0.005      # share of a variance
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
@@ -137,7 +138,8 @@ def _column(name, estimate):
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
     if estimate.unit == 'rad':
         return f'{label(name)}, deg', DEG
-    return f'{label(name)}, {estimate.unit}', 1.0
+    factor, unit = SMALL.get(estimate.unit, (1.0, estimate.unit))
+    return f'{label(name)}, {unit}', factor
 
 
 def check_rows(before, after) -> list[tuple]:

@@ -20,7 +20,7 @@ from odocal_ros.output import report
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.report import report_html, report_or_why
 
-CREATED = '2026-01-02T03:04:05+00:00'
+CREATED, MADE = '2026-01-02T03:04:05+00:00', '2026-01-02 03:04:05 UTC'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
 FIGURES = ('Track', 'Residuals', 'Scale by section', 'Speed and turn rate', 'Fix quality')
@@ -122,7 +122,7 @@ def test_a_leg_is_told_whole(good):
                  '-1.0000 ± 0.0029 deg', '-0.017453 ± 0.000050 rad', 'not determined',
                  'TOPIC_GAP', 'odometer gap of 1.2 s', 'Mend the stream',
                  '1500 m', '0.10 m', '2018-08-02 08:53:20 UTC', 'ab' * 32, '/imu/data',
-                 '1 of 202 fixes status below 0; first at t = 7.0 s', CREATED, *FIGURES):
+                 '1 of 202 fixes status below 0; first at t = 7.0 s', MADE, *FIGURES):
         assert part in text, part
     assert parsed.tags['svg'] == parsed.tags['figure'] == 5
     for words in ('east of the start, km', 'along, m', 'scale less result, ppm', 'speed, km/h',
@@ -147,11 +147,32 @@ def test_every_number_of_the_result_is_there_in_full(good):
 def test_any_set_of_methods_stands_side_by_side(good):
     _, text, parsed = page_of(three_methods(good))
     assert 'Methods and legs side by side' in text
-    assert 'method smoother wheels two point' in text
+    assert 'method two point smoother wheels' in text, 'the result is of the first'
     for part in ('1.520 ± 0.010 m', '+12.0 ± 3.0 ms', 'track width', 'Error budget of the method '
                  'wheels', 'leg 2, wheels', 'all legs, smoother'):
         assert part in text, part
     assert parsed.tags['svg'] == 2 * 5 + 1
+
+
+def test_the_method_that_gave_the_result_comes_first(good):
+    result = {n: replace(e, method='smoother') for n, e in good.estimates.items()}
+    base = good.methods['two_point']
+    both = replace(good, estimates=result, methods={
+        'two_point': base, 'smoother': replace(base, name='smoother')})
+    _, text, _ = page_of(both)
+    assert 'method smoother two point' in text
+    budgets = re.findall(r'Error budget of the method (\w+)', text)
+    assert budgets == sorted(budgets, key=['smoother', 'two'].index)
+    assert 'roll, pitch, yaw 0.000, -0.000' not in page_of(replace(
+        good, imu_rotation_rpy=(0.0, -1e-9, 0.0)))[1]
+
+
+def test_each_panel_of_the_comparison_has_the_rows_that_have_a_value(good):
+    page, _, _ = page_of(three_methods(good))
+    (panels,) = re.findall(r'<svg[^>]*aria-label="Each bar.*?</svg>', page, re.DOTALL)
+    # scale: three methods, of all and of two legs; yaw: not by the wheels
+    assert len(re.findall('>leg [12], wheels<', panels)) == 2
+    assert len(re.findall('>leg [12], smoother<', panels)) == 4
 
 
 def test_what_is_rejected_or_missing_renders_too(rejected, nothing, good):
@@ -268,7 +289,11 @@ def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
              'out: [...document.querySelectorAll("figure svg")].filter(s => { const box = '
              's.getBoundingClientRect(); return [...s.querySelectorAll("text")].some(t => { const '
              'b = t.getBoundingClientRect(); return b.left < box.left - 2 || b.right > box.right '
-             '+ 2 || b.top < box.top - 2 || b.bottom > box.bottom + 2; }); }).length }); })'
+             '+ 2 || b.top < box.top - 2 || b.bottom > box.bottom + 2; }); }).length,'
+             'over: [...document.querySelectorAll("figure svg")].filter(s => { const b = '
+             '[...s.querySelectorAll("text")].map(t => t.getBoundingClientRect()); return '
+             'b.some((p, i) => b.some((q, k) => k > i && p.left < q.right - 1 && q.left < p.right '
+             '- 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1)); }).length }); })'
              '</script></body>')
     page.write_text(html.replace('</body>', probe))
     import json
@@ -279,6 +304,7 @@ def test_a_browser_shows_the_figures_and_nothing_sticks_out(good, tmp_path):
         assert len(layout['figures']) == 11
         assert min(w for w, _ in layout['figures']) > 0.8 * min(width, 1280 / 2.4) - 40
         assert layout['out'] == 0, 'text outside its figure'
+        assert layout['over'] == 0, 'text over text'
     page.write_text(html)
     picture, paper = tmp_path / 'page.png', tmp_path / 'page.pdf'
     shown(page, tmp_path, '--window-size=900,3000', f'--screenshot={picture}')
