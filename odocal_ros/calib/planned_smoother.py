@@ -13,7 +13,7 @@ from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
 from odocal_ros.calib.smoother.problem import Problem, SPACING
-from odocal_ros.calib.smoother.smoother import FEWEST_FIXES, SHORTEST
+from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
 
@@ -45,7 +45,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     MethodResult named ``smoother``; scale 1, angles 0, sigmas and budget as they will be.
 
     """
-    few = _too_little(drive, sigmas)
+    few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
     if few:
         return refused([few], '1')
     made = ideal(drive, sigmas, spacing_for(drive) if spacing is None else spacing)
@@ -99,11 +99,3 @@ def _fit(problem, made: Ideal, levels, priors) -> Fit:
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), weighted,
                solve(weighted.normal()), True, 0)
-
-
-def _too_little(drive, sigmas):
-    count = int(drive.duration * sigmas.fix_rate)
-    if count < FEWEST_FIXES or drive.duration < SHORTEST:
-        return Reason(Code.SCALE_NOT_DETERMINED, f'{count} fixes in {drive.duration:.0f} s: too '
-                      'little for the smoother')
-    return None

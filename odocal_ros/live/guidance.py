@@ -104,6 +104,8 @@ def _while_recording(now: Situation) -> str:
     wheels = None if now.outlook is None else now.outlook.wheels
     if wheels is not None and wheels.fault:
         return f'{wheels.fault}; call ~/cancel_leg'
+    if now.outlook is not None and now.outlook.fault:
+        return f'the leg would be rejected: {now.outlook.fault}'
     metres, wants = metres_to_go(now), manoeuvres(now)
     slow = now.max_speed < now.session.config.leg.min_speed
     if metres > 0 or slow:

@@ -28,6 +28,7 @@ from odocal_ros.live.worker import Worker
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
+
 class LegWay:
     """
     A leg's way from mark to answer; the operator's commands are in ``Operation``.

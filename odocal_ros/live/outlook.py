@@ -78,6 +78,7 @@ class Outlook:
     pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
     methods : what those say that need no end of the drive.   estimates : the running estimate,
     each value by the method that will give it.   until_ns : stamp up to which it was looked at.
+    fault : what the leg will be rejected for however far it goes, and what to do.
     """
 
     scale: Prospect
@@ -87,6 +88,7 @@ class Outlook:
     methods: dict[str, MethodResult] = field(default_factory=dict)
     estimates: dict[str, Estimate] = field(default_factory=dict)
     until_ns: int = 0
+    fault: str = ''
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.calib.choice import ABOUT, choose, deciding
 from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.leg import Leg
@@ -59,6 +59,11 @@ def nothing_foreseen(config: Config) -> Outlook:
 def with_running(outlook: Outlook, running: Running, config: Config) -> Outlook:
     """Return an outlook with a running estimate, where the result will be by it."""
     method = running.method
+    faults = [r for r in method.reasons
+              if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
+    if faults:      # its values are of no use then
+        first = faults[0]
+        return replace(outlook, fault=f'{first.code.name}: {first.text}. {first.remedy}')
     if method.verdict is not Verdict.REJECTED:
         outlook = replace(outlook, methods=outlook.methods | {'smoother': method})
     given, _ = choose(outlook.methods, config.method)

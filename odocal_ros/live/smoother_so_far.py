@@ -23,12 +23,7 @@ from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.smoother import (
-    best_fit,
-    FEWEST_FIXES,
-    likeliest_fit,
-    SHORTEST,
-)
+from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit, too_little
 from odocal_ros.calib.smoother.state import ACCEL_SCALE, LN_K, PITCH, YAW
 from odocal_ros.config import Config
 from odocal_ros.errors import BadData
@@ -124,8 +119,11 @@ class SmootherSoFar:
 
     def _view(self, leg, config) -> SmootherLeg:
         inputs, _ = screen(leg, config)
-        if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2 or len(inputs.t_fix) < FEWEST_FIXES:
-            raise BadData(f'the smoother needs {FEWEST_FIXES} fixes')
+        if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
+            raise BadData('the smoother needs samples of the Imu and of the odometer')
+        few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
+        if few:
+            raise BadData(few.text)
         found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
         if any(r.code is Code.IMU_AXES for r in found):
             raise BadData(found[0].text)
@@ -141,8 +139,9 @@ class SmootherSoFar:
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, run.origin, run.fixes_n, spans, run.rough, t_stop)
         fixes = ((view.t_fix >= view.t_begin) & (view.t_fix <= view.t_stop)).sum()
-        if fixes < FEWEST_FIXES or view.t_imu[-1] - view.t_begin < SHORTEST:
-            raise BadData(f'the smoother needs {SHORTEST:g} s and {FEWEST_FIXES} fixes')
+        few = too_little(int(fixes), float(view.t_imu[-1] - view.t_begin))
+        if few:
+            raise BadData(few.text)
         return view
 
     def _fit(self, view, config, trace):

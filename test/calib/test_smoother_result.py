@@ -16,7 +16,8 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
-from odocal_ros.calib.smoother.state import YAW
+from odocal_ros.calib.smoother.state import GYRO_SCALE, YAW
+from odocal_ros.config import with_settings
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -136,6 +137,13 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     assert Code.YAW_NOT_DETERMINED in codes(method)
     scale = method.estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3.3 * scale.sigma
+
+
+def test_the_gyro_scale_is_believed_as_it_is_set():
+    _, config, leg = made(**SHORT)
+    for asked, believed in ((np.nan, 2e-3), (0.02, 0.02), (0.0, 1e-5)):
+        told = with_settings(config, {'imu.gyro_scale_sigma': asked})
+        assert Problem.of(leg, told).priors.constants[GYRO_SCALE] == believed
 
 
 def test_too_little_is_refused():

@@ -186,8 +186,9 @@ def test_an_imu_that_faces_down_is_read_as_such(config, looks):
 
 
 @pytest.mark.parametrize(('changed', 'words'), [
-    ({'fix': slice(0, 5)}, '10 fixes'), ({'imu': slice(0, 2)}, '10 fixes'),
-    ({'odometer': slice(0, 1)}, '10 fixes')])
+    ({'fix': slice(0, 5)}, '^5 fixes in [0-9]+ s: the smoother needs 10 in 20 s'),
+    ({'imu': slice(0, 0)}, 'of the Imu'), ({'imu': slice(0, 2)}, 'of the Imu'),
+    ({'odometer': slice(0, 1)}, 'of the odometer')])
 def test_too_little_is_said_and_no_look_is_lost_by_it(config, looks, changed, words):
     leg, so_far = looks[0].leg, SmootherSoFar()
     less = replace(leg, **{slot: take(getattr(leg, slot), rows) for slot, rows in changed.items()})
@@ -226,6 +227,21 @@ def test_before_the_smoother_can_say_anything_the_end_points_are_foreseen(config
     assert outlook_of(leg, 5.0, Config(), smoother=Silent()).scale.sources[0][0] == 'fix_end'
     with pytest.raises(OdocalError, match='too little'):
         look(leg, with_settings(Config(), {'method': 'smoother'}), Silent(), lambda: True)
+
+
+@pytest.mark.parametrize('method', ['smoother', 'auto'])
+def test_what_the_leg_will_be_rejected_for_is_said_at_once(config, looks, method):
+    leg = looks[-1].leg
+    backwards = replace(leg, odometer=replace(leg.odometer, value=-leg.odometer.value))
+    asked = with_settings(config, {'method': method})
+    found = outlook_of(backwards, 5.0, asked, smoother=SmootherSoFar())
+    assert found.fault.startswith('ODOMETER_REVERSED: the odometer runs against the Imu')
+    assert found.estimates.get('scale_factor') is None      # no value that would be thrown away
+    session = Session()
+    session.start(1, asked)
+    told = hint(Situation(session, asked, outlook=found, distance_m=900.0, max_speed=10.0))
+    assert told.startswith('the leg would be rejected: ODOMETER_REVERSED')
+    assert outlook_of(leg, 5.0, asked, smoother=SmootherSoFar()).fault == ''
 
 
 def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(drive, config):

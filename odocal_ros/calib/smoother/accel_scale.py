@@ -98,5 +98,6 @@ def judge_scale(problem, now: Fit, config, trace=None) -> Fit:
                     first=with_scales(now.first, priors.constants[ACCEL_SCALE]))
     # noise judged with a scale error that was not taken for one is to be judged again
     taken = weight >= TAKEN
-    return fit(problem, now.state, now.levels, 2 * FEW if taken else FEW, about=about,
+    last = fit(problem, now.state, now.levels, 2 * FEW if taken else FEW, about=about,
                frozen=not taken, trace=trace)
+    return replace(last, iterations=now.iterations + last.iterations)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.smoother.motion import D, ROWS
-from odocal_ros.calib.smoother.state import BA, BG, P, PHI, V
+from odocal_ros.calib.smoother.state import BA, BG, ODO_DELAY, P, PHI, V
 from odocal_ros.nav.rotations import skew
 
 Floats = NDArray[np.float64]
@@ -162,7 +162,7 @@ def _extra(motion, leg):
     extra[:, P] = (GAP_FORCE * gap * T)[:, None]**2
     t = motion.state.t
     way = leg.travel
-    delay = motion.state.constants[9]
+    delay = motion.state.constants[ODO_DELAY]
     outside = (t[:-1] + delay < way.t[0] - 0.1) | (t[1:] + delay > way.t[-1] + 0.1)
     extra[outside, D] = ABSENT
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):

@@ -35,10 +35,9 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-OPTIONAL = [i for i, name in enumerate(CONSTANTS)
-            if i < ACCEL_SCALE.start and i not in (LN_K, YAW, PITCH, GYRO_SCALE, HEADING)]
-
-SCALES = range(ACCEL_SCALE.start, ACCEL_SCALE.stop)
+SCALES = (GYRO_SCALE, *range(ACCEL_SCALE.start, ACCEL_SCALE.stop))     # errors of the Imu
+# estimates where the drive tells them: lever arms and delays
+OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
 
 
 def refused(reasons, scale_unit, details=None) -> MethodResult:
@@ -90,7 +89,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
             found[name] = Estimate(value, float(sigma[i]), 'rad')
     reasons += _undetermined(sigma, limit, config, yaw)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
-    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, GYRO_SCALE, *SCALES)}
+    ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     for i in OPTIONAL:
         name = CONSTANTS[i]
         if ratio[name] < INFORMED:
@@ -184,7 +183,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'outside': _outside(leg, problem, fit, sigma),
         'posterior_to_prior': ratio,
         **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
-           for i in (GYRO_SCALE, *SCALES)},
+           for i in SCALES},
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((w.fix_r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((w.fix_weight[:, 0] < 0.5).sum()),

@@ -46,7 +46,6 @@ class Intervals:
     mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
-
     def shifted(self, gyro_bias, accel_bias) -> 'Intervals':
         """Return the sums for biases that differ a little, (K, 3) each, to first order."""
         turned = -turn(self.A, gyro_bias)

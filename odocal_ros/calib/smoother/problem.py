@@ -36,6 +36,8 @@ ROAD = 0.01          # m/sqrt(s), what slip and slide are believed to be at firs
 LEAST_ROAD = 2e-4    # m/sqrt(s) along
 LEAST_FIX = 0.005    # m
 NO_SCALE = 1e-5      # relative, of the accelerometer: as good as none, until the fit is judged
+# of a gyro in use: a chip of the first two grades may be as far off as grades.GRADES has it, which
+# is what its maker guarantees; the drive's turns tell, and the belief gives way up to 30 times
 GYRO_SCALE_SIGMA = {'consumer': 3e-3, 'industrial': 2e-3, 'tactical': 3e-4, 'navigation': 1e-5}
 
 
@@ -196,7 +198,9 @@ def _priors(config, grade, leg) -> Priors:
     sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade]
+    given = config.imu.gyro_scale_sigma
+    sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade] if np.isnan(given) else max(
+        given, NO_SCALE)
     sigma[HEADING] = leg.heading.sigma
     sigma[ACCEL_SCALE] = NO_SCALE
     accel_bias = np.full(3, max(grade.accel_bias, 1e-6))

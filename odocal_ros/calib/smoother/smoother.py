@@ -40,7 +40,9 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
     MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
 
     """
-    few = _too_little(leg)
+    inside = (leg.t_fix >= leg.t_begin) & (leg.t_fix <= leg.t_stop)
+    few = too_little(int(inside.sum()),
+                     min(leg.t_stop, leg.t_imu[-1]) - max(leg.t_begin, leg.t_imu[0]))
     if few:
         return refused([few], leg.scale_unit)
     problem = Problem.of(leg, config)
@@ -81,13 +83,12 @@ def likeliest_fit(problem, config, trace=None):
     return fit(problem, best.state, best.levels, about=best, trace=trace)
 
 
-def _too_little(leg):
-    inside = (leg.t_fix >= leg.t_begin) & (leg.t_fix <= leg.t_stop)
-    length = min(leg.t_stop, leg.t_imu[-1]) - max(leg.t_begin, leg.t_imu[0])
-    if inside.sum() < FEWEST_FIXES or length < SHORTEST:
-        return Reason(Code.SCALE_NOT_DETERMINED, f'{int(inside.sum())} fixes in {length:.0f} s: '
-                      'too little for the smoother')
-    return None
+def too_little(fixes: int, seconds: float) -> Reason | None:
+    """Return why so many fixes in so many seconds of a leg are too few, None if they are not."""
+    if fixes >= FEWEST_FIXES and seconds >= SHORTEST:
+        return None
+    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s: the smoother '
+                  f'needs {FEWEST_FIXES} in {SHORTEST:.0f} s at least')
 
 
 def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
