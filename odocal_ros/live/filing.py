@@ -13,10 +13,14 @@ from odocal_ros.live.worker import Worker
 
 
 class Filing:
-    """Saves results and takes them back; ``saved`` is the newest folder that still stands."""
+    """
+    Saves results and takes them back.
+
+    saved : the newest folder that still stands.   trouble : why the newest result has none.
+    """
 
     def __init__(self, worker: Worker, log, show: Callable[[], None]) -> None:
-        self.saved = ''
+        self.saved = self.trouble = ''
         self._worker, self._log, self._show = worker, log, show
         self._shelf = Shelf()
         self._warned: Calibration | None = None    # the operator was told that latest stays
@@ -33,15 +37,17 @@ class Filing:
         def then(outcome, error):
             if error is None:
                 folder, stays = outcome
-                self.saved = str(folder)
+                self.saved, self.trouble = str(folder), ''
                 if stays and asked:
                     self._warned = calibration
                 future.set_result((True, f'saved to {folder}' + (
                     f'; latest stays where it was: {stays}; call ~/save'
                     f'{" again" * asked} to point it here all the same' if stays else '')))
             else:
-                future.set_result((False, f'not saved: {answers.one_line(error)}'))
-            self._log.info(future.result()[1])
+                self.trouble = answers.one_line(error)
+                future.set_result((False, f'not saved: {self.trouble}'))
+            tell = self._log.info if error is None else self._log.warning
+            tell(future.result()[1])
             self._show()
 
         self._worker.submit(partial(
@@ -51,6 +57,8 @@ class Filing:
 
     def withdraw(self, left) -> None:
         """Let ``latest`` and ``saved`` go back to what holds only the legs left."""
+        self.trouble = ''
+
         def then(folder, error):
             self.saved = '' if folder is None else str(folder)
             if error is not None:

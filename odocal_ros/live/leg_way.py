@@ -97,7 +97,7 @@ class LegWay:
         outlook = self._watch.outlook
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
-            distance_m=self._distance_m,
+            save_trouble=self._filing.trouble, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(),
             ability=self._ability if recording else None, outlook=outlook,
             outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,

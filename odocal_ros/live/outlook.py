@@ -5,6 +5,7 @@ import math
 
 from odocal_ros.calib.result import Estimate, MethodResult
 
+COARSE = 0.01        # relative sigma from which it is said in per cent
 FARTHEST = 2e4       # m: who must drive on for more needs something else
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
@@ -37,6 +38,8 @@ class Prospect:
 
     def words(self, name: str, unit: str, factor: float) -> str:
         """Return it for people, sigmas times ``factor`` in ``unit``."""
+        if unit == 'ppm' and self.sigma is not None and self.sigma >= COARSE:
+            unit, factor = '%', 100.0
         asked = _three_digits(self.asked * factor)
         sigma = None if self.sigma is None else _three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'

@@ -56,6 +56,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'can_tell': ', '.join(now.ability.can) if now.ability else '',
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
+        'save_trouble': now.save_trouble,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
     return DiagnosticStatus(
@@ -71,7 +72,8 @@ def level(now: Situation) -> bytes:
     if state is State.IDLE and not now.heard:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
-    doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble)
+    doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
+                                or now.save_trouble)
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
@@ -92,9 +94,10 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
     if now.restored and session.state is State.IDLE:
         seen += f', with the result restored of {now.restored}'
     good = '' if session.state is State.RECORDING else quantities.words(ok)
-    trouble = now.journal_trouble
-    journal = f'the journal cannot be written: {trouble}' if trouble else ''
-    return '; '.join(filter(None, (seen, good, text, journal)))
+    troubles = [f'{what}: {trouble}' for what, trouble in (
+        ('the result is not saved', now.save_trouble),
+        ('the journal cannot be written', now.journal_trouble)) if trouble]
+    return '; '.join(filter(None, (seen, good, text, *troubles)))
 
 
 def _reason_codes(now: Situation) -> str:

@@ -51,6 +51,27 @@ def test_a_worse_result_needs_the_second_save(save):
     assert save(BAD)[1]
 
 
+def test_what_cannot_be_saved_is_a_warning_until_it_is(tmp_path):
+    worker, said = Worker(), []
+    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
+                    lambda: None)
+
+    def save(folder):
+        future = filing.save(GOOD, with_settings(Config(), {'output.directory': str(folder)}), {},
+                             'imu_link', NOW_NS, True)
+        wait_for(lambda: worker.poll() or future.done(), 'the answer of save')
+        return future.result()
+    (tmp_path / 'file').touch()
+    success, text = save(tmp_path / 'file')
+    assert not success
+    assert said == [text]
+    assert filing.trouble in text
+    assert 'output.directory' in filing.trouble
+    assert save(tmp_path)[0]
+    assert filing.trouble == ''
+    worker.close()
+
+
 def test_the_saves_of_the_node_itself_do_not_count(save):
     assert save(GOOD, asked=False)[1]
     for _ in range(2):

@@ -429,6 +429,13 @@ YAW = Prospect(0.005, 0.0087, 0.0)
 NO_YAW = Prospect(None, 0.0087, None, (), 'no drive brings it below its heading (1 deg)')
 
 
+def test_a_coarse_scale_is_said_in_per_cent():
+    assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
+        'scale 1.02 +- 13.8 % so far; 2200 m more bring it to the asked 0.1 %')
+    assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
+        'enough: scale 9900 ppm (asked 1000)')
+
+
 def said(outlook, **more):
     session = Session()
     session.start(1, Config())

@@ -211,6 +211,9 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect
     player.play(part(slow[1], 55, 60), SPEED)
     assert 'scale factor' in answer_of(stopping).message
     assert node.text.count('the journal cannot be written') == 1
+    assert not client.call('save').success
+    status = wait_for(lambda: client.status['save_trouble'] and client.status, 'the other warning')
+    assert 'the result is not saved: ' in status['message']
     # and none is missed where none is wanted
     assert client.set(journal__max_bytes=0).successful
     wait_for(lambda: not client.status['journal_trouble'], 'the end of the warning')
@@ -218,7 +221,8 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect
     player.play(part(slow[1], 60, 60.5), SPEED)
     client.start()
     status = client.until(state='recording')
-    assert (status['journal'], status['journal_trouble'], status['level']) == ('', '', b'\0')
+    assert [status[k] for k in ('journal', 'journal_trouble', 'save_trouble', 'level')] == [
+        '', '', '', b'\0']
 
 
 def test_a_disk_full_for_a_while_costs_nothing_nor_does_the_end_of_the_node(start, connect, slow):
