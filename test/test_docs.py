@@ -5,7 +5,7 @@ import re
 import shlex
 import shutil
 
-from drives import drive
+from drives import drive, settings
 from pages import all_commands, blocks, PAGES, ROOT, yaml_blocks
 import pytest
 
@@ -13,6 +13,7 @@ from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.config_file import read_config_file
 from odocal_ros.offline import cli
+from odocal_ros.pipeline import calibrate
 
 # what begins otherwise than with odocal or ros2, and what runs it instead of this file
 ELSEWHERE = {
@@ -118,6 +119,20 @@ def test_the_figures_of_the_page_are_those_that_are_drawn():
     drawn = re.findall(r"return '([^']+)', says", source)
     assert told == drawn
     assert 'Origin' in (ROOT / 'odocal_ros/output/templates/report.html').read_text()
+
+
+def test_each_source_of_a_budget_is_explained():
+    page = page_of('docs/report.md')
+    cells = re.findall(r'^\| ([\w, ]+) \|', page, re.MULTILINE)
+    told = {name for cell in cells for name in cell.split(', ')} | {'gyro bias y', 'gyro bias z'}
+    assert "*The legs' own errors*" in page
+    made = drive(scenario='town', duration=200.0, two_wheels=True, imu_grade='industrial')
+    more = {'method': 'all', 'odometer.left': 'topic', 'odometer.right': 'topic'}
+    leg = calibrate(made.leg(), settings(made, **more))
+    budgets = {name: method.details.get('budget') for name, method in leg.methods.items()}
+    assert all(budgets.values()), budgets
+    found = {source.replace('_', ' ') for budget in budgets.values() for source in budget}
+    assert found <= told, f'say in docs/report.md what they are: {found - told}'
 
 
 def test_settings_files_on_the_pages_are_taken(tmp_path):

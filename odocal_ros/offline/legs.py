@@ -169,8 +169,9 @@ def _marked(marks, last, bag):
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
-        raise BadData(f'{bag.name}: the recording ended at its start mark, the leg holds nothing; '
-                      'give --leg to calibrate another part of it')
+        raise BadData(f'{bag.name}: the recording broke off at its start mark, or so soon after '
+                      'that nothing of the leg is in it; drive it again (--leg : takes what came '
+                      'before the mark)')
     return legs
 
 

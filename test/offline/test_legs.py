@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from odocal_ros.config import Config
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.leg import LegRecorder
-from odocal_ros.offline.legs import find_legs, LegSpan, marked_legs, open_ended, parse_leg
+from odocal_ros.offline.legs import (
+    _marked,
+    find_legs,
+    LegSpan,
+    marked_legs,
+    open_ended,
+    parse_leg,
+)
 from odocal_ros.reasons import Code
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -138,3 +145,10 @@ def test_a_leg_outside_the_bag_is_refused_with_the_span_there_is(out_and_back):
     recorder, bag = recorded(out_and_back)
     with pytest.raises(BadUsage, match=r'runs from 0 to \d+\.\d s'):
         find_legs(recorder, bag, [parse_leg('5000:6000')], [], Config())
+
+
+def test_a_recording_that_broke_off_at_its_start_mark_says_so():
+    bag = SimpleNamespace(name='2026-01-02T03-04-05Z_leg_1')
+    with pytest.raises(BadData, match='broke off at its start mark.* drive it again'):
+        _marked([(10, 0)], 10, bag)
+    assert _marked([(10, 0)], 11, bag) == [(10, 11)]
