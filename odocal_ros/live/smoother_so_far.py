@@ -42,7 +42,6 @@ LONG = 660.0                # s
 FEW_KEYS = 150              # keyframes of a fit from nothing: it takes ten times the passes
 PASSES, MORE = 2, 6         # from the last look, and where that was not enough
 GROWN = 1.5                 # of the leg, until what is decided once is decided anew
-TOLD = 90.0                 # s of a leg in which slow errors of the fixes show as such
 AGREE = 3.0                 # sigmas within which a fit from nothing bears the running one out
 
 
@@ -210,8 +209,7 @@ def _running(view, problem, best, config) -> Running:
     moving = steps > 0.5 * T
     way = max(float(steps.sum()), 1.0)
     sigmas = np.sqrt(np.diag(best.solved.covariance))[[LN_K, YAW, PITCH]]
-    sigmas = np.hypot(sigmas * method.details['widened'],
-                      _slow_yet_unseen(view, best, config, way))
+    sigmas = sigmas * method.details['widened']
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)
     for name, sigma in zip(PARAMETERS, sigmas, strict=True):
@@ -223,21 +221,6 @@ def _running(view, problem, best, config) -> Running:
     return Running(replace(method, estimates=found), sigmas, way,
                    float((gained**2).sum(axis=1) @ (1 / T)),
                    float(np.median((steps / T)[moving])) if moving.any() else 0.0)
-
-
-def _slow_yet_unseen(view, best, config, way) -> np.ndarray:
-    """
-    Return what slow errors of the fixes may do to scale, yaw and pitch: (3,) relative, rad.
-
-    In a leg shorter than such errors stay they look like none. They are taken for as large as the
-    fixes say, twice that in height, and to be others at either end.
-    """
-    asked = config.gnss.correlation_time
-    judged = view.t_stop - view.t_begin > TOLD or best.levels.correlation_time > 0
-    if judged or not np.isnan(asked):
-        return np.zeros(3)
-    fix = np.sqrt(np.median(view.covariance_n[:, 0, 0]))
-    return np.sqrt(2) * fix / way * np.array([1.0, 0.0, 2.0])
 
 
 def _of_cells(view, imu) -> float:

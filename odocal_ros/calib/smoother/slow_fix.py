@@ -3,7 +3,8 @@ Slow errors of fixes: whether there are any, how large, how long they stay.
 
 A receiver's error wanders over a minute or so. Taken for white it would be averaged as if each fix
 brought news, and the sigma would be a fraction of the error. Where the residuals of neighbouring
-seconds are alike, a Gauss-Markov part is estimated beside the white one; its time by likelihood.
+seconds are alike, or the fixes of a short leg scatter less than they say, a Gauss-Markov part is
+estimated beside the white one; its time by likelihood.
 """
 
 from dataclasses import replace
@@ -15,6 +16,7 @@ from odocal_ros.calib.smoother.estimate import Fit, fit
 BIN = 2.0                      # s over which residuals are averaged
 ALIKE, SURE = 0.15, 4.0        # correlation of neighbouring bins; its sigmas
 SMOOTHED = 0.2                 # of the stated sigma: a fix so much better was filtered
+TOLD = 90.0                    # s of fixes in which errors that stay for a minute show as alike
 TIMES = (15.0, 60.0, 240.0)    # s, tried
 SLOW_SHARE, WHITE_SHARE = 0.9, 0.2    # of the variance, to start from
 FIRST, TRIAL = 5, 3            # iterations with the middle time, with each other
@@ -52,7 +54,20 @@ def are_slow(problem, first: Fit, asked: float) -> bool:
         return True
     t = problem.leg.t_fix[problem.use]
     alike, sigma = correlation(t, first.weighted.fix_r[:, :2])
-    return alike > max(ALIKE, SURE * sigma)
+    return alike > max(ALIKE, SURE * sigma) or _hidden(t, first.levels['fix'])
+
+
+def _hidden(t, level) -> bool:
+    """
+    Tell whether the fixes of a short leg scatter less than they say.
+
+    In less than TOLD a slow error passes for another scale and heading, and what is left of it
+    is hardly alike: what a receiver says of its errors and does not show as scatter is slow.
+
+    t : (m,) s.   level : variance of the scatter, of the stated; good to 1 / sqrt(m) of itself,
+    two components each.
+    """
+    return t[-1] - t[0] < TOLD and level < 1 - SURE / np.sqrt(len(t))
 
 
 def with_slow_errors(problem, first: Fit, asked: float, trace=None) -> Fit:

@@ -1,0 +1,42 @@
+"""Legs too short to show slow errors of the fixes: the sigma holds them all the same."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.smoother import smooth
+
+WINDOW, WINDOWS = 45.0, 6      # s, of one drive
+TOWN = {'scenario': 'town', 'duration': 420.0, 'imu_grade': 'consumer', 'seed': 3}
+
+
+def results(noise):
+    """Return the smoother's results of a drive's windows, and the truth."""
+    drive, config, leg = made(**TOWN, fix_noise=noise)
+    begins = 20.0 + WINDOW * np.arange(WINDOWS)
+    return drive.truth, [smooth(replace(leg, t_begin=begin, t_stop=begin + WINDOW), config)
+                         for begin in begins]
+
+
+def test_slow_errors_are_in_the_sigma_of_scale_and_pitch():
+    truth, found = results('correlated')
+    for name, true in (('scale_factor', truth.scale), ('pitch_mounting_angle', truth.pitch)):
+        out = [(e.value - true) / e.sigma for e in (r.estimates[name] for r in found)]
+        # chi2 of 6, 1 in 1000; taken for white they are some 5 sigmas off each
+        assert np.square(out).sum() < 22.5
+
+
+def test_fixes_as_white_as_they_say_are_taken_for_white():
+    _, found = results('white')
+    assert [r.details['noise']['correlation_time'] for r in found] == [0.0] * WINDOWS
+
+
+@pytest.mark.parametrize('stated', [0.5, 2.0])
+def test_it_goes_by_what_the_receiver_says(stated):
+    _, config, leg = made(**TOWN, fix_noise='white')
+    one = replace(leg, t_begin=20.0, t_stop=20.0 + WINDOW,
+                  covariance_n=leg.covariance_n * stated**2)
+    # twice as good as said: the other three quarters of the variance may stay for a minute
+    assert (smooth(one, config).details['noise']['correlation_time'] > 0) == (stated > 1)
