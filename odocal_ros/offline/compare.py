@@ -5,6 +5,7 @@ from pathlib import Path
 import sys
 
 HELP = 'change between calibrations against their sigmas'
+FINE = 1e-3      # relative change below which a scale's is said in ppm
 CAUSES = {
     'scale': 'tyre pressure, wear, load or another tyre; calibrate again to be sure, then use the '
              'newer value',
@@ -81,10 +82,11 @@ def _label(parameter):
 
 
 def _amount(change, difference, stored):
-    """Return a change as people read it: scales in percent, angles in deg."""
+    """Return a change as people read it: scales in per cent or ppm, angles in deg."""
     old = stored[difference.since].estimates[change.parameter].value
     if change.parameter.startswith('scale_'):
-        return f'{100 * difference.change / old:+.3g} %'
+        change = difference.change / old
+        return f'{1e6 * change:+.0f} ppm' if abs(change) < FINE else f'{100 * change:+.3g} %'
     if change.unit == 'rad':
         return f'{57.29577951308232 * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'

@@ -118,7 +118,7 @@ def _sections(found, name, scale_sigma):
     factor, unit = lengths(found.distance[-1])
     middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
     off = part.ratio - 1
-    times, word = relative(np.nanmax(np.abs(off) + part.sigma))
+    times, word = relative(max(np.nanmax(np.abs(off) + part.sigma), scale_sigma or 0.0))
     figure, (ax,) = sheet(2.7)
     if scale_sigma:
         ax.axhspan(-scale_sigma * times, scale_sigma * times, color=BAND, linewidth=0,

@@ -67,6 +67,13 @@ def test_a_change_is_measured_in_sigmas_of_the_difference(compare):
     assert whole['sentence'].endswith(CAUSES['scale'])
 
 
+def test_a_small_change_of_scale_is_told_in_ppm(compare):
+    # 2e-6 of 0.02 is 100 ppm
+    code, out, _ = compare(content(), content(0.020002, 4e-6, start=2 * START))
+    assert code == 0
+    assert '+100 ppm (+0.4 sigma)' in out
+
+
 @pytest.mark.parametrize(('sigmas', 'code'), [(2.9, 0), (3.1, 1), (-2.9, 0), (-3.1, 1)])
 def test_three_sigma_is_the_limit(compare, sigmas, code):
     other = content(0.02 + sigmas * 5e-6, 4e-6, start=2 * START)
