@@ -10,7 +10,14 @@ import pytest
 from wheel_legs import wheel_leg
 
 from odocal_ros.calib.wheels.first import near_neighbours
-from odocal_ros.calib.wheels.judge_noise import evidence, inverse_root, judge_turns, slow_means
+from odocal_ros.calib.wheels.judge_noise import (
+    evidence,
+    inverse_root,
+    judge_turns,
+    NOTHING,
+    sizes_believed,
+    slow_means,
+)
 from odocal_ros.calib.wheels.leg import C_bv, wheel_factors
 from odocal_ros.calib.wheels.model import equations, make_bins, State
 from odocal_ros.calib.wheels.noise import walk_root
@@ -154,6 +161,18 @@ def turns(slip, count_sigma, seed=2, n=100):
 def test_slip_is_found_as_large_as_it_is():
     # 99 squared steps: the variance to sqrt(2 / 99), three sigmas 43 %
     assert turns(0.01, 1e-3).slip == pytest.approx(1e-4, rel=0.43)
+
+
+def test_what_is_believed_of_sizes_is_whole_and_least_far_from_the_usual():
+    sizes = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
+    p = np.exp(sizes_believed(sizes, 3e-3, 1.5))
+    assert p.sum() == pytest.approx(1.0, rel=1e-12)
+    assert p[0] == NOTHING
+    # a log-normal law: a factor e^1.5 off the usual is as likely as e^-1.5, and e^-0.5 of it
+    near, low, high = (np.interp(np.log(3e-3) + x, np.log(sizes[1:]), np.log(p[1:]))
+                       for x in (0.0, -1.5, 1.5))
+    # between grid points 0.23 apart a parabola of curvature 1 / 1.5^2 sags by 0.23^2 / 8 of it
+    assert [low - near, high - near] == pytest.approx([-0.5, -0.5], abs=2 * 0.23**2 / 8 / 1.5**2)
 
 
 @pytest.mark.parametrize('level', [0.3, 1.0, 4.0, 20.0])

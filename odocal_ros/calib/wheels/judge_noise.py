@@ -16,7 +16,10 @@ TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])   # s
 SLOW = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
 BELIEF = 0.5          # ln: how far the stated variance may be off, before looking
 SLIPS = np.append(0.0, np.geomspace(1e-5, 0.1, 41))      # m/sqrt(s)
-WHITE_BELIEF = 0.8    # that nothing lasts, no wheel slips
+NOTHING = 0.8         # belief that nothing lasts, no wheel slips
+# where something does: size, and ln by which it may be off
+SLOW_BELIEF = 1.0, 2.0        # of the stated variance
+SLIP_BELIEF = 3e-3, 1.5       # m/sqrt(s)
 LEVELS = 2.0**(np.arange(-4, 8) / 1.5)    # of the variance of rounding in motion
 LEVEL_BELIEF = 0.7    # ln: how far it may be off, before looking
 LEAST_WHITE = 1e-4    # of the stated variance
@@ -101,7 +104,7 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
     shapes = [root[:, None] * np.kron(np.eye(2), slow_means(begin, end, time)) * root
               for time in times]
     belief = -0.5 * (np.log(white + SLOW) / BELIEF)**2
-    belief += np.log(np.where(SLOW > 0, (1 - WHITE_BELIEF) / (len(SLOW) - 1), WHITE_BELIEF))
+    belief += sizes_believed(SLOW, *SLOW_BELIEF)
     cut = np.ix_(use, use)
     white_root = inverse_root((known + W)[cut])
     log = np.array([belief + evidence(r[use], X[use], white_root, S[cut], SLOW) for S in shapes])
@@ -128,14 +131,20 @@ def judge_turns(r, X, known, counts, walk) -> TurnNoise:
     """
     levels = LEVELS if counts.any() else np.ones(1)
     belief = -0.5 * ((np.log(levels) + LEVEL_BELIEF**2 / 2) / LEVEL_BELIEF)**2     # mean 1
-    belief = belief[:, None] + np.log(
-        np.where(SLIPS > 0, (1 - WHITE_BELIEF) / (len(SLIPS) - 1), WHITE_BELIEF))
+    belief = belief[:, None] + sizes_believed(SLIPS, *SLIP_BELIEF)
     roots = [inverse_root(known + level * counts) for level in levels]
     log = belief + [evidence(r, X, root, walk, SLIPS**2) + np.log(np.diag(root)).sum()
                     for root in roots]
     p = np.exp(log - log.max())
     p /= p.sum()
     return TurnNoise(float((p @ SLIPS**2).sum()), float(levels @ p.sum(axis=1)))
+
+
+def sizes_believed(sizes, usual, spread):
+    """Return the log of what is believed of sizes, the first of them 0, before looking: (n,)."""
+    log = np.append(np.log(NOTHING), -0.5 * (np.log(sizes[1:] / usual) / spread)**2)
+    log[1:] += np.log(1 - NOTHING) - np.log(np.exp(log[1:]).sum())
+    return log
 
 
 def inverse_root(covariance):
