@@ -12,7 +12,7 @@ from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
-from odocal_ros.calib.smoother.problem import Problem, SPACING
+from odocal_ros.calib.smoother.problem import Problem, sensor_noise, SPACING
 from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
@@ -81,9 +81,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
     road |= dict.fromkeys(('along', 'along_hard'), sigmas.slip**2)
     tau = sigmas.correlation_time
     white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
-    values = road | {
-        'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2,
-        'gyro_walk': grade.gyro_bias_walk**2, 'accel_walk': grade.accel_bias_walk**2,
+    values = road | {name: sigma**2 for name, sigma in sensor_noise(grade).items()} | {
         'slow': (1 - white) * sigmas.fix**2, 'slow_up': (1 - white) * up}
     values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
     least = {name: problem.least.get(name, 0.0) for name in values}

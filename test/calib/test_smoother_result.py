@@ -139,6 +139,26 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     assert abs(scale.value - drive.truth.scale) < 3.3 * scale.sigma
 
 
+def test_an_imu_said_to_be_without_noise_is_not_believed_so():
+    drive, config, leg = made(**SHORT)
+    zero = with_settings(config, {f'imu.{name}': 0.0 for name in (
+        'gyro_noise', 'gyro_bias', 'gyro_bias_walk', 'accel_noise', 'accel_bias',
+        'accel_bias_walk', 'gyro_scale_sigma')})
+    method = smooth(leg, zero)
+    assert Code.IMU_WORSE_THAN_GRADE in codes(method)
+    assert np.abs(off(drive, method)).max() < 3.3
+
+
+def test_an_imu_that_is_silent_at_rest_is_not_taken_for_perfect():
+    drive, config, leg = made(**SHORT)
+    w_b, f_b = leg.w_b.copy(), leg.f_b.copy()
+    for begin, end in leg.standstills:      # as one with a dead band, or a simulator's
+        rest = (leg.t_imu >= begin) & (leg.t_imu <= end)
+        w_b[rest], f_b[rest] = 0.0, f_b[rest].mean(axis=0)
+    method = smooth(replace(leg, w_b=w_b, f_b=f_b), config)
+    assert np.abs(off(drive, method)).max() < 3.3
+
+
 def test_the_gyro_scale_is_believed_as_it_is_set():
     _, config, leg = made(**SHORT)
     for asked, believed in ((np.nan, 2e-3), (0.02, 0.02), (0.0, 1e-5)):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.problem import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
@@ -17,11 +18,11 @@ WIDEN = 2.0            # factor on the sigmas where the model does not hold
 def mismatch(problem, fit, neighbours, config):
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
-    grade = grade_of(config.imu)
+    own = sensor_noise(grade_of(config.imu))
     level = fit.levels.roots()
-    worse = [f'{what} {level[name] / own:.1f} times' for name, own, what in (
-        ('gyro', grade.gyro_noise, 'gyro noise'),
-        ('accel', grade.accel_noise, 'accelerometer noise')) if level[name] > WORSE * own]
+    worse = [f'{what} {level[name] / own[name]:.1f} times' for name, what in (
+        ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
+        if level[name] > WORSE * own[name]]
     worse += [f'{what} {np.max(now / own):.1f} times' for now, own, what in (
         (np.abs(fit.state.gyro_bias[0]), problem.priors.gyro_bias, 'gyro bias'),
         (np.abs(fit.state.accel_bias[0]), problem.priors.accel_bias, 'accelerometer bias'))

@@ -35,6 +35,9 @@ SPACING = 1.0        # s between keyframes
 ROAD = 0.01          # m/sqrt(s), what slip and slide are believed to be at first
 LEAST_ROAD = 2e-4    # m/sqrt(s) along
 LEAST_FIX = 0.005    # m
+# noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
+# (or a simulator's) is silent at rest
+LEAST_SENSOR = {'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7}
 NO_SCALE = 1e-5      # relative, of the accelerometer: as good as none, until the fit is judged
 # of a gyro in use: a chip of the first two grades may be as far off as grades.GRADES has it, which
 # is what its maker guarantees; the drive's turns tell, and the belief gives way up to 30 times
@@ -73,10 +76,9 @@ class Problem:
         root = whitener(covariance, np.isnan(leg.fixes_n[use, 2]))
         q = leg.travel.quantum
         floor = max(q**2 / 12, (1e-3 / leg.rough_scale)**2)
-        values = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2,
-                  'gyro_walk': grade.gyro_bias_walk**2, 'accel_walk': grade.accel_bias_walk**2,
-                  'along': ROAD**2, 'along_hard': ROAD**2, 'travel': floor, 'fix': 1.0,
-                  'fix_up': 1.0, 'slow': fix_sigma**2, 'slow_up': 4 * fix_sigma**2}
+        values = {name: sigma**2 for name, sigma in sensor_noise(grade).items()}
+        values |= {'along': ROAD**2, 'along_hard': ROAD**2, 'travel': floor, 'fix': 1.0,
+                   'fix_up': 1.0, 'slow': fix_sigma**2, 'slow_up': 4 * fix_sigma**2}
         angle = turned(leg, imu)
         slide = least_slide(angle)**2
         values |= dict.fromkeys(SIDEWAYS, max(ROAD**2, slide))
@@ -154,6 +156,13 @@ class Sums:
                     and np.abs(c[:3]).max() < NEAR_FORWARD)
 
 
+def sensor_noise(grade) -> dict[str, float]:
+    """Return the roots of the Imu's noise levels by its grade, SI: white ones and walks."""
+    stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
+              'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
+    return {name: max(sigma, LEAST_SENSOR[name]) for name, sigma in stated.items()}
+
+
 def at_rest(imu, leg, still) -> dict:
     """Return white noise levels of gyro and accelerometer as standstills show them."""
     turn = np.add.reduceat(imu.turn, imu.key[:-1])
@@ -174,7 +183,8 @@ def at_rest(imu, leg, still) -> dict:
         freedom += len(run) - 2
     if freedom < LEAST_REST:
         return {}
-    return {'gyro': float(sums[0] / freedom), 'accel': float(sums[1] / freedom)}
+    return {name: max(float(total / freedom), LEAST_SENSOR[name]**2)
+            for name, total in zip(('gyro', 'accel'), sums, strict=True)}
 
 
 def shaken(imu) -> dict:
