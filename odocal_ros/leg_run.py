@@ -9,6 +9,7 @@ from odocal_ros.align import align
 from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
+from odocal_ros.calib.facing import axes_reasons, facing
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
@@ -56,8 +57,8 @@ class LegRun:
 
     What methods read: leg, inputs, config, origin, fixes_n (k, 3) m, fix_sigma m, nominal and
     rough (scale, 0 or None unknown), lever_b (3,) m, spans (standstills), alignment, track,
-    distance m, t_fit s (fixes after it are held out); ``reasons`` takes what they find of the
-    data.
+    distance m, t_fit s (fixes after it are held out), facing (of the Imu, None unseen);
+    ``reasons`` takes what they find of the data.
     """
 
     def __init__(self, leg, inputs, config, reasons, alignment, holdout=False):
@@ -75,11 +76,12 @@ class LegRun:
         self.rough = rough_scale(inputs.travel, inputs.t_fix, self.fixes_n,
                                  self.fix_sigma) or self.nominal
         self.alignment, self.about_alignment, self.of_ends = alignment, (), ()
+        self.facing = None
         self.lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
 
     def result(self) -> LegResult:
         """Return what the leg gives, however far it carries."""
-        if not self._moves():
+        if not (self._moves() and self._faces_forward()):
             return leg_result(self.leg, self.inputs, self.reasons)
         self._prepare()
         methods, paths = {}, {}
@@ -163,6 +165,14 @@ class LegRun:
             return False
         self.reasons += uncovered(inputs.travel, inputs.t_stop)
         return True
+
+    def _faces_forward(self):
+        """Tell whether the body frame is near enough to forward-left-up, and say where not."""
+        inputs = self.inputs
+        self.facing = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, self.rough)
+        found = axes_reasons(self.facing, self.config.imu.nominal_yaw)
+        self.reasons += found
+        return Code.IMU_AXES not in {r.code for r in found}
 
     def _prepare(self):
         """Align, reckon and judge the drive."""

@@ -15,6 +15,7 @@ from odocal_ros.calib.check import (
     stray,
     track_check,
 )
+from odocal_ros.calib.facing import toward
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.slip import find_slips, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
@@ -71,8 +72,9 @@ class TwoPointRun:
 
     def _slips(self, chord, f):
         """Return slips of the mean between the marks, s and m; name those not named already."""
-        t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track, f,
-                             self.run.origin.latitude, self.inputs.travel.quantum)
+        t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
+                             toward(self.run.facing, f), self.run.origin.latitude,
+                             self.inputs.travel.quantum)
         one = self.run.wheel_slips      # of one wheel: half of it goes into the mean
         known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
         held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
@@ -169,8 +171,9 @@ class TwoPointRun:
             self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
 
     def _reversed(self, chord):
-        if not chord.alignment.heading_separable and chord.M[:2, 0] @ chord.M[:2, 0] > 0 \
-                and self.track.s[-1] < self.track.s[0]:
+        """Say that the odometer counts down where nothing tells how the Imu is pushed."""
+        backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
+        if backwards and self.run.facing is None and not chord.alignment.heading_separable:
             self.run.reasons.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive '
                 'counts mean backwards, or the vehicle was reversed all the way'))

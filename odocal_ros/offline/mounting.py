@@ -6,13 +6,12 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.facing import LEAST, pushes
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 
-BIN = 1.0                      # s, accelerations are compared as means over it
 SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
 NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it
-LEAST = 20                     # bins
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,30 +78,10 @@ def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
     In the level plane, as complex numbers, f = e^(i theta) (dv/dt + i v w_up) + bias: speeding up
     pushes forward, turning pushes to the inside. One least-squares angle fits both.
     """
-    t0, t1 = max(t[0], travel.t[0]) + BIN, min(t[-1], travel.t[-1]) - BIN
-    if t1 - t0 < LEAST * BIN:
+    found = pushes(t, w_i, f_i, up_i, travel, metres_per_unit)
+    if found is None:
         return None, np.pi
-    edges = np.arange(t0, t1, BIN)
-    cell = np.searchsorted(edges, t) - 1
-    inside = (cell >= 0) & (cell < len(edges) - 1)
-    count = np.bincount(cell[inside], minlength=len(edges) - 1)
-    use = count > 0
-    mean_of = [np.bincount(cell[inside], column[inside], len(edges) - 1) / np.maximum(count, 1)
-               for column in (*f_i.T, w_i @ up_i)]
-    f, w_up = np.stack(mean_of[:3], -1), mean_of[3]
-    wide = np.array([-BIN / 2, BIN / 2])
-    speed_at = [(travel.at(edges + x + BIN / 2) - travel.at(edges + x - BIN / 2))
-                * metres_per_unit / BIN for x in wide]
-    speed = np.mean(speed_at, axis=0)
-    middle = (edges[:-1] + edges[1:]) / 2
-    v = (speed[:-1] + speed[1:]) / 2
-    dv = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
-        * metres_per_unit / BIN**2
-    e1 = np.cross(up_i, np.eye(3)[int(np.argmin(np.abs(up_i)))])
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(up_i, e1)
-    A = (dv + 1j * v * w_up)[use]
-    F = (f @ e1 + 1j * (f @ e2))[use]
+    A, F = found.onward + 1j * found.inward, found.force
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
     if len(A) < LEAST or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
@@ -114,7 +93,7 @@ def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
     if sigma > SURE:
         return None, sigma
     theta = np.angle(gain)
-    return np.cos(theta) * e1 + np.sin(theta) * e2, sigma
+    return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma
 
 
 def _quarter_turns():
