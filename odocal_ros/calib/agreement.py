@@ -5,6 +5,7 @@ import math
 
 from odocal_ros.calib.choice import ORDER
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 
 LOOSE = 3.0     # sigmas of the difference, as if independent: methods that share data differ less
@@ -47,11 +48,12 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
             if a is None or b is None or a.value is None or b.value is None:
                 continue
             sigma = math.hypot(a.sigma, b.sigma)
-            if abs(b.value - a.value) > LOOSE * sigma:
-                off = (f'{(b.value / a.value - 1) * 1e6:+.0f} ppm' if name == 'scale_factor'
-                       else f'{math.degrees(b.value - a.value):+.3f} deg')
+            apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
+            if abs(apart) > LOOSE * sigma:
+                off = (f'{apart / a.value * 1e6:+.0f} ppm' if name == 'scale_factor'
+                       else f'{math.degrees(apart):+.3f} deg')
                 found.append(Reason(
                     Code.METHODS_DISAGREE, f'{word} by {other.name} differs from that by '
-                    f'{better.name} by {off}, {abs(b.value - a.value) / sigma:.1f} sigma; likely '
+                    f'{better.name} by {off}, {abs(apart) / sigma:.1f} sigma; likely '
                     f'cause: {CAUSES[name][other.name]}'))
     return found

@@ -6,6 +6,7 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, total_covariance
 from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
 DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
@@ -85,6 +86,9 @@ def _combine(parameter, i, have):
     relative = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in have])
     y = np.log(x) if relative else x
+    angle = have[0].estimates[parameter].unit == 'rad'
+    if angle:       # of an Imu that faces backwards they lie about +-pi
+        y = x - ((x - x[0]) - wrap(x - x[0]))
     own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
                     for r in have])
     own = np.maximum(own, 1e-18)
@@ -105,7 +109,8 @@ def _combine(parameter, i, have):
         variance *= factor**2
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter} differs between the {len(y)} legs '
                           f'{factor:.1f} times more than their sigmas allow'),)
-    return float(np.exp(mean) if relative else mean), float(variance), shared, reasons
+    mean = np.exp(mean) if relative else wrap(mean) if angle else mean
+    return float(mean), float(variance), shared, reasons
 
 
 def _effect(result, name, i):

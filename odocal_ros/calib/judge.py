@@ -21,8 +21,9 @@ def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
                                       f'{scale.unit} is {100 * off:+.1f} % from the nominal '
                                       f'{nominal_scale:.6g}'))
     if yaw.value is not None and yaw.sigma > config.verdict.max_yaw_sigma:
-        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {57.29578 * yaw.sigma:.3f} '
-                              f'deg, {57.29578 * config.verdict.max_yaw_sigma:.3f} deg asked'))
+        sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
+        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '
+                              'deg asked'))
     return tuple(reasons)
 
 

@@ -1,12 +1,15 @@
 """Legs that are not of one vehicle, or not of one set of settings: they have no mean."""
 
+from dataclasses import replace
+import math
+
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
 SURE = 5.0           # sigmas
 MOST_SCALE = 0.05    # tyres: wear 2 %, pressure and load 1 %, another make 3 %
 MOST_YAW = 0.087     # rad (5 deg): no mounting gives way so far
-DEG = 57.29578
 
 
 def unlike_legs(numbered) -> tuple[Reason, ...]:
@@ -29,12 +32,15 @@ def unlike_legs(numbered) -> tuple[Reason, ...]:
         (a, low), (b, high) = far
         found.append(f'the scale of leg {b} is {100 * (high.value / low.value - 1):.1f} % above '
                      f'that of leg {a}')
-    far = _farthest([(n, e) for n, leg in numbered if (e := leg_estimates(leg).get(
-        'yaw_mounting_angle')) is not None and e.value is not None])
+    yaws = [(n, e) for n, leg in numbered if (e := leg_estimates(leg).get(
+        'yaw_mounting_angle')) is not None and e.value is not None]
+    # of an Imu that faces backwards they lie about +-180 deg
+    far = _farthest([(n, replace(e, value=float(wrap(e.value - yaws[0][1].value))))
+                     for n, e in yaws])
     if far and far[1][1].value - far[0][1].value > MOST_YAW:
         (a, low), (b, high) = far
-        found.append(f'the yaw mounting of leg {b} is {DEG * (high.value - low.value):.1f} deg '
-                     f'above that of leg {a}')
+        found.append(f'the yaw mounting of leg {b} is '
+                     f'{math.degrees(high.value - low.value):.1f} deg above that of leg {a}')
     return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: more than one vehicle with one '
                    'mounting changes between drives'),) if found else ()
 

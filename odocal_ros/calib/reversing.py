@@ -8,6 +8,7 @@ that only once the stretch is long beside their noise; a few metres are enough f
 
 import numpy as np
 
+from odocal_ros.calib.sanity import G
 from odocal_ros.reasons import Code, Reason
 
 STEP = 0.1          # s, grid
@@ -18,7 +19,6 @@ STANDS = 0.02       # of the top speed: below it is a stop
 COUNTS = 20.0       # counts a second at top speed, below which a counter shows no acceleration
 SURE = 5.0          # sigmas
 ALIKE = (0.5, 2.0)  # of the usual ratio: a start that is like the others
-G = 9.81            # m/s^2
 
 
 def reversed_starts(travel, t_imu, w_b, f_b, between, signed=True) -> tuple[Reason, ...]:

@@ -13,6 +13,7 @@ import math
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
+from odocal_ros.nav.angles import wrap
 from odocal_ros.output.stored import Stored
 
 CHANGED = 3.0        # sigmas of the difference: by chance once in 370 times
@@ -132,6 +133,8 @@ def _difference(name, stored, since, index) -> Difference | None:
     a, b = stored[since], stored[index]
     old, new = a.estimates[name], b.estimates[name]
     change = new.value - old.value
+    if name in ANGLES:      # of an Imu that faces backwards they lie about +-pi
+        change = float(wrap(change))
     if old.sigma is None or new.sigma is None:
         return Difference(since, change, None, None, None)
     sigma = math.hypot(old.sigma, new.sigma)

@@ -62,6 +62,14 @@ def test_better_legs_weigh_more():
     assert e.value == pytest.approx(0.0102 * 0.9 + 0.010 * 0.1)
 
 
+def test_yaws_about_half_a_turn_have_a_mean_there():
+    legs = [method(yaw=np.pi - 1e-4), method(yaw=1e-4 - np.pi), method(yaw=2e-4 - np.pi)]
+    combined = combine_method('two_point', legs)
+    assert combined.reasons == ()
+    # -1, 1 and 2 times 1e-4 beyond half a turn
+    assert combined.estimates[YAW].value == pytest.approx(2e-4 / 3 - np.pi, abs=1e-12)
+
+
 def test_a_shared_error_of_opposite_effect_cancels():
     """An antenna that is off by as much on the way there and back leaves the mean alone."""
     def with_antenna(sign):

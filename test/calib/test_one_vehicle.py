@@ -45,6 +45,12 @@ def test_a_mounting_that_was_moved():
     assert text.startswith('the yaw mounting of leg 1 is 6.0 deg above that of leg 2')
 
 
+def test_an_imu_that_faces_backwards_is_one_vehicle():
+    assert said(leg(1, yaw=179.9 * DEG), leg(2, yaw=-179.9 * DEG)) == []
+    text, = said(leg(1, yaw=177 * DEG), leg(2, yaw=-177 * DEG))
+    assert text.startswith('the yaw mounting of leg 2 is 6.0 deg above that of leg 1')
+
+
 def test_both_are_said_in_one():
     text, = said(leg(1), leg(2, scale=0.03, yaw=0.5))
     assert ' and the yaw mounting of leg 2 is ' in text

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 
 import pytest
 
@@ -65,6 +66,12 @@ def test_a_change_is_measured_in_sigmas_of_the_difference(compare):
     assert second['to_first']['sigmas'] == pytest.approx(16.0)
     assert whole['sentence'].startswith('scale factor changed by +0.4 % (16.0 sigma) since ')
     assert whole['sentence'].endswith(CAUSES['scale'])
+
+
+def test_a_yaw_about_half_a_turn_changes_by_the_short_way(compare):
+    _, _, found = changes(compare, content(yaw=math.pi - 1e-4),
+                          content(yaw=1e-4 - math.pi, start=2 * START))
+    assert found['yaw_mounting_angle'][1]['to_first']['change'] == pytest.approx(2e-4)
 
 
 def test_a_small_change_of_scale_is_told_in_ppm(compare):
