@@ -10,6 +10,7 @@ from odocal_ros.calib.wheels.planar import planar_leg
 from odocal_ros.calib.wheels.ranges import ranges_of
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
+from odocal_ros.calib.wheels.unseen import drawn_out
 from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
@@ -18,6 +19,7 @@ from odocal_ros.reasons import Code, Reason
 
 ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
                      'and odometer.right name them')
+UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED, Code.REVERSING_UNSIGNED}
 
 
 def wheels(run):
@@ -68,7 +70,8 @@ def _leg(run) -> WheelLeg | None:
         t_start=ends[0], t_stop=ends[1], alignment=run.alignment, lever_b=run.lever_b,
         nominal=run.nominal, rough=run.rough, scale_unit=inputs.scale_unit,
         interval=float(np.median(np.diff(left.t))), doubt=(inputs.doubt_t, inputs.doubt_sigma),
-        slips=(slips.t, slips.size))
+        slips=drawn_out(slips.begin, slips.end, slips.size), uneven=bool(slips.change) or bool(
+            UNEVEN & {r.code for r in run.reasons}))
 
 
 def _search(run, leg, pitch):

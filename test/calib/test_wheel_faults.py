@@ -41,13 +41,20 @@ def prepared(**options):
 
 
 def faults(options, left=lambda s: s, right=lambda s: s, swap=False, prepare=prepared, **more):
-    """Return reasons and slips of a drive whose ways of left and right are changed."""
+    """
+    Return reasons and slips of a drive whose ways of left and right are changed.
+
+    sides : also that a drive without turns does not tell the sides.
+    """
+    also = set() if more.pop('sides', False) else {Code.ODOMETER_CHOSEN}
     inputs, track, latitude, metres = prepare(**options)
     wheels = [replace(w, s=change(w.s)) for w, change in (
         (inputs.travel_left, left), (inputs.travel_right, right))]
     imu = inputs.t_imu, inputs.w_b, inputs.f_b
-    return wheel_faults(*wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
-                        more.pop('rough', 1.0) * metres, **more)
+    reasons, slips = wheel_faults(
+        *wheels[::-1 if swap else 1], imu, (0.0, inputs.t_stop), track, latitude,
+        more.pop('rough', 1.0) * metres, **more)
+    return tuple(r for r in reasons if r.code not in also), slips
 
 
 def spun(options, at, length, size):
@@ -154,10 +161,13 @@ def test_swapped_wheels_are_told_by_the_gyro():
         assert faults(options)[0] == ()
 
 
-def test_a_drive_without_turns_does_not_tell_swapped_wheels():
-    reasons, _ = faults({'scenario': 'straight', 'duration': 300.0, 'two_wheels': True},
-                        swap=True)
-    assert reasons == ()
+@pytest.mark.parametrize('swap', [False, True])
+def test_a_drive_without_turns_does_not_tell_swapped_wheels_and_says_so(swap):
+    straight = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True}
+    (reason,), _ = faults(straight, swap=swap, sides=True)
+    assert reason.code is Code.ODOMETER_CHOSEN
+    assert 'no turn tells whether' in reason.text
+    assert faults(TOWN, sides=True)[0] == ()
 
 
 @pytest.mark.parametrize(('scenario', 'seeds'), [('straight', 50), ('town', 10)])
@@ -214,6 +224,33 @@ def test_a_wheel_that_slips_on_and_on_is_said(side):
     assert '% (+-' in reason.text
     assert ('more' if side == 'right' else 'less') in reason.text
     assert not len(slips.t)
+
+
+@pytest.mark.parametrize('begin', [18.0, 120.0])
+def test_a_slow_slip_is_no_ratio_of_the_drive(begin):
+    """Half a per cent for 45 s of 250: a line through all of it takes a part of the slip."""
+    options = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True, 'seed': 15}
+    (reason,), slips = faults(options, left=spun(options, begin, 45.0, -2.9))
+    assert reason.code is Code.WHEEL_SLIP
+    # what rounding may do at the ends of each wheel, and the tenth at begin and end
+    assert abs(abs(slips.size[0]) - 2.9) < 0.3 + 4 * COUNT
+    assert abs(slips.begin[0] - begin) < 0.2 * 45
+    assert abs(slips.end[0] - begin - 45) < 0.2 * 45
+    assert not slips.change
+
+
+@pytest.mark.parametrize('share', [0.25, 0.75])
+def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
+    options = TOWN | {'seed': 3}
+
+    def slips_on(s):
+        return s + np.floor(0.01 * np.maximum(s - share * s[-1], 0.0))
+    (reason,), slips = faults(options, right=slips_on)
+    assert f'after about {100 * share:.0f} % of the way' in reason.text
+    percent = float(reason.text.split('comes to count ')[1].split()[0])
+    assert abs(percent - 1.0) < 0.1
+    # either part may be the right one: as far off as 1 % of the shorter or of the longer one
+    assert 0.005 < slips.change / 2 < 0.0075
 
 
 def test_one_counter_sent_twice_is_no_second_wheel():

@@ -32,6 +32,7 @@ class WheelLeg:
     nominal, rough : scale of the mean of both counts as configured (0: unknown), and by fixes.
     doubt : (t, sigma) s, scale units of the mean: travel lost in gaps and resets.
     slips : (t, size) s, m: what an Imu saw the wheels spin.
+    uneven : a wheel fails, or the ratio of both changes on the way, as was said already.
     """
 
     origin: Origin
@@ -52,6 +53,7 @@ class WheelLeg:
     interval: float = 0.05
     doubt: Events = field(default_factory=_none)
     slips: Events = field(default_factory=_none)
+    uneven: bool = False
 
 
 def positions(leg: WheelLeg, t, k_left, k_right, heading_error, pitch=0.0):

@@ -4,7 +4,6 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, HEIGHT_UNKNOWN, total_covariance
 from odocal_ros.calib.result import Estimate, MethodResult, Source
-from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
 from odocal_ros.calib.wheels.model import GYRO, HEADING, LATENCY, RATIO, SCALE, WIDTH
 from odocal_ros.calib.wheels.observable import (
@@ -19,6 +18,7 @@ from odocal_ros.calib.wheels.observable import (
     without_turns,
 )
 from odocal_ros.calib.wheels.solution import Solution
+from odocal_ros.calib.wheels.unseen import solve_with_slips
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.earth import A
@@ -53,7 +53,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
         return refused(leg, Reason(Code.WHEEL_DEAD, f'the {" and the ".join(dead)} wheel does not '
                                    'count between the marks'))
     try:
-        solution = solve(leg, config, turn_rate)
+        solution, slipped = solve_with_slips(leg, config, turn_rate)
     except np.linalg.LinAlgError:
         return refused(leg, Reason(Code.NOT_CONVERGED, 'the equations of both wheels have no '
                                    'solution'))
@@ -68,6 +68,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
                                    f'{100 * sigma[SCALE]:.2g} %'))
     reasons = separable(solution, sigma[RATIO], config, turn_rate)
     apart = not reasons
+    reasons = slipped + reasons
     told, why = width_told(solution, sigma[WIDTH], config.odometer.track_width)
     heading = float(wrap(solution.state.heading))
     about_heading = judge_heading(leg, heading, config)

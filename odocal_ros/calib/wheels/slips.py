@@ -31,6 +31,11 @@ TURN_DOUBT = 0.01     # of the track width, in turns: scrub, camber, gyro scale,
 CHANCE = 5.0          # log of the odds at which a wheel is named
 BEFORE = 1.0          # s each side of a slip that acceleration is looked at
 QUIET = 0.1           # rad, turn within which acceleration tells the wheel
+SLOPE = 200           # steps over which the slope of the difference is taken
+LATE = 2.0            # s each side of a slip that may be part of it
+SHORT = 1 / 16        # of the way: a slip of less is no change of the wheels
+STEEP = 2.0           # times a change of the ratio, from where on a slip beside it stands out
+TOLD = 0.1            # m, least way by which going on would have shown
 SHARE = 4             # of a slip's half, what the mean must at least part from the Imu by
 
 
@@ -41,7 +46,7 @@ class WheelSlips:
 
     begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
     wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
-    change : of the ratio right over left, from the first half of the way to the second.
+    change : of the ratio right over left at some place, as much as at half the way does the same.
     """
 
     begin: NDArray[np.float64]
@@ -102,11 +107,17 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     reasons = swapped(x[1] * per_right, np.sqrt(covariance[1, 1]) * per_right,
                        track_width)
     reasons += unlike(ratio, track_width or abs(x[1]) * per_right, max_deviation)
-    found, change = changed(two, signals, metres_per_unit)
-    reasons += found
+    quantum_m = per_right * (1 + ratio) / 2
     apart = (two.right - signals @ x) * per_right         # m, what turn and ratio leave
     width = track_width or abs(x[1]) * per_right
-    events = _events(two, apart, per_right * (1 + ratio) / 2, width)
+    events, lasting = _events(two, apart, quantum_m, width)
+    found, change = changed(_without(two, events), signals, metres_per_unit)
+    reasons += found
+    # what seemed a change and is none is a slip; beside one only what is far steeper is
+    events = sorted(events + lasting)
+    if change:
+        steep = STEEP * abs(change) * metres_per_unit
+        events = [e for e in events if abs(_slope(two, e)) > steep]
     if not events:
         return reasons, replace(NO_SLIPS, change=change)
     mean = (two.left * ratio + two.right) / 2 * per_right
@@ -115,8 +126,38 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     return reasons + _slip_reason(slips), slips
 
 
+def _level(two, apart, quantum_m):
+    """
+    Return the difference of the ways, m, without the slope it has on most of the way.
+
+    Rounding at a steady speed makes slopes too, of two counts over a window at most: they stay.
+    """
+    way = _way(two)
+    run, climb = way[SLOPE:] - way[:-SLOPE], apart[SLOPE:] - apart[:-SLOPE]
+    if len(run) < SLOPE:
+        return apart
+    moves = run > max(np.median(run) / 2, 2 * two.quantum)
+    slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
+    doubt = 2 * quantum_m * (two.quantum > 0) / max(np.median(run), 1e-9)
+    return apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * way
+
+
+def _without(two, events):
+    """Return the wheels with the cells of slips not known."""
+    known = two.known.copy()
+    for begin, end, _ in events:
+        known &= (two.t[1:] < begin - LATE) | (two.t[:-1] > end + LATE)
+    return replace(two, known=known)
+
+
 def _events(two, apart, quantum_m, width):
-    """Return (begin, end, size) of each jump of the difference: s, s, m, in order."""
+    """
+    Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
+
+    apart : m, what turn and ratio leave of the difference; the ratio as most of the way has it is
+    taken off here. Those that are over, and those that may be a change of the ratio.
+    """
+    apart = _level(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
     mean = (total[MEAN:] - total[:-MEAN]) / MEAN
     unknown = np.append(0, np.cumsum(~two.known))
@@ -132,13 +173,41 @@ def _events(two, apart, quantum_m, width):
         for k in np.flatnonzero(far):
             hits[k + MEAN:k + span] = True
         windows.append((span, jump, limit, far))
-    return [_measured(two, apart, windows, a, b) for a, b in runs(hits)]
+    over, lasting = [], []
+    for a, b in runs(hits):
+        event = _measured(two, apart, windows, a, b)
+        (over if _ends(two, apart, event) else lasting).append(event)
+    return over, lasting
+
+
+def _ends(two, apart, event):
+    """Tell whether a slip is over: short, or the wheels go on after it as they did before it."""
+    way = _way(two)
+    begin, end = np.interp(event[:2], two.t, way)
+    if end - begin < SHORT * way[-1]:
+        return True
+    at = np.searchsorted(two.t, event[:2]).clip(0, len(way) - 1)
+    for a, b in ((0, at[0]), (at[1], len(way) - 1)):
+        would, does = _slope(two, event) * (way[b] - way[a]), apart[b] - apart[a]
+        if abs(would) < TOLD or abs(does) > abs(would) / 2:
+            return False
+    return True
+
+
+def _slope(two, event):
+    """Return the size of a slip by the way it took, seen from a tenth to nine tenths of it."""
+    begin, end = np.interp(event[:2], two.t, _way(two))
+    return 0.8 * event[2] / max(end - begin, 1e-9)
+
+
+def _way(two):
+    return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
 
 
 def _limit(two, jump, span, quantum_m, width):
     """Return how far each jump between two means may go by chance, m."""
     n, ends = len(jump), span + MEAN - 1
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
+    way = _way(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
     run = way[ends:][:n] - way[:n]
     spread = np.zeros(n)

@@ -18,7 +18,8 @@ TRACK = 3.0           # m, sigma of a track width that is not told
 LATE = 0.05           # s, sigma of the delay between wheels, and of wheels to Imu
 LOAD = 2e-3           # s^2/m, sigma of the change of rolling radius by sideways acceleration
 NARROW = 0.1          # m: a track of less is no track
-CHANGE = 2e-3         # of the wheels' ratio from half to half of the way: tyres warm up alike
+CHANGE = 2e-3         # of the wheels' ratio on the rest of the way: tyres warm up alike
+SPLITS = np.arange(1, 8) / 8      # of the way, where the ratio is looked at for a change
 
 
 def signals_of(two, metres_per_unit):
@@ -62,7 +63,11 @@ def swapped(width, sigma, track_width):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count alike in turns, too: turn and '
                        f'difference of the wheels give a track width of {width:.3f} m, +-'
                        f'{sigma:.2g} m, as if one counter were sent twice'),)
-    if width + SURE * sigma > 0 or width > -NARROW:
+    if width - SURE * sigma <= 0 < width + SURE * sigma:
+        return (Reason(Code.ODOMETER_CHOSEN, 'no turn tells whether the left wheel and the right '
+                       f'one are exchanged (track width by turns {width:.2f} +- {sigma:.2g} m): '
+                       'the sides are taken as named'),)
+    if width > -NARROW:
         return ()
     return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
                    f'difference of the wheels give a track width of {width:.2f} m, +-'
@@ -70,23 +75,37 @@ def swapped(width, sigma, track_width):
 
 
 def changed(two, signals, metres_per_unit):
-    """Say that the wheels' ratio is not the same in both halves of the way; by how much, or 0."""
+    """
+    Say that the wheels' ratio is not the same before and after some place of the way.
+
+    Returns
+    -------
+    Reasons; what the sigmas are to hold, as a change of the ratio at half the way, 0 for none.
+
+    """
     way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
-    middle = int(np.searchsorted(way, way[-1] / 2))
-    late = np.where(np.arange(len(way)) > middle, two.left - two.left[middle], 0.0)
-    x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
-    if x is None or x[0] <= 0:
+    best = (0.0, 0.0, 0.0, 0)
+    for share in SPLITS:
+        at = int(np.searchsorted(way, share * way[-1]))
+        late = np.where(np.arange(len(way)) > at, two.left - two.left[at], 0.0)
+        x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
+        if x is None or x[0] <= 0:
+            continue
+        change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
+        if abs(change) > max(CHANGE, SURE * sigma) and abs(change) / sigma > best[0]:
+            best = (abs(change) / sigma, float(change), share, at)
+    odds, change, share, at = best
+    if not change:
         return (), 0.0
-    change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
-    if abs(change) <= max(CHANGE, SURE * sigma):
-        return (), 0.0
-    return (Reason(Code.WHEEL_SLIP, f'from the first half of the way to the second, at '
-                   f't = {two.t[middle]:.0f} s, the right wheel comes to count '
-                   f'{100 * abs(change):.2f} % (+-{100 * sigma:.2f}) '
-                   f'{"more" if change > 0 else "less"} on the way of the left one, against the '
-                   'gyro: a wheel that slips all along, or loses air. Which half is right nothing '
-                   f'tells: the sigma of the scale holds {25 * abs(change):.2f} % for it, that of '
-                   f'each wheel {50 * abs(change):.2f} %'),), float(change)
+    # before it as likely as after it: the fit lies between, (1 - share) of the change from before
+    held = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
+    return (Reason(Code.WHEEL_SLIP, f'from t = {two.t[at]:.0f} s on, after about '
+                   f'{100 * share:.0f} % of the way, the right wheel comes to count '
+                   f'{100 * abs(change):.2f} % (+-{100 * abs(change) / odds:.2f}) '
+                   f'{"more" if change > 0 else "less"} on the way of the left one, '
+                   'against the gyro: a wheel that slips all along, or loses air. Which part is '
+                   f'right nothing tells: the sigma of the scale holds {25 * abs(held):.2f} % for '
+                   f'it, that of each wheel {50 * abs(held):.2f} %'),), held
 
 
 def unlike(ratio, width, limit):
