@@ -10,7 +10,7 @@ from odocal_ros.calib.wheels.planar import planar_leg
 from odocal_ros.calib.wheels.ranges import ranges_of
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
-from odocal_ros.calib.wheels.unseen import drawn_out
+from odocal_ros.calib.wheels.unseen import drawn_out, with_unseen
 from odocal_ros.delay_note import note_delays
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
@@ -41,6 +41,8 @@ def wheels(run):
     method = fit_wheels(leg, run.config)
     if method.estimates['scale_factor'].value is None:
         return method, None
+    # the methods that follow hold them too
+    run.wheel_slips = with_unseen(run.wheel_slips, method.details['slips'])
     note_delays(run, {'gnss': (method.details['fix_latency_seen'],
                                method.details['fix_latency_sigma'])})
     found = _search(run, leg, method.details['pitch']['value'])

@@ -10,7 +10,9 @@ from wheel_legs import wheel_leg
 
 from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.result import fit_wheels
-from odocal_ros.calib.wheels.unseen import drawn_out, unseen_slip
+from odocal_ros.calib.wheels.slips import NO_SLIPS
+from odocal_ros.calib.wheels.unseen import drawn_out, unseen_slip, with_unseen
+from odocal_ros.pipeline import calibrate
 from odocal_ros.reasons import Code
 
 SIZE = 0.23          # m
@@ -44,8 +46,10 @@ def slipped(one, side, size=SIZE):
 def test_the_step_that_stands_out_has_place_size_and_sign(side, size):
     one = made()
     found = unseen_slip(solve(wheel_leg(slipped(one, side, size), settings(one)), settings(one)))
-    t, seen, sigma, wheel = found
-    assert abs(t - turn_begins(one) - 2.5) < 5.0          # a bin is 2.4 s, the slip 5 s
+    (begin, end), seen, sigma, wheel = found
+    middle = turn_begins(one) + 2.5
+    assert abs((begin + end) / 2 - middle) < 5.0          # a bin is 2.4 s, the slip 5 s
+    assert end - begin < 10.0
     if wheel < 0:       # fixes of 1.5 m do not tell which wheel: a slip of the other is as good
         seen = abs(seen) * np.sign(size)
     # a step is no ramp: 2.5 s of either end
@@ -70,7 +74,7 @@ def test_rtk_fixes_name_the_wheel():
     one = made(fix_noise='rtk')
     for side in (0, 1):
         leg = wheel_leg(slipped(one, side, 0.6), settings(one))
-        assert unseen_slip(solve(leg, settings(one)))[3] == side
+        assert unseen_slip(solve(leg, settings(one)))[-1] == side
 
 
 def test_nothing_stands_out_of_clean_drives_nor_near_known_slips():
@@ -80,7 +84,7 @@ def test_nothing_stands_out_of_clean_drives_nor_near_known_slips():
     one = made()
     solution = solve(wheel_leg(slipped(one, 1), settings(one)), settings(one))
     found = unseen_slip(solution, [turn_begins(one)])
-    assert found is None or abs(found[0] - turn_begins(one)) > 30.0
+    assert found is None or abs(found[0][0] - turn_begins(one)) > 30.0
 
 
 def test_wheels_that_are_known_to_fail_are_not_searched():
@@ -111,3 +115,30 @@ def test_a_slip_of_seconds_seen_by_the_gyro_is_held_with_fixes_of_centimetres():
         for name, true in zip(('scale_factor', 'scale_factor_left', 'scale_factor_right'),
                               (one.truth.scale, *one.truth.wheel_scales), strict=True):
             assert abs(e[name].value - true) < 4 * e[name].sigma
+
+
+def test_slips_of_both_kinds_come_in_order_of_time():
+    seen = [{'t': 30.0, 'duration': 4.0, 'metres': -0.5, 'wheel': 'right'},
+            {'t': 9.0, 'duration': 1.0, 'metres': 0.2, 'wheel': 'one of them'}]
+    slips = with_unseen(with_unseen(NO_SLIPS, seen[:1]), seen[1:])
+    assert slips.begin.tolist() == [9.0, 30.0]
+    assert slips.end.tolist() == [10.0, 34.0]
+    assert slips.size.tolist() == [0.2, -0.5]
+    assert slips.wheel.tolist() == [0, 1]
+
+
+def test_a_slow_slide_in_town_is_in_the_sigma_of_the_smoother_too():
+    one = drive(**ROUTE | {'imu_grade': 'industrial', 'duration': 283.0}, seed=413)
+    leg = one.leg()
+    wheel = leg.odometer
+    way = np.clip((seconds(leg, wheel) - 78.2) / 46.8, 0, 1) * -2.74
+    leg = replace(leg, odometer=replace(wheel, value=wheel.value + np.floor(
+        way / one.options.scale).astype(np.int64)))
+    result = calibrate(leg, settings(one, method='auto', odometer__track_width=1.6))
+    (slip,) = result.methods['wheels'].details['slips']
+    assert slip['wheel'] == 'left'
+    assert abs(slip['t'] + slip['duration'] / 2 - 101.5) < 10.0
+    for method in ('wheels', 'smoother'):
+        e = result.methods[method].estimates['scale_factor']
+        # what a slide of 2.7 m of one wheel makes of the mean, known to its size
+        assert abs(e.value - one.truth.scale) < 2 * e.sigma

@@ -53,7 +53,8 @@ def without_turns(solution: Solution):
     values = np.linalg.eigvalsh(wheels / np.outer(size, size))
     size = np.sqrt(np.diag(normal))
     rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
-    return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(rest[1, 1]) / size[1])
+    variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not told at all
+    return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])
 
 
 def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reason, ...]:

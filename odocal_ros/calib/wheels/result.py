@@ -53,7 +53,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
         return refused(leg, Reason(Code.WHEEL_DEAD, f'the {" and the ".join(dead)} wheel does not '
                                    'count between the marks'))
     try:
-        solution, slipped = solve_with_slips(leg, config, turn_rate)
+        solution, slipped, slips = solve_with_slips(leg, config, turn_rate)
     except np.linalg.LinAlgError:
         return refused(leg, Reason(Code.NOT_CONVERGED, 'the equations of both wheels have no '
                                    'solution'))
@@ -95,7 +95,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
         'gyro_bias_z': _gyro_bias(leg, solution)}
     return MethodResult('wheels', tuple(reasons), estimates, PARAMETERS, sources,
                         _details(leg, solution, covariance, sources, (K, left, right, 1.0, 1.0),
-                                 config))
+                                 slips))
 
 
 def refused(leg, reason) -> MethodResult:
@@ -179,7 +179,7 @@ def _gyro_bias(leg, solution):
     return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
 
 
-def _details(leg, solution: Solution, covariance, sources, scale, config):
+def _details(leg, solution: Solution, covariance, sources, scale, slips):
     state, noise = solution.state, solution.noise
     condition, ratio_sigma = without_turns(solution)
     used = solution.fit.use[:2 * len(solution.eq.turn)]
@@ -204,6 +204,7 @@ def _details(leg, solution: Solution, covariance, sources, scale, config):
         'fix_latency_sigma': float(np.sqrt(covariance[LATENCY, LATENCY])),
         'gyro_scale_seen': {'value': state.gyro_scale, 'sigma': float(np.sqrt(
             covariance[GYRO, GYRO]))},
+        'slips': slips,        # those that only this fit sees
         'slip_walk': float(np.sqrt(solution.turns.slip)),
         'count_noise': float(np.sqrt(solution.turns.counts)),   # 1: each row rounds anew
         'heading_source': leg.alignment.heading_source,

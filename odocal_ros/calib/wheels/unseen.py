@@ -1,8 +1,8 @@
 """
 Slips of one wheel that only the whole fit sees: in turns the gyro alone takes them for the turn's.
 
-A step of one wheel's way, tried at every place against all that was fitted. Fixes, the turns
-elsewhere and the gyro hold against it, each by its weight, so that a step no larger than what the
+A slip of one wheel, tried at every place against all that was fitted. Fixes, the turns
+elsewhere and the gyro hold against it, each by its weight, so that one no larger than what the
 noise makes is none. What is found joins the slips of the leg, and the fit is made again.
 """
 
@@ -19,6 +19,8 @@ APART = 5.0          # of z^2, by which one wheel is named before the other
 NEAR = 30.0          # s from a slip that is known: its begin and end are no others
 MOST = 4             # slips looked for
 AROUND = 0.5         # s each side of a slip that may be part of it
+LENGTHS = (0.0, 8.0, 20.0, 45.0)     # s, of the slips looked for
+SHORT = 5.0          # s, of which begin and end are not told apart
 STEP = 1.0           # s between the steps that make a slip
 SIDES = ('left', 'right')
 
@@ -38,21 +40,21 @@ def solve_with_slips(leg, config, turn_rate=True):
 
     Returns
     -------
-    Solution, None where the fixes are too few; reasons.
+    Solution, None where the fixes are too few; reasons; the slips for calibration.json.
 
     """
-    solution, reasons = solve(leg, config, turn_rate), ()
-    while turn_rate and solution and not leg.uneven and len(reasons) < MOST:
+    solution, seen = solve(leg, config, turn_rate), []
+    while turn_rate and solution and not leg.uneven and len(seen) < MOST:
         found = unseen_slip(solution, leg.slips[0])
         if found is None:
             break
-        t, size, sigma, wheel = found
-        reasons += (_said(t, size, sigma, wheel),)
+        (begin, end), size, _, _ = found
+        seen.append(found)
         bin_s = np.diff(solution.bins.edges[:2])
-        more = drawn_out(t - bin_s, t + bin_s, [size])
+        more = drawn_out(begin - bin_s, end + bin_s, [size])
         leg = replace(leg, slips=tuple(map(np.append, leg.slips, more)))
         solution = solve(leg, config)
-    return solution, reasons
+    return solution, tuple(_said(*found) for found in seen), tuple(map(_slip, sorted(seen)))
 
 
 def drawn_out(begin, end, size):
@@ -72,46 +74,90 @@ def drawn_out(begin, end, size):
 
 def unseen_slip(solution, known_t=()):
     """
-    Return the step of one wheel that stands out most: t s, size and sigma m, wheel; or None.
+    Return the slip of one wheel that stands out most: (begin, end) s, size and sigma m, wheel.
 
     size > 0 where the wheel ran farther than the ground.   wheel : 0 left, 1 right, -1 either.
-    known_t : s, of slips that are known already.
+    known_t : s, of slips that are known already.   None where nothing stands out.
     """
-    edges, eq, fit = solution.bins.edges, solution.eq, solution.fit
-    at = np.sort(np.append(edges[1:-1], (edges[:-1] + edges[1:]) / 2))
-    for t in known_t:
-        at = at[np.abs(at - t) > NEAR]
-    if not len(at):
-        return None
-    columns = _columns(at, edges, eq)[fit.use]                  # (u, 2, m)
-    flat = columns.reshape(len(columns), -1)
+    best = None
+    for length in LENGTHS:
+        spans, columns, turn = _ramps(solution, length)
+        if not len(spans):
+            continue
+        far = np.ones(len(spans), bool)
+        for t in known_t:
+            far &= (spans[:, 1] < t - NEAR) | (spans[:, 0] > t + NEAR)
+        z, size = _scores(solution.fit, columns)
+        usual = SURE * np.hypot(BLUR, TURN_DOUBT * solution.state.width * turn)
+        score = np.where(far & (np.abs(z) > SURE) & (np.abs(size) > usual), np.abs(z), 0.0)
+        k, j = np.unravel_index(np.argmax(score), score.shape)
+        if score[k, j] > (best[0] if best else 0.0):
+            wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > APART else -1
+            best = (score[k, j], tuple(map(float, spans[j])), float(size[k, j]),
+                    float(size[k, j] / z[k, j]), wheel)
+    return best and best[1:]
+
+
+def _scores(fit, columns):
+    """Return the size of each slip by all observations, in sigmas and m: (2, m) each."""
+    flat = columns[fit.use].reshape(fit.use.sum(), -1)
     weight = np.einsum('uk,uk->k', flat, fit.P @ flat)
+    weight = np.maximum(weight, 1e-9 * weight.max() + 1e-30)
     pull = fit.left @ flat
-    floor = 1e-9 * weight.max()
-    z = (np.sign(pull) * np.sqrt(pull**2 / np.maximum(weight, floor))).reshape(2, -1)
-    size = (pull / np.maximum(weight, floor)).reshape(2, -1)
-    here = np.clip(np.searchsorted(edges, at) - 1, 0, len(edges) - 2)
-    turn = np.abs(eq.yaw[np.minimum(here + 2, len(edges) - 1)] - eq.yaw[np.maximum(here - 1, 0)])
-    usual = SURE * np.hypot(BLUR, TURN_DOUBT * solution.state.width * turn)
-    told = (np.abs(z) > SURE) & (np.abs(size) > usual)
-    if not told.any():
-        return None
-    k, best = np.unravel_index(np.argmax(np.where(told, np.abs(z), 0.0)), z.shape)
-    wheel = int(k) if z[k, best]**2 - z[1 - k, best]**2 > APART else -1
-    return float(at[best]), float(size[k, best]), float(size[k, best] / z[k, best]), wheel
+    return ((pull / np.sqrt(weight)).reshape(2, -1), (pull / weight).reshape(2, -1))
 
 
-def _columns(at, edges, eq):
-    """Return what 1 m of slip of the left and of the right wheel does, (3N, 2, m)."""
-    since = np.clip((edges[1:, None] - at) / np.diff(edges)[:, None], 0.0, 1.0)
-    axis = eq.forward[np.clip(np.searchsorted(edges, at) - 1, 0, len(edges) - 2)]
-    level = [-since * axis[:, k] / 2 for k in (0, 1)]
-    return np.stack([np.concatenate([*level, sign * since]) for sign in (1.0, -1.0)], axis=1)
+def _ramps(solution, length):
+    """
+    Return the slips of a length, s, that grow with the way, and what 1 m of each does.
+
+    Returns
+    -------
+    (m, 2) s, begin and end; (3N, 2, m) of the left and of the right wheel; (m,) rad turned there.
+
+    """
+    edges, eq = solution.bins.edges, solution.eq
+    half = (edges[1] - edges[0]) / 2
+    at = edges[0] + half * np.arange(1, 2 * (len(edges) - 1))
+    n = max(1, round(length / half))                        # steps that make a ramp
+    if n > len(at) // 3:
+        return np.empty((0, 2)), None, None
+    here = np.clip(((at - edges[0]) / (2 * half)).astype(int), 0, len(edges) - 2)
+    way = np.maximum(eq.length[here], 1e-6)
+    total = np.append(0.0, np.cumsum(way))
+    since = np.clip((edges[1:, None] - at) / (2 * half), 0.0, 1.0)
+    level = [-since * eq.forward[here, k] / 2 for k in (0, 1)]
+    steps = np.stack([np.concatenate([*level, sign * since]) for sign in (1.0, -1.0)], axis=1)
+    summed = np.concatenate([np.zeros((*steps.shape[:2], 1)), np.cumsum(steps * way, -1)], -1)
+    columns = (summed[..., n:] - summed[..., :-n]) / (total[n:] - total[:-n])
+    spans = np.stack([at[:len(at) - n + 1], at[n - 1:]], -1)
+    yaw = np.append(0.0, np.cumsum(np.abs(np.diff(eq.yaw))))
+    turn = np.interp(spans[:, 1] + 2 * half, edges, yaw) - np.interp(
+        spans[:, 0] - 2 * half, edges, yaw)
+    return spans, columns, turn
 
 
-def _said(t, size, sigma, wheel):
+def _slip(found):
+    (begin, end), size, sigma, wheel = found
+    return {'t': begin, 'duration': end - begin, 'metres': size, 'sigma': sigma,
+            'wheel': (*SIDES, 'one of them')[wheel]}
+
+
+def with_unseen(known, seen):
+    """Return WheelSlips with those of calibration.json after them, in order of time."""
+    begin = np.append(known.begin, [s['t'] for s in seen])
+    order = np.argsort(begin, kind='stable')
+    end = np.append(known.end, [s['t'] + s['duration'] for s in seen])
+    wheel = [{'left': -1, 'right': 1}.get(s['wheel'], 0) for s in seen]
+    return replace(known, begin=begin[order], end=end[order],
+                   size=np.append(known.size, [s['metres'] for s in seen])[order],
+                   wheel=np.append(known.wheel, wheel)[order].astype(np.int64))
+
+
+def _said(span, size, sigma, wheel):
     which = 'one of the wheels parts from the other' if wheel < 0 else (
         f'the {SIDES[wheel]} wheel {"spins" if size > 0 else "slides"}')
+    when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < SHORT else (
+        f'between t = {span[0]:.0f} and {span[1]:.0f} s')
     return Reason(Code.WHEEL_SLIP, f'{which} by {100 * abs(size):.0f} cm (+-{100 * sigma:.1f}) '
-                  f'about t = {t:.0f} s, as turns and fixes before and after tell; the sigmas '
-                  'hold it')
+                  f'{when}, as turns and fixes before and after tell; the sigmas hold it')
