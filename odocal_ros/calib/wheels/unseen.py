@@ -21,6 +21,7 @@ MOST = 4             # slips looked for
 AROUND = 0.5         # s each side of a slip that may be part of it
 LENGTHS = (0.0, 8.0, 20.0, 45.0)     # s, of the slips looked for
 SHORT = 5.0          # s, of which begin and end are not told apart
+TAIL = 0.15          # of a slip seen from a tenth to nine tenths, each side
 STEP = 1.0           # s between the steps that make a slip
 SIDES = ('left', 'right')
 
@@ -50,8 +51,8 @@ def solve_with_slips(leg, config, turn_rate=True):
             break
         (begin, end), size, _, _ = found
         seen.append(found)
-        bin_s = np.diff(solution.bins.edges[:2])
-        more = drawn_out(begin - bin_s, end + bin_s, [size])
+        bin_s = float(solution.bins.edges[1] - solution.bins.edges[0])
+        more = drawn_out([begin - bin_s], [end + bin_s], [size])
         leg = replace(leg, slips=tuple(map(np.append, leg.slips, more)))
         solution = solve(leg, config)
     return solution, tuple(_said(*found) for found in seen), tuple(map(_slip, sorted(seen)))
@@ -66,7 +67,9 @@ def drawn_out(begin, end, size):
     """
     t, steps = [], []
     for a, b, whole in zip(begin, end, size, strict=True):
-        at = np.linspace(a - AROUND, b + AROUND, 2 + int(np.ceil((b - a + 2 * AROUND) / STEP)))
+        around = AROUND + TAIL * (b - a)
+        n = 2 + int((b - a + 2 * around) / STEP)
+        at = np.linspace(a - around, b + around, n)
         t.append(at)
         steps.append(np.full(len(at), whole / np.sqrt(len(at))))
     return np.concatenate([*t, []]), np.concatenate([*steps, []])
