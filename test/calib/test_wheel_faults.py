@@ -16,7 +16,8 @@ from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.reasons import Code
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screen import screen
 
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
@@ -297,3 +298,20 @@ def test_wheels_of_other_resolution_are_said_with_what_the_mean_then_is():
     # factors 1.004 apart: the right wheel weighs 0.6657, 0.1657 of 1.6 m off the middle
     assert 'a point 0.27 m right of the middle' in reason.text
     assert faults(TOWN, right=lambda s: 1.3 * s)[0] == ()
+
+
+def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
+    """The track goes straight on where the fixes turn: its best scale is a third off."""
+    made = drive(**TOWN, seed=3)
+    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w * [1, 1, 0]))
+    method = calibrate(leg, settings(made, method='wheels')).methods['wheels']
+    assert method.verdict is Verdict.REJECTED
+    assert Code.TRACK_MISMATCH in {r.code for r in method.reasons}
+
+
+def test_a_gyro_of_noise_ends_in_reasons_too():
+    """Heights left out in the last round: what was solved with them has another length."""
+    made = drive(**TOWN, seed=3, imu_grade='industrial')
+    noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
+    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
+    assert calibrate(leg, settings(made, method='wheels')).methods['wheels'].reasons

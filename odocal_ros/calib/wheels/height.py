@@ -57,7 +57,9 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
     r = np.nan_to_num(r + L @ state.phi[:, :2].T.ravel())
     X = np.stack([np.ones(n), eq.by[:, 2, 3]], -1)
     known = L @ Q @ L.T
+    keep = use
     for _ in range(3):
+        use = keep
         V = known + _fix_noise(leg, bins, r, use)
         found = _solve(V, r, X, use, L @ Q, state)
         if found is None:
@@ -66,7 +68,7 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
         far = use & (off > OUTLIER)
         if not far.any():
             break
-        use = use & ~far
+        keep = use & ~far
     sigma = float(np.sqrt(covariance[1, 1]))
     pitch = state.pitch + float(delta[1])
     if sigma > KNOWN * PITCH_PRIOR or abs(pitch) > PITCH_LIMIT:

@@ -16,6 +16,7 @@ BETTER = 0.5         # of the belief's sigma: what counts as learned
 SCALE_LIMIT = 0.1    # relative sigma beyond which there is no scale
 HEADING_LIMIT = 0.5  # rad
 NOISY = 1.25         # times the stated sigma: worth saying
+WILD, LOST = 5.0, 0.01     # times the stated sigma, and of the way: no track at all
 BACKWARDS = np.deg2rad(160.0)
 FAR = np.deg2rad(20.0)
 
@@ -123,6 +124,14 @@ def judge_fit(solution: Solution) -> tuple[Reason, ...]:
     if noise > NOISY:
         reasons += (Reason(Code.FIXES_NOISIER_THAN_SAID, f'the fixes stray {noise:.1f} times as '
                            'far from the track as their covariance says'),)
+    n = len(solution.eq.turn)
+    residual = solution.residual[:2 * n][solution.fit.use[:2 * n]]
+    rms, way = np.sqrt(2 * (residual**2).mean()), solution.eq.length.sum()
+    if noise > WILD and rms > LOST * way:
+        reasons += (Reason(Code.TRACK_MISMATCH, f'with the best factors the track is {rms:.1f} m '
+                           f'rms from the fixes on {way:.0f} m, {noise:.1f} times as far as they '
+                           'say: the gyro does not turn as the vehicle does, or the fixes are '
+                           'bad'),)
     if not solution.height.known:
         reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height good enough for '
                            f'the pitch; taken as 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg'),)
