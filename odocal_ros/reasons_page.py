@@ -59,14 +59,14 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up: '
         'travel backwards was taken for travel forwards.',
         Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '
-        'mean backwards, or the Imu faces backwards.',
+        'mean backwards, or the Imu faces backwards. Or speeding up pushes the Imu backwards.',
         Code.ODOMETER_STILL: 'The fixes move on, the counter stays.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro turns much farther or faster than '
         'a vehicle does: g, deg/s or another unit.',
         Code.IMU_LOOKS_Z_DOWN: 'Gravity shows on -z, as on an Imu whose axes are '
         'forward-right-down. It was turned over for this result.',
-        Code.IMU_AXES: 'Gravity shows on another axis than z: the body frame is not '
-        'forward-left-up.',
+        Code.IMU_AXES: 'Gravity shows on another axis than z, or speeding up pushes the Imu to a '
+        'side: the body frame is not forward-left-up.',
         Code.IMU_WORSE_THAN_GRADE: 'At rest the gyro is ten times noisier than its grade, or '
         'more. Sigmas that come from the grade are then too small.',
         Code.GYRO_SIGN: 'Where the fixes turn left the gyro turns right.',

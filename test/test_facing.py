@@ -38,7 +38,6 @@ def test_it_is_seen_in_town_on_hills_and_on_a_straight_road(yaw, options):
 def test_a_gyro_of_the_wrong_sign_does_not_turn_it():
     made = town(1.0)
     found = seen(made, gyro=-1.0)
-    # the turns are no longer told apart from noise only where they fit: the sigma says how well
     assert abs(wrap(found.yaw - 1.0 * DEG)) < 3 * found.sigma
     assert found.sigma < 3 * DEG
 
@@ -66,7 +65,13 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
     back, = axes_reasons(Facing(-179 * DEG, 1 * DEG), np.nan)
     assert back.code is Code.ODOMETER_REVERSED
     assert axes_reasons(Facing(-179 * DEG, 1 * DEG), np.pi) == ()      # as the settings have it
-    assert axes_reasons(Facing(0.0, 1 * DEG), np.pi)[0].code is Code.ODOMETER_REVERSED
+    # said as it is seen, whatever the nominal
+    ahead, = axes_reasons(Facing(0.0, 1 * DEG), np.pi)
+    assert ahead.code is Code.ODOMETER_REVERSED
+    assert 'pushes the Imu forwards (yaw mounting +0 deg, +-1, nominal +180)' in ahead.text
+    ahead, = axes_reasons(Facing(0.0, 1 * DEG), 90 * DEG)
+    assert ahead.code is Code.IMU_AXES
+    assert 'pushes the Imu forwards' in ahead.text
 
 
 def test_only_a_far_forward_axis_is_turned():

@@ -4,6 +4,7 @@ from itertools import combinations
 import math
 
 from odocal_ros.calib.choice import ORDER
+from odocal_ros.calib.judge import share
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -50,8 +51,8 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
             sigma = math.hypot(a.sigma, b.sigma)
             apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
             if abs(apart) > LOOSE * sigma:
-                off = (f'{apart / a.value * 1e6:+.0f} ppm' if name == 'scale_factor'
-                       else f'{math.degrees(apart):+.3f} deg')
+                off = (share(apart / a.value, '+') if name == 'scale_factor' else
+                       f'{math.degrees(apart):+.3f} deg')
                 found.append(Reason(
                     Code.METHODS_DISAGREE, f'{word} by {other.name} differs from that by '
                     f'{better.name} by {off}, {abs(apart) / sigma:.1f} sigma; likely '

@@ -21,6 +21,7 @@ GAIN = 0.5, 2.0                # of the push by what the wheels say: else it is 
 FAR = np.deg2rad(75.0)         # off the nominal: no mounting is meant so
 NEAR = np.deg2rad(10.0)        # off what a method takes for forward: no matter for slips
 BACKWARDS = np.deg2rad(150.0)  # an odometer that runs the other way looks so too
+WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +76,7 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
     mean_of = [np.bincount(cell[inside], column[inside], len(edges) - 1) / np.maximum(count, 1)
                for column in (*f.T, w @ up)]
     f, turn_rate = np.stack(mean_of[:3], -1), mean_of[3]
-    speed_at = [(travel.at(edges + x + BIN / 2) - travel.at(edges + x - BIN / 2))
-                * metres_per_unit / BIN for x in (-BIN / 2, BIN / 2)]
-    speed = np.mean(speed_at, axis=0)
+    speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
     middle = (edges[:-1] + edges[1:]) / 2
     onward = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
         * metres_per_unit / BIN**2
@@ -85,8 +84,7 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(up, e1)
     use = np.flatnonzero(count)
-    return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use],
-                  ((speed[:-1] + speed[1:]) / 2 * turn_rate)[use],
+    return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use], (speed * turn_rate)[use],
                   np.diff(use, prepend=-9) == 1)
 
 
@@ -142,13 +140,15 @@ def axes_reasons(found: Facing | None, nominal_yaw) -> tuple[Reason, ...]:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
     off = abs(float(wrap(found.yaw - nominal)))
+    way = WAYS[round(found.yaw / (np.pi / 2)) % 4]
     seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
+    if nominal:
+        seen += f', nominal {np.rad2deg(nominal):+.0f}'
     if off > BACKWARDS:
-        return (Reason(Code.ODOMETER_REVERSED, 'speeding up pushes the Imu backwards (yaw '
-                       f'mounting {seen}): positive counts mean backwards, the Imu faces '
-                       'backwards, or all was driven in reverse and the counter does not tell'),)
+        return (Reason(Code.ODOMETER_REVERSED, f'speeding up pushes the Imu {way} (yaw mounting '
+                       f'{seen}): positive counts mean backwards, the Imu faces the other way, or '
+                       'all was driven in reverse and the counter does not tell'),)
     if off < FAR + 3 * found.sigma:
         return ()
-    side = 'left' if found.yaw < 0 else 'right'
-    return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu to the {side} (yaw mounting '
-                   f'{seen}): the body frame is not forward-left-up'),)
+    return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu {way} (yaw mounting {seen}): the '
+                   'body frame is not forward-left-up'),)

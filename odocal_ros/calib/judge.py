@@ -12,8 +12,8 @@ def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
     if scale.value is not None:
         relative = scale.sigma / scale.value
         if relative > config.verdict.max_scale_sigma:
-            reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, f'scale sigma {relative * 1e6:.0f} '
-                                  f'ppm, {config.verdict.max_scale_sigma * 1e6:.0f} ppm asked'))
+            reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, f'scale sigma {share(relative)}, '
+                                  f'{share(config.verdict.max_scale_sigma)} asked'))
         if nominal_scale:
             off = scale.value / nominal_scale - 1
             if abs(off) > config.odometer.max_scale_deviation:
@@ -25,6 +25,12 @@ def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
         reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '
                               'deg asked'))
     return tuple(reasons)
+
+
+def share(relative, sign='') -> str:
+    """Return a relative figure as people say it: in ppm, or in per cent from one on."""
+    return f'{100 * relative:{sign}.1f} %' if abs(relative) >= 0.01 else (
+        f'{1e6 * relative:{sign}.0f} ppm')
 
 
 def nominal_scale(config, unit) -> float:

@@ -7,7 +7,7 @@ from odocal_ros.calib.planned_methods import NOT_PREDICTED, Plan
 from odocal_ros.calib.planned_smoother import SWAY_RATE, WHITE_SHARE
 from odocal_ros.offline.what_helps import ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
-from odocal_ros.output.figures import length, time_span
+from odocal_ros.output.figures import length, share, time_span
 
 PITCH = 'pitch_mounting_angle'
 PARAMETERS = (SCALE, YAW, PITCH)
@@ -87,6 +87,8 @@ def _shown(parameter, sigma):
     if sigma is None:
         return 'unknown'
     if parameter == SCALE:
+        if sigma >= 0.01:
+            return share(sigma)
         return f'{sigma * 1e6:.3g} ppm' if sigma < 1e-3 else f'{sigma * 1e6:.0f} ppm'
     return f'{math.degrees(sigma):.3g} deg'
 

@@ -84,6 +84,8 @@ def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
     assert found.code is Code.METHODS_DISAGREE
     assert 'scale by two_point differs from that by smoother by +2143 ppm, 3.0 sigma' in found.text
     assert 'marks' in found.text
+    (found,) = disagreements(several(method('smoother'), method('two_point', 1.9)))
+    assert 'by -5.0 %, ' in found.text
 
 
 def test_a_yaw_that_differs_points_at_the_heading():
