@@ -93,7 +93,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     def travel(t):
         return leg.travel.at(t + c[ODO_DELAY])
     sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], c[GYRO_SCALE], travel,
-                           f, np.empty(0), derivatives=False)
+                           f, np.empty(0), c[ACCEL_SCALE], derivatives=False)
     for k in range(K):
         on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
     C = on['C_nb']

@@ -35,7 +35,7 @@ class Fixes:
     """
 
     def __init__(self, leg, state, points, intervals, use, later=0.0):
-        self.state, self.points, self.mean_force = state, points, intervals.mean_force
+        self.state, self.points = state, points
         k, tau = points.interval, points.tau[:, None]
         self.k = k
         self.C = state.C_nb[k]
@@ -80,7 +80,7 @@ class Fixes:
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
-        c[:, :, ACCEL_SCALE] = J[:, :, BA][:, :, :2] * self.mean_force[self.k, None, :2]
+        c[:, :, ACCEL_SCALE] = self.C @ self.points.FF
         return J, c
 
 

@@ -129,9 +129,8 @@ class Motion:
         c[:, D, ODO_ARM] = swing @ state.C_bv
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self._faster()
-        # a scale error is a bias in proportion to the turn rate, or to the force
+        # a gyro's scale error is a bias in proportion to the turn rate
         c[:, :, GYRO_SCALE] = a[:, :, BG.start + 2] * s.mean_rate[:, 2:]
         c[:, BG, GYRO_SCALE] = 0.0
-        c[:, :, ACCEL_SCALE] = a[:, :, BA][:, :, :2] * s.mean_force[:, None, :2]
-        c[:, BA, ACCEL_SCALE] = 0.0
+        c[:, V, ACCEL_SCALE], c[:, P, ACCEL_SCALE] = C @ s.F, C @ s.FF
         return c

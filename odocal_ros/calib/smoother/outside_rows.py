@@ -104,7 +104,7 @@ def _velocity(problem, state, points, later):
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, GNSS_DELAY] = faster
     c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * points.rate[:, 2:]
-    c[:, :, ACCEL_SCALE] = J[:, :, BA][:, :, :2] * problem.imu.mean_force()[k, None, :2]
+    c[:, :, ACCEL_SCALE] = C @ points.F
     return Rows('velocity', k, raw, J, c, 1 / sent.sigma)
 
 

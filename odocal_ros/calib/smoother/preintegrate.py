@@ -40,19 +40,25 @@ class Intervals:
     AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
     dv_bg: Floats    # (K, 3, 3) derivative of dv by the gyro bias
     dp_bg: Floats    # (K, 3, 3)
+    F: Floats        # (K, 3, 2) integral of R's x and y columns times their force as measured:
+    #                  d dv = -F d accelerometer scale; not A times the mean force, which may be
+    #                  millimetres off and would tell a scale that nothing tells
+    FF: Floats       # (K, 3, 2) its integral: d dp = -FF d accelerometer scale
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
     S_bg: Floats     # (K, 3, 3) derivative of S @ forward by the gyro bias
     mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
     mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
-    def shifted(self, gyro_bias, accel_bias) -> 'Intervals':
-        """Return the sums for biases that differ a little, (K, 3) each, to first order."""
+    def shifted(self, gyro_bias, accel_bias, accel_scale) -> 'Intervals':
+        """Return the sums for biases, (K, 3), and scales, (2,), that differ a little."""
         turned = -turn(self.A, gyro_bias)
         return replace(
             self, R=exp_so3(turned) @ self.R,
-            dv=self.dv + turn(self.dv_bg, gyro_bias) - turn(self.A, accel_bias),
-            dp=self.dp + turn(self.dp_bg, gyro_bias) - turn(self.AA, accel_bias))
+            dv=self.dv + turn(self.dv_bg, gyro_bias) - turn(self.A, accel_bias)
+            - self.F @ accel_scale,
+            dp=self.dp + turn(self.dp_bg, gyro_bias) - turn(self.AA, accel_bias)
+            - self.FF @ accel_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +70,8 @@ class Points:
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)
     R: Floats        # (m, 3, 3)
+    F: Floats        # (m, 3, 2)
+    FF: Floats       # (m, 3, 2)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
 
@@ -105,13 +113,9 @@ class ImuRows:
         t = leg.t_imu[rows]
         return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
 
-    def mean_force(self) -> Floats:
-        """Return the mean specific force of each interval as measured: (K, 3) m/s^2."""
-        return _mean(self.t, self.f_b, self.key)
-
 
 def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forward, t_points,
-                 derivatives=True):
+                 accel_scale=(0.0, 0.0), derivatives=True):
     """
     Sum up all intervals.
 
@@ -129,8 +133,10 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forwar
         Scale times forward axis, for S_bg.
     t_points : (m,) array
         Times of fixes, rising, within the keyframes.
+    accel_scale : (2,) array
+        Scale errors of the accelerometer's x and y axes, of what is measured, taken out.
     derivatives : bool
-        False: zeros stand in for those that cost most (AA, dv_bg, dp_bg, S_bg).
+        False: zeros stand in for those that cost most (AA, dv_bg, dp_bg, F, FF, S_bg).
 
     Returns
     -------
@@ -147,8 +153,8 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forwar
         rows = slice(key[first], key[last] + 1)
         part = _Chunk(imu.t[rows], imu.f_b[rows], imu.turn[key[first]:key[last]] * unscaled,
                       key[first:last + 1] - key[first], gyro_bias[first:last],
-                      accel_bias[first:last])
-        out.append(part.intervals(travel, forward, derivatives))
+                      accel_bias[first:last], np.append(accel_scale, 0.0), derivatives)
+        out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], owner[mine] - first, first))
     return _joined(Intervals, out), _joined(Points, points)
 
@@ -179,7 +185,7 @@ def _cross(a, M):
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
-    def __init__(self, t, f_b, turn, key, gyro_bias, accel_bias):
+    def __init__(self, t, f_b, turn, key, gyro_bias, accel_bias, accel_scale, derivatives):
         self.t, self.key, self.turn, self.f_b = t, key, turn, f_b
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         dt = self.dt = np.diff(t)
@@ -191,12 +197,18 @@ class _Chunk:
         back = quat_conjugate(q[key[:-1]])[self.own]
         self.Rs = matrix_from_quat(quat_multiply(back, q[:-1]))
         self.Re = matrix_from_quat(quat_multiply(back, q[1:]))
-        bias = accel_bias[self.own]
-        self.a_s = np.einsum('nij,nj->ni', self.Rs, f_b[:-1] - bias)
-        self.a_e = np.einsum('nij,nj->ni', self.Re, f_b[1:] - bias)
+        bias, f = accel_bias[self.own], f_b * (1 - accel_scale)
+        self.a_s = np.einsum('nij,nj->ni', self.Rs, f[:-1] - bias)
+        self.a_e = np.einsum('nij,nj->ni', self.Re, f[1:] - bias)
         self.v, self.dv = self._sums(self.a_s, self.a_e)
         self.p, self.dp = self._twice(self.v, self.a_s, self.a_e)
         self.A_before, self.A = self._sums(self.Rs, self.Re)
+        self.derivatives = derivatives
+        if derivatives:
+            ends = self.F_s, self.F_e = (self.Rs[:, :, :2] * f_b[:-1, None, :2],
+                                         self.Re[:, :, :2] * f_b[1:, None, :2])
+            self.F_before, self.F = self._sums(*ends)
+            self.FF_before, self.FF = self._twice(self.F_before, *ends)
 
     def _widen(self, x, like):
         return x.reshape(-1, *(1,) * (like.ndim - 1))
@@ -216,14 +228,16 @@ class _Chunk:
         dt = self._widen(self.dt, at_start)
         return self._running(before * dt + (2 * at_start + at_end) * (dt**2 / 6))
 
-    def intervals(self, travel, forward, derivatives=True) -> Intervals:
+    def intervals(self, travel, forward) -> Intervals:
         """Return the sums of each interval; without derivatives zeros stand for them."""
         ds = np.diff(travel(self.t)) / 2
         _, S = self._running((self.Rs + self.Re) * self._widen(ds, self.Rs))
         T = np.diff(self.t[self.key])
         _, turn = self._running(self.turn)
         AA = dv_bg = dp_bg = S_bg = np.zeros_like(S)
-        if derivatives:
+        F = FF = np.zeros_like(S[:, :, :2])
+        if self.derivatives:
+            F, FF = self.F, self.FF
             A_after = self.A_before + (self.Rs + self.Re) * self._widen(self.dt / 2, self.Rs)
             _, AA = self._twice(self.A_before, self.Rs, self.Re)
             x_s, x_e = _cross(self.a_s, self.A_before), _cross(self.a_e, A_after)
@@ -232,7 +246,7 @@ class _Chunk:
             turned = _cross(self.Rs @ forward, self.A_before) + _cross(self.Re @ forward, A_after)
             _, S_bg = self._running(turned * self._widen(ds, turned))
         return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, self.A, AA, dv_bg, dp_bg,
-                         S, S_bg, turn / T[:, None], _mean(self.t, self.f_b, self.key),
+                         F, FF, S, S_bg, turn / T[:, None], _mean(self.t, self.f_b, self.key),
                          np.maximum.reduceat(self.dt, self.key[:-1]))
 
     def points(self, t, interval, first) -> Points:
@@ -247,7 +261,14 @@ class _Chunk:
         dv = self.v[j] + (self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 2)[:, None]) * h1
         R = self.Rs[j] + self.Rs[j] @ skew(self.rate_turn[j] * share[:, None])
         force = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * share[:, None]
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, force,
+        F = FF = np.zeros((len(t), 3, 2))
+        if self.derivatives:
+            h2, change = h[:, None, None], self.F_e[j] - self.F_s[j]
+            half, third = share[:, None, None] / 2, share[:, None, None] / 3
+            F = self.F_before[j] + (self.F_s[j] + change * half) * h2
+            FF = self.FF_before[j] + self.F_before[j] * h2 + (
+                self.F_s[j] + change * third) * h2**2 / 2
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, F, FF, force,
                       self.rate_turn[j] / self.dt[j, None])
 
 

@@ -110,9 +110,9 @@ class Problem:
         all_t = np.concatenate(times)
         order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
-            self.imu, state.gyro_bias[:-1],
-            state.accel_bias[:-1] + self.imu.mean_force() * _level(c), c[GYRO_SCALE],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order])
+            self.imu, state.gyro_bias[:-1], state.accel_bias[:-1], c[GYRO_SCALE],
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order],
+            c[ACCEL_SCALE])
         if not self.outside:
             return Sums(state, intervals, points, {})
         points = points.take(np.argsort(order, kind='stable'))
@@ -137,19 +137,20 @@ class Sums:
         gyro = gyro + (a.constants[GYRO_SCALE] - b.constants[GYRO_SCALE]) * (
             self.intervals.mean_rate * [0.0, 0.0, 1.0])
         c = a.constants - b.constants
-        accel = (a.accel_bias - b.accel_bias)[:-1] + self.intervals.mean_force * _level(c)
-        return gyro, accel, c
+        return gyro, (a.accel_bias - b.accel_bias)[:-1], c
 
     def near(self, state):
         """Return intervals for a state nearby, and what they leave to be taken in."""
         gyro, accel, c = self._apart(state)
-        if not (gyro.any() or accel.any()):
+        if not (gyro.any() or accel.any() or c[ACCEL_SCALE].any()):
             return self.intervals, 0.0, c[ODO_DELAY], c[GNSS_DELAY]
-        return self.intervals.shifted(gyro, accel), gyro, c[ODO_DELAY], c[GNSS_DELAY]
+        return (self.intervals.shifted(gyro, accel, c[ACCEL_SCALE]), gyro, c[ODO_DELAY],
+                c[GNSS_DELAY])
 
     def hold_at(self, state) -> bool:
         """Tell whether a state is near enough for first order."""
         gyro, accel, c = self._apart(state)
+        accel[:, :2] += self.intervals.mean_force[:, :2] * c[ACCEL_SCALE]
         return bool(np.abs(gyro).max() < NEAR_GYRO and np.abs(accel).max() < NEAR_ACCEL
                     and abs(c[ODO_DELAY]) < NEAR_ODO_TIME
                     and abs(c[GNSS_DELAY]) < NEAR_GNSS_TIME
@@ -216,8 +217,3 @@ def _priors(config, grade, leg) -> Priors:
     accel_bias = np.full(3, max(grade.accel_bias, 1e-6))
     accel_bias[2] = np.hypot(accel_bias[2], grade.accel_scale_error * G)
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, np.zeros(M))
-
-
-def _level(constants):
-    """Return the accelerometer's scale errors by axis, as a bias in proportion to the force."""
-    return np.append(constants[ACCEL_SCALE], 0.0)
