@@ -85,7 +85,8 @@ def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
     assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is taken'
     both = calibrate(leg, config)
     assert 'wheels' in both.methods
-    assert Code.ODOMETER_CHOSEN not in everything_said(both)
+    # named, but a straight way does not tell whether rightly
+    assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('no turn tells')
     assert result.methods['two_point'].estimates['scale_factor'].value == \
         both.methods['two_point'].estimates['scale_factor'].value
 
