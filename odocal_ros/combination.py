@@ -42,11 +42,12 @@ def combine(legs, config: Config) -> Calibration:
     reasons = _leg_reasons(legs, good, twice, giving, estimates)
     if giving:
         known = {(r.code, r.text) for r in reasons}
+        rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
         own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
                if len(legs) == 1 or r.code is Code.LEGS_DISAGREE]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
-                    if (r.code, r.text) not in known]
+                    if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))
     reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
     if len(good) < config.verdict.min_legs and good:
@@ -88,13 +89,13 @@ def _leg_reasons(legs, good, twice, giving, estimates):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         methods = [leg.methods[n] for n in giving if n in leg.methods]
         own = [*leg.reasons, *(r for m in methods
-                               for r in worth_saying(m.reasons, m.name, estimates)
+                               for r in worth_saying(_further(m, leg), m.name, estimates)
                                if len(legs) == 1 or r.code not in PER_LEG)]
         if leg in twice:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
                                   'covers; not used'))
         elif good and leg not in good:
-            every = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+            every = [*leg.reasons, *(r for m in leg.methods.values() for r in _further(m, leg))]
             reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
                                   + _why(every)))
         else:
@@ -102,8 +103,15 @@ def _leg_reasons(legs, good, twice, giving, estimates):
             reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
                                + _why(m.reasons)) for m in refused]
             reasons += [Reason(r.code, prefix + r.text) for r in own
-                        if not any(r in m.reasons for m in refused)]
+                        if not any(r in m.reasons for m in refused)
+                        and not (refused and r.code is Code.METHOD_REJECTED)]
     return reasons
+
+
+def _further(method, leg):
+    """Return a method's reasons without what rejects the leg already, in other words."""
+    known = {r.code for r in leg.reasons if r.code.gravity is Verdict.REJECTED}
+    return [r for r in method.reasons if r.code not in known]
 
 
 def _why(reasons):

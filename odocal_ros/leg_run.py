@@ -7,7 +7,7 @@ import numpy as np
 
 from odocal_ros.align import align
 from odocal_ros.calib.agreement import disagreements
-from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.calib.choice import choose, deciding, passed_over
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.facing import axes_reasons, facing
 from odocal_ros.calib.judge import nominal_scale
@@ -92,6 +92,7 @@ class LegRun:
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))
         self.reasons += disagreements(methods)
+        self.reasons += passed_over(methods, self.config.method, {r.code for r in self.reasons})
         estimates, _ = choose(methods, self.config.method)
         scale = estimates.get('scale_factor')
         if scale is None or paths.get(scale.method) is None:

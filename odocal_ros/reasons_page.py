@@ -149,6 +149,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'be told from this drive; it stays as configured.',
         Code.MODEL_MISMATCH: 'What is left over after the fit is larger, or more regular, than '
         'the noise that was assumed.',
+        Code.METHOD_REJECTED: 'A method that goes before another, or alone tells left from right '
+        'wheel, found that its values are not to be used; its first reason is given. The result '
+        'is by the others.',
         Code.METHODS_DISAGREE: 'Two methods give values for the same leg that differ by more than '
         'three sigmas of their difference.',
     },

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.reasons import Code, Verdict
+from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'wheels', 'two_point')
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
@@ -62,6 +62,21 @@ def choose(methods: dict[str, MethodResult], asked):
                 estimates[name] = replace(estimate, method=method.name)
     giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
+
+
+def passed_over(methods: dict[str, MethodResult], asked, said=()) -> list[Reason]:
+    """
+    Return METHOD_REJECTED of each method that is rejected while one behind it gives.
+
+    asked : as for ``choose``.   said : codes that the leg says itself.
+    """
+    found = [methods[name] for name in deciding(asked) if name in methods]
+    sound = [i for i, m in enumerate(found) if m.verdict is not Verdict.REJECTED]
+    why = [(m.name, next(r for r in m.reasons if r.code.gravity is Verdict.REJECTED))
+           for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
+    # one that lacks its data (a second wheel) had nothing to go by
+    return [Reason(Code.METHOD_REJECTED, f'{name} is left out, it says {r.code.name}: {r.text}')
+            for name, r in why if r.code not in (Code.NO_METHOD, *said)]
 
 
 def leg_estimates(leg) -> dict[str, Estimate]:

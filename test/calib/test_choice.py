@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.agreement import disagreements, LOOSE
-from odocal_ros.calib.choice import choose, deciding, worth_saying
+from odocal_ros.calib.choice import choose, deciding, passed_over, worth_saying
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.combination import combine
 from odocal_ros.config import Config, with_settings
@@ -75,6 +75,22 @@ def test_reasons_about_a_value_that_another_method_gives_are_not_said():
     assert worth_saying([NO_YAW, REFUSED], 'smoother', alone) == (NO_YAW, REFUSED)
 
 
+def test_a_rejected_method_is_named_where_one_behind_it_gives():
+    fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
+    found, = passed_over(several(method('two_point'), fell), 'auto')
+    assert found.code is Code.METHOD_REJECTED
+    assert found.text == 'smoother is left out, it says CHORD_TOO_SHORT: a loop'
+    # said by the leg already; behind the one that gives; nothing gives; not asked for
+    assert passed_over(several(method('two_point'), fell), 'auto', {REFUSED.code}) == []
+    loop = method('two_point', reasons=[REFUSED])
+    assert passed_over(several(loop, method('smoother')), 'auto') == []
+    assert passed_over(several(loop, fell), 'auto') == []
+    assert passed_over(several(method('two_point'), fell), 'two_point') == []
+    # that there is no second wheel is no fault of the drive
+    none = method('wheels', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
+    assert passed_over(several(none, method('two_point')), 'all') == []
+
+
 def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
     limit = LOOSE * 2**0.5 * 1e-3
     near = several(method('smoother'), method('two_point', 2.0 + 0.99 * limit))
@@ -135,3 +151,25 @@ def test_a_method_rejected_on_every_leg_stays_rejected_in_the_combination():
     whole = combine(legs, Config())
     assert whole.verdict is Verdict.REJECTED
     assert whole.methods['two_point'].verdict is Verdict.REJECTED
+
+
+def test_what_rejects_a_leg_is_said_once():
+    fell = Reason(Code.ODOMETER_REVERSED, 'by the method')
+    rejected = leg(1, method('smoother', reasons=[fell]), method('two_point'),
+                   reasons=[Reason(Code.ODOMETER_REVERSED, 'by the leg')])
+    text, = (r.text for r in combine([rejected, leg(2, method('smoother'))], ALL).reasons
+             if r.code is Code.LEG_REJECTED)
+    assert text == 'leg 1: rejected and not used: by the leg'
+    alone = combine([leg(1, method('smoother', reasons=[fell]), reasons=rejected.reasons)], ALL)
+    assert [r.text for r in alone.reasons if r.code is fell.code] == ['by the leg']
+
+
+def test_a_method_left_out_of_one_leg_of_two_is_said_once():
+    fell = method('smoother', reasons=[REFUSED])
+    one = leg(1, fell, method('two_point'),
+              reasons=passed_over(several(fell, method('two_point')), 'all'))
+    said = combine([one, leg(2, method('smoother'), method('two_point'))], ALL).reasons
+    assert [r.code for r in said if 'a loop' in r.text] == [Code.LEG_REJECTED]
+    said = combine([one], ALL)
+    assert [r.code for r in said.reasons if 'a loop' in r.text] == [Code.METHOD_REJECTED]
+    assert said.verdict is Verdict.CAUTION
