@@ -315,3 +315,14 @@ def test_a_gyro_of_noise_ends_in_reasons_too():
     noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
     assert calibrate(leg, settings(made, method='wheels')).methods['wheels'].reasons
+
+
+def test_a_track_width_that_ends_at_nothing_is_none():
+    """A gyro so noisy that the turns tell no width: 0.1 m is a limit of the search, no result."""
+    made = drive(**TOWN, seed=3, imu_grade='consumer')
+    noise = np.random.default_rng(0).normal(0.0, 0.1, made.imu.w_i.shape)
+    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
+    method = calibrate(leg, settings(made, method='wheels')).methods['wheels']
+    assert method.estimates['track_width'].value is None
+    why = {r.code: r.text for r in method.reasons}[Code.TRACK_WIDTH_NOT_DETERMINED]
+    assert 'as if less than 0.1 m lay between them' in why

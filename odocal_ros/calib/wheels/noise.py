@@ -14,6 +14,7 @@ from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import Bins, Equations, State
 
 ANY_WIDTH = 1.6      # m, of a car: where nothing is known yet
+LEAST_WIDTH = 0.1    # m: less is none
 LOOSE = 3.0          # times the gyro's drift: what a width not known makes of turns
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from odocal_ros.calib.two_point import PITCH_PRIOR
 from odocal_ros.calib.wheels.beliefs import WIDTH_SIGMA
 from odocal_ros.calib.wheels.model import PARAMETERS
+from odocal_ros.calib.wheels.noise import LEAST_WIDTH
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
@@ -76,6 +77,10 @@ def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reaso
 def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ...]]:
     """Tell whether the drive itself tells the track width, and why not where none is given."""
     width = solution.state.width
+    if solution.width_told and width <= LEAST_WIDTH:
+        return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the difference of the wheels does '
+                              f'not follow the turns by gyro: as if less than {LEAST_WIDTH:g} m '
+                              'lay between them'),)
     told = solution.width_told and sigma < WIDTH_SHARE * width
     if told or given:
         return told and (not given or sigma < BETTER * WIDTH_SIGMA * given), ()

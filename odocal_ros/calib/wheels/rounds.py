@@ -21,6 +21,7 @@ from odocal_ros.calib.wheels.model import (
 from odocal_ros.calib.wheels.noise import (
     drift_covariance,
     known_parts,
+    LEAST_WIDTH,
     Part,
     phi_loading,
     quantisation,
@@ -184,7 +185,7 @@ def _stepped(state, fit, height, widen):
     return replace(
         state, scale=state.scale * float(np.exp(np.clip(step[SCALE], -0.5, 0.5))),
         log_ratio=state.log_ratio + float(np.clip(step[RATIO], -0.5, 0.5)),
-        heading=state.heading + float(step[HEADING]), width=max(state.width + widen, 0.1),
+        heading=state.heading + float(step[HEADING]), width=max(state.width + widen, LEAST_WIDTH),
         offset=state.offset + float(step[OFFSET]), pitch=height.pitch,
         start_n=np.append(state.start_n[:2] + step[3:5], height.start),
         phi=np.column_stack([height.phi, fit.phi]), latency=state.latency + float(step[LATENCY]),
