@@ -78,7 +78,8 @@ def parse_set(text: str) -> tuple[str, object]:
         raise BadUsage(str(error)) from None
     if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):
         return name, _checked(name, value.strip(), '--set ')      # a joint may be named 0 or on
-    return name, _checked(name, '' if node is None else _value(node), '--set ')
+    where = '--set ' if name in SETTINGS else '--set: '           # then the setting's name
+    return name, _checked(name, '' if node is None else _value(node), where)
 
 
 def _composed(text, where):

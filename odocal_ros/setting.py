@@ -62,6 +62,7 @@ class Setting:
                 raise BadConfig(f'{self.name}: {value} is not finite')
             below = self.low is not None and value < self.low
             if below or self.high is not None and value > self.high:
+                unit = '' if self.unit == '1' else self.unit
                 raise BadConfig(f'{self.name} = {value:g}: want {self.low:g} to {self.high:g} '
-                                f'{self.unit}'.rstrip())
+                                f'{unit}'.rstrip())
         return value

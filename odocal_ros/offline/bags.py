@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage, OdocalError
 
 
@@ -47,6 +48,14 @@ def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
     if troubles:
         raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used, nothing was '
                        f'calibrated: {"; ".join(troubles)}')
+
+
+def unlike_settings(configs: list[Config]) -> list[str]:
+    """Return the names of the settings that differ between bags, as journals bring their own."""
+    first, *others = [flat(config) for config in configs]
+    # as text: an unset one is NaN, which is not equal to itself
+    return [name for name, value in first.items()
+            if any(repr(other[name]) != repr(value) for other in others)]
 
 
 def told_apart(paths: list[Path], legs: list[list], inputs: list[dict]):

@@ -53,7 +53,7 @@ def run(args) -> int:
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
     from odocal_ros.config import with_settings
-    from odocal_ros.offline.bags import about, look_at_all, once, told_apart
+    from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.pipeline import combine
     paths, again = once([Path(bag) for bag in args.bags])
@@ -61,12 +61,12 @@ def run(args) -> int:
         _tell(args, f'{path} is given twice: it is read once')
     if len(paths) > 1:
         look_at_all(paths, lambda path: _look(path, args))
-    used, legs, inputs, dropped, imu_frame, unit = [], [], [], None, '', None
+    done, dropped, imu_frame, unit = [], None, '', None
     for path in paths:
         journal = journal_notes(path)
-        config = _config(args, journal)
+        own = _config(args, journal)
         try:
-            new, described, frame, unit = _legs_of(path, args, asked, config, journal, unit)
+            new, described, frame, unit = _legs_of(path, args, asked, own, journal, unit)
         except LegDropped as error:
             dropped = error
             if len(paths) > 1:
@@ -76,12 +76,15 @@ def run(args) -> int:
             if len(paths) == 1:
                 raise
             raise BadUsage(about(path, error)) from None
-        used.append(path)
-        legs.append(new)
-        inputs.append(described)
+        done.append((path, own, new, described))
         imu_frame = imu_frame or frame
-    if dropped and not legs:
+    if dropped and not done:
         raise dropped
+    used, configs, legs, inputs = (list(column) for column in zip(*done, strict=True))
+    config = configs[-1]
+    if unlike := unlike_settings(configs):
+        _tell(args, f'{", ".join(unlike)}: not the same in all journals; each leg is computed '
+              f'with its own, limits and files are by those of {used[-1].name}')
     if not config.frames.imu and imu_frame:
         config = with_settings(config, {'frames.imu': imu_frame})
     legs, inputs = told_apart(used, legs, inputs)

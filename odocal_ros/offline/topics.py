@@ -17,6 +17,8 @@ COMMANDS = ('cmd', 'command', 'setpoint', 'target', 'desired')   # asked of a ve
 FUSED = ('filtered', 'fused', 'gps', 'gnss', 'fix', 'global', 'ground_truth', 'ekf')
 GNSS = ('gps', 'gnss', 'fix', 'ublox', 'novatel', 'septentrio')
 
+SENSORS = {'imu': (IMU,), 'heading': (IMU,), 'fix': (FIX,), 'fix_velocity': VELOCITY}
+
 Topics = dict[str, TopicInfo]
 
 
@@ -97,7 +99,7 @@ def _types(slot: str, config: Config) -> Iterable[str]:
     if slot in ('odometer', 'odometer_right'):
         asked = config.odometer.type
         return ODOMETERS if asked == 'auto' else (full_type(asked),)
-    return VELOCITY if slot == 'fix_velocity' else (FIX,) if slot == 'fix' else (IMU,)
+    return SENSORS[slot]
 
 
 def _named(topics: Topics, slot: str, topic: str) -> str:
@@ -107,9 +109,20 @@ def _named(topics: Topics, slot: str, topic: str) -> str:
             if not topics[name].count:
                 raise BadUsage(f'{OPTION[slot]} {topic}: the topic has no message; the bag has '
                                f'{_described(topics, topics)}')
+            if not _may_serve(topics[name].msgtype, slot):
+                raise BadUsage(f'{OPTION[slot]} {topic}: the topic is of {topics[name].msgtype}, '
+                               f'which cannot be the {_label(slot)}; the bag has '
+                               f'{_described(topics, topics)}')
             return name
     raise BadUsage(f'{OPTION[slot]} {topic}: no such topic; the bag has '
                    f'{_described(topics, topics)}')
+
+
+def _may_serve(msgtype: str, slot: str) -> bool:
+    """Return whether a type can be a slot's; odometers may be of a foreign one."""
+    if slot in ('odometer', 'odometer_right'):
+        return full_type(msgtype) not in (IMU, FIX)
+    return full_type(msgtype) in SENSORS[slot]
 
 
 def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str:

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -81,6 +82,28 @@ def test_a_bag_given_twice_is_read_once(bags, tmp_path, capsys):
     told = capsys.readouterr()
     assert 'is given twice: it is read once' in told.err
     assert len(json.loads(told.out)['legs']) == 1
+
+
+def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys, monkeypatch):
+    """A leg that was dropped says nothing, its settings neither."""
+    for name, limit in (('one', 3), ('other', 5), ('dropped', 7)):
+        shutil.copytree(bags / name.replace('dropped', 'one'), tmp_path / name)
+        (tmp_path / name / JOURNAL).write_text(
+            f'/**:\n  ros__parameters:\n    verdict.min_legs: {limit}\n')
+    monkeypatch.setattr('odocal_ros.offline.legs.dropped_legs', lambda bag: bag.name == 'dropped')
+    said = {}
+    for names in ('one', 'one dropped', 'one other'):
+        argv = [str(tmp_path / name) for name in names.split()]
+        main(['replay', *argv, '--method', 'two_point', '--json', '--output',
+              str(tmp_path / f'to {names}')])
+        told = capsys.readouterr()
+        said[names] = told.err
+        result = json.loads(told.out)
+        text, = (r['text'] for r in result['reasons'] if r['code'] == 'MORE_LEGS_NEEDED')
+        assert text.endswith('of 5' if 'other' in names else 'of 3'), names
+    assert 'verdict.min_legs: not the same in all journals' in said['one other']
+    assert 'are by those of other' in said['one other']
+    assert 'not the same' not in said['one dropped'] + said['one']
 
 
 def test_bags_of_one_name_are_named_by_their_paths(bags, tmp_path, capsys):

@@ -51,6 +51,16 @@ def test_missing_lists_what_there_is():
         choose(topics(imu__data=None))
     with pytest.raises(BadUsage, match='--fix-topic /gps: no such topic; the bag has /imu/data'):
         choose(topics(), {'fix': '/gps'})
+    # not as if the others were missing, which it would be taken from
+    with pytest.raises(BadUsage, match='^--imu-topic /fix: the topic is of sensor_msgs/msg/'
+                       'NavSatFix, which cannot be the Imu; the bag has /imu/data'):
+        choose(topics(), {'imu': '/fix'})
+    for slot, topic in (('odometer', '/imu/data'), ('odometer_right', '/fix'),
+                        ('fix', '/odometer'), ('heading', '/fix'), ('fix_velocity', '/odometer')):
+        with pytest.raises(BadUsage, match='which cannot be the '):
+            choose(topics(), {slot: topic})
+    foreign = topics(ticks='my_msgs/msg/Ticks')
+    assert choose(foreign, {'odometer': '/ticks'})['odometer'] == '/ticks'
     with pytest.raises(BadUsage, match='the topic has no message'):
         choose(topics() | {'/gps': TopicInfo('/gps', FIX, 0)}, {'fix': '/gps'})
     with pytest.raises(BadUsage, match='no odometer'):
