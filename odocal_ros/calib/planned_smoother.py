@@ -53,7 +53,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels, problem.priors)
-        priors, _ = scale_priors(fit.priors, fit.solved, None, sigmas.config)
+        priors, _ = scale_priors(fit, None, sigmas.config)
         if priors is not fit.priors:
             fit = _fit(problem, made, levels, priors)
     except (NotPositive, np.linalg.LinAlgError) as error:

@@ -17,7 +17,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.sanity import imu_sanity
 from odocal_ros.calib.smoother import smoother_leg
-from odocal_ros.calib.smoother.accel_scale import judge_scale, with_scales
+from odocal_ros.calib.smoother.accel_scale import judge_running, judge_scale, with_scales
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -158,6 +158,7 @@ class SmootherSoFar:
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
+        best = judge_running(best, config)      # more of a drive tells more of it
         best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
         if not best.settled:
             best = fit(problem, best.state, best.levels, MORE, about=best, trace=trace)

@@ -33,6 +33,16 @@ def test_weights_are_the_evidence_written_out():
     assert prior**2 == pytest.approx(expected, rel=5e-3)
 
 
+@pytest.mark.parametrize('held', [1e-4, GRADE])
+def test_what_was_believed_before_does_not_weigh_twice(held):
+    data, error = 1 / 1e-3**2, 2e-3
+    both = data + 1 / held**2
+    again = believed(np.eye(2) / both, np.full(2, data * error / both), GRADE, BELIEF, held)
+    for now, first in zip(again, believed(*seen(1e-3, error), GRADE, BELIEF), strict=True):
+        # differences of 1e10 leave 1e-6 of 1e6 by rounding
+        np.testing.assert_allclose(now, first, rtol=1e-4)
+
+
 def test_a_drive_that_tells_there_is_none_is_believed():
     prior, weight = believed(*seen(1e-4, 0.0), GRADE, BELIEF)
     assert weight < 0.01
@@ -54,6 +64,18 @@ def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():
         # a belief of none that had given way by steps would hold it to less than its grade
         assert details['posterior_to_prior'][f'accelerometer_scale_{axis}'] == pytest.approx(
             found['sigma'] / error, rel=0.01)
+
+
+def test_of_slow_fixes_an_error_too_small_to_be_told_is_held_too():
+    grade = 0.01
+    drive, config, leg = made(scenario='town', duration=200.0, imu_grade='consumer',
+                              fix_noise='correlated', accel_scale_error=grade / 4, seed=4)
+    result = smooth(leg, with_settings(config, {'imu.accel_scale_sigma': np.nan}))
+    scale = result.estimates['scale_factor']
+    assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma
+    for axis in 'xy':       # believed as large as the grade's, whatever its evidence
+        assert result.details['posterior_to_prior'][f'accelerometer_scale_{axis}'] == (
+            pytest.approx(result.details[f'accelerometer_scale_{axis}']['sigma'] / grade))
 
 
 @pytest.mark.parametrize('noise', ['white', 'correlated'])

@@ -150,6 +150,27 @@ def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(con
     assert last.sigmas[0] > 1.5 * blind.sigmas[0]      # it does decide
 
 
+def test_what_is_believed_of_it_grows_with_what_the_drive_tells(config):
+    error = 3e-3
+    drive = drive_of(accel_scale_error=error)
+    graded = with_settings(config, {'imu.accel_scale_sigma': math.nan})
+    first, later = looked(drive, graded, (40.0, 60.0))
+    assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no fit from nothing
+    leg = SmootherSoFar().look(later.leg, graded)
+
+    def prior(running):
+        details = running.method.details
+        return (details['accelerometer_scale_x']['sigma']
+                / details['posterior_to_prior']['accelerometer_scale_x'])
+
+    assert prior(first.running) < 0.5 * error       # that there is none was not out of the question
+    assert prior(leg) == pytest.approx(error)       # now it is; the grade has such an error
+    assert prior(later.running) == pytest.approx(error)
+    (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
+    assert abs(off) < 0.2           # as of any look that goes on from the last
+    assert ratio == pytest.approx(1.0, abs=0.1)
+
+
 @pytest.mark.parametrize('allowed', [0, 3])
 def test_a_look_gives_up_between_passes_and_the_next_begins_anew(config, looks, allowed):
     so_far, asked = SmootherSoFar(), []
