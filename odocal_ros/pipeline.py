@@ -55,7 +55,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     reasons += sanity
     if z_down:
         inputs = turned_over(inputs)
-    if Code.IMU_AXES in {r.code for r in sanity}:
+    if {Code.NO_IMU, Code.IMU_AXES} & {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
     return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
 

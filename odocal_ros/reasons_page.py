@@ -28,8 +28,8 @@ WEIGHTS = {Verdict.REJECTED: 'rejects', Verdict.CAUTION: 'caution', Verdict.ACCE
 # section: code: when it appears and what it means
 MEANINGS: dict[str, dict[Code, str]] = {
     'The data that came': {
-        Code.NO_IMU: 'No usable Imu message lies between the marks. Without turn rates there '
-        'is no track.',
+        Code.NO_IMU: 'No usable Imu message lies between the marks, or all its turn rates or '
+        'accelerations are zero. Without them there is no track.',
         Code.NO_ODOMETER: 'No usable odometer message lies between the marks: a wrong topic, a '
         'type that is read differently, or a driver that is not running.',
         Code.NO_FIX: 'No position lies between the marks, or none near one of the two marks.',

@@ -279,6 +279,17 @@ def test_g_instead_of_metres_per_second_squared(made, leg):
     sound(result, made.truth)
 
 
+@pytest.mark.parametrize(('silent', 'text'), [
+    ('w_i', 'every turn rate is zero'), ('f_i', 'there is no gravity in the acceleration')])
+def test_an_imu_that_sends_half_of_it_is_refused_before_anything_is_divided(leg, made, silent,
+                                                                             text):
+    none = replace(leg, imu=changed(leg.imu, **{silent: lambda a: 0 * a}))
+    with np.errstate(all='raise'):
+        result, said = run(none, settings(made, method='auto'))
+    assert rejecting(result) == {Code.NO_IMU}
+    assert text in said[Code.NO_IMU]
+
+
 @pytest.mark.parametrize('scenario', ['town', 'straight'])
 def test_degrees_instead_of_radians(made, town, scenario):
     it = town if scenario == 'town' else made

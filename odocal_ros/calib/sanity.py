@@ -7,6 +7,7 @@ from odocal_ros.reasons import Code, Reason
 G = 9.80665
 AXES = 'xyz'
 MAX_RATE = 8.0       # rad/s: no road vehicle turns so fast
+NOTHING = 0.01       # m/s^2, far below what gravity is in any unit
 TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up
 
 
@@ -23,13 +24,21 @@ def imu_sanity(f_b, w_b, C_bi):
 
     Returns
     -------
-    reasons, and whether the body frame must be turned over (z down) to be used.
+    reasons, and whether the body frame must be turned over (z down) to be used. NO_IMU and
+    IMU_AXES: there is nothing to compute with.
 
     """
     mean = np.median(f_b, axis=0)
     size = float(np.linalg.norm(mean))
     fast = float(np.percentile(np.linalg.norm(w_b - np.median(w_b, axis=0), axis=1), 99.9))
     reasons = []
+    if not w_b.any():       # what messages hold that have none
+        reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '
+                              'imu.gyro_scale is 0'))
+    if size < NOTHING:
+        reasons.append(Reason(Code.NO_IMU, 'there is no gravity in the acceleration: the Imu '
+                              'sends none, or without gravity, or imu.accel_scale is 0'))
+        return tuple(reasons), False
     if not 0.85 * G < size < 1.15 * G:
         if 0.85 < size < 1.15:
             what = f'the Imu shows {size:.3f} at rest, as g would: set imu.accel_scale to 9.80665'
@@ -40,8 +49,6 @@ def imu_sanity(f_b, w_b, C_bi):
         reasons.append(Reason(Code.IMU_UNITS, f'the gyro shows {fast:.3g} rad/s, faster than a '
                               'vehicle turns, as deg/s would: set imu.gyro_scale to '
                               '0.017453292519943295'))
-    if size < 1e-3:
-        return tuple(reasons), False
     up = mean / size
     if up[2] > np.cos(TILT):
         return tuple(reasons), False

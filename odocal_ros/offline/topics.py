@@ -85,7 +85,9 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name the node listens to
             return [name for name in found if _last(name) == 'heading']
-        found = [name for name in found if 'heading' in name] or found
+        # the only one is the Imu's
+        alone = len(found) == 1 and 'imu' not in chosen
+        found = [name for name in found if 'heading' in name] or ([] if alone else found)
     elif slot == 'imu':
         found = _unless_all(found, ('heading',))
     elif slot == 'fix':
@@ -136,7 +138,8 @@ def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str
                 f'of {_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
     what = ' or '.join(types) if len(types) < 3 else 'a type that odometers have'
-    return f'no {_label(slot)} (a topic of {what}) in the bag'
+    beside = ' beside that of the Imu' if slot == 'heading' else ''
+    return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'
 
 
 def _described(topics: Topics, names: Iterable[str]) -> str:

@@ -99,6 +99,9 @@ def test_heading():
     with pytest.raises(BadUsage, match='no heading'):
         choose(topics(imu__data=None, imu=IMU), {'imu': '/imu'},
                alignment__heading_source='heading_topic')
+    with pytest.raises(BadUsage, match=r'^no heading \(a topic of sensor_msgs/msg/Imu beside '
+                       r'that of the Imu\) in the bag; the bag has /imu/data'):
+        choose(topics(), alignment__heading_source='heading_topic')      # the Imu is there
     assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
 
 
