@@ -5,18 +5,14 @@ import shlex
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.topics import candidates, choose_topics, OPTION, wanted
+from odocal_ros.offline.topics import candidates, choose_topics, named, OPTION, wanted
 
 COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]):
     """Return slot -> topic, the likeliest where several could be meant; and settings it needs."""
-    chosen = {slot: topic if topic in topics else f'/{topic}'
-              for slot, topic in overrides.items()}
-    for slot, topic in chosen.items():
-        if topic not in topics:      # the sentence that replay says
-            choose_topics(topics, config, {slot: topic})
+    chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     free = candidates(topics, 'odometer', config, chosen)
     sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
     if not config.odometer.left and 'odometer' not in chosen and all(sides) and len(free) == 2:

@@ -42,7 +42,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
         such inputs are named at once, with the option that settles each.
 
     """
-    chosen = {slot: _named(topics, slot, topic) for slot, topic in overrides.items()}
+    chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     troubles: list[str] = []
     for slot in wanted(config):
         if slot in chosen:
@@ -104,7 +104,7 @@ def _types(slot: str, config: Config) -> Iterable[str]:
     return SENSORS[slot]
 
 
-def _named(topics: Topics, slot: str, topic: str) -> str:
+def named(topics: Topics, slot: str, topic: str) -> str:
     """Return the topic that a user named, with or without its leading slash."""
     for name in (topic, f'/{topic}'):
         if name in topics:

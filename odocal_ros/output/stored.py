@@ -62,7 +62,9 @@ def read_stored(path: Path) -> Stored:
         content = json.loads(path.read_text(encoding='utf-8'), parse_constant=_no_constant)
         return _stored(content, name)
     except OSError as error:
-        raise BadUsage(f'{name}: {error.strerror}; give a calibration.json or its folder') \
+        in_folder = isinstance(error, FileNotFoundError) and path != Path(name)
+        why = f'there is no {MAIN} in it' if in_folder else error.strerror
+        raise BadUsage(f'{name}: {why}; give a calibration.json or its folder') \
             from None
     except (ValueError, RecursionError) as error:      # of json, utf-8, or a value below
         why = (str(error).splitlines() or ['nested too deep'])[0]

@@ -226,6 +226,8 @@ def test_what_is_only_helpful_may_be_missing(compare, path, value):
 def test_missing_files_and_single_ones(tmp_path, capsys):
     assert main(['compare', str(tmp_path / 'a'), str(tmp_path / 'b')]) == 2
     assert 'No such file' in capsys.readouterr().err
+    assert main(['compare', str(tmp_path), str(tmp_path)]) == 2
+    assert f'{tmp_path}: there is no calibration.json in it' in capsys.readouterr().err
     (tmp_path / 'calibration.json').write_text(json.dumps(content()))
     assert main(['compare', str(tmp_path)]) == 2
     assert 'two or more' in capsys.readouterr().err

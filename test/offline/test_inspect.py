@@ -329,4 +329,6 @@ def test_topic_named_by_the_user(tmp_path, capsys):
     assert told['mapping']['odometer'] == '/speed'
     assert '--odometer-topic /speed' in told['command']
     assert main(['inspect', str(path), '--fix-topic', '/gps']) == 2
-    assert 'no such topic' in capsys.readouterr().err
+    assert ' --fix-topic /gps: no such topic' in capsys.readouterr().err
+    assert main(['inspect', str(path), '--imu-topic', '/fix']) == 2
+    assert 'which cannot be the Imu' in capsys.readouterr().err
