@@ -123,8 +123,8 @@ class Code(Enum):
     PARAMETER_NOT_DETERMINED = NOTE, 'Drive with turns both ways, stops and starts.'
     MODEL_MISMATCH = CAUTION, ('The residuals are not what the noise model says; the sigmas were '
                                'widened. Check slip, lever arms, delays and the sky.')
-    METHOD_REJECTED = CAUTION, ('Do what is said of the code that it names; the values are by '
-                                'another method, which may not see it.')
+    METHOD_REJECTED = CAUTION, ('Look up in docs/reasons.md what to do about the code named; the '
+                                'values are by another method, which may not see it.')
     METHODS_DISAGREE = CAUTION, ('See the values side by side; the likely cause is named. Drive '
                                  'again with stops at both marks and turns in between.')
     # several legs, several calibrations
