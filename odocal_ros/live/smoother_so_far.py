@@ -2,9 +2,9 @@
 What the smoother makes of the way so far: run on the sketch of a leg, each look from the last.
 
 A look starts from the state, noise levels, beliefs and slips that the one before ended with,
-reckons on over what is new, and is there after two passes. What is decided once for a leg, the
-sort of fix errors, the accelerometer's scale error and where the Imu faces, is decided anew from
-nothing whenever the leg has grown by half.
+reckons on over what is new, and is there after two passes. The accelerometer's scale error is
+judged on the way. What is decided once for a leg, the sort of fix errors and where the Imu faces,
+is decided anew from nothing whenever the leg has grown by half.
 """
 
 from collections.abc import Callable
