@@ -163,7 +163,7 @@ def test_what_is_believed_of_it_grows_with_what_the_drive_tells(config):
         return (details['accelerometer_scale_x']['sigma']
                 / details['posterior_to_prior']['accelerometer_scale_x'])
 
-    assert prior(first.running) < 0.5 * error       # that there is none was not out of the question
+    assert prior(first.running) < 0.5 * error       # there might well be none
     assert prior(leg) == pytest.approx(error)       # now it is; the grade has such an error
     assert prior(later.running) == pytest.approx(error)
     (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
