@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.result import LegResult
-from odocal_ros.calib.sanity import imu_sanity
+from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.combination import combine
 from odocal_ros.config import Config
 from odocal_ros.leg import Leg
@@ -55,7 +55,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     reasons += sanity
     if z_down:
         inputs = turned_over(inputs)
-    if {Code.NO_IMU, Code.IMU_AXES} & {r.code for r in sanity}:
+    if UNUSABLE & {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
     return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
 

@@ -6,6 +6,7 @@ from odocal_ros.reasons import Code, Reason
 
 G = 9.80665
 AXES = 'xyz'
+UNUSABLE = {Code.NO_IMU, Code.IMU_AXES}     # nothing follows from such an Imu
 MAX_RATE = 8.0       # rad/s: no road vehicle turns so fast
 NOTHING = 0.01       # m/s^2, far below what gravity is in any unit
 TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up

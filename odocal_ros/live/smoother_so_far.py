@@ -14,8 +14,9 @@ import time
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.facing import axes_reasons, facing
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.sanity import imu_sanity
+from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.calib.smoother import smoother_leg
 from odocal_ros.calib.smoother.accel_scale import judge_running, judge_scale, with_scales
 from odocal_ros.calib.smoother.chain import NotPositive
@@ -34,7 +35,6 @@ from odocal_ros.live.smoother_carried import carried, Footing, rows_of
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline import turned_over
-from odocal_ros.reasons import Code
 from odocal_ros.screen import screen
 
 FINE, COARSE = 1.0, 2.0     # s between keyframes, of a leg up to LONG and beyond
@@ -124,14 +124,16 @@ class SmootherSoFar:
         if few:
             raise BadData(few.text)
         found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
-        if any(r.code is Code.IMU_AXES for r in found):
-            raise BadData(found[0].text)
+        _refuse_unusable(found)
         run = LegRun(leg, turned_over(inputs) if z_down else inputs, config, [], None)
         if not run.rough:
             raise BadData('how far a count reaches is not known yet')
+        inputs = run.inputs
+        _refuse_unusable(axes_reasons(
+            facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, run.rough),
+            config.imu.nominal_yaw))
         if vars(run.origin) != (self._origin and vars(self._origin)):
             self._origin, self._last = run.origin, None
-        inputs = run.inputs
         spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, run.rough,
                             config.leg.standstill)
         # a way beyond the odometer's last row would be a slip
@@ -201,6 +203,12 @@ def _decided_anew(best, anew, problem, config, trace):
     if apart.max() > AGREE:
         return best_fit(problem, config, trace)
     return judge_scale(problem, best, config, trace)
+
+
+def _refuse_unusable(found):
+    why = [r.text for r in found if r.code in UNUSABLE]
+    if why:
+        raise BadData(why[0])
 
 
 def _running(view, problem, best, config) -> Running:

@@ -342,3 +342,14 @@ def test_the_keys_hold_values_and_sigmas(looks):
             0.02, 1e-5, 0.01, 1e-3, 'smoother, wheels', 7.5]
     assert math.isnan(keys['estimate_pitch_mounting_angle_rad'])
     assert math.isnan(keys['estimate_pitch_mounting_angle_sigma_rad'])
+
+
+@pytest.mark.parametrize(('yaw', 'turn_rates', 'why'), [
+    (math.pi / 2, 1.0, 'speeding up pushes the Imu to the right'),
+    (0.0, 0.0, 'every turn rate is zero')])
+def test_an_imu_that_no_leg_can_use_is_told_at_once(config, yaw, turn_rates, why):
+    drive = drive_of(yaw=yaw)
+    leg = drive.leg()
+    leg = replace(leg, imu=replace(leg.imu, w_i=turn_rates * leg.imu.w_i))
+    with pytest.raises(OdocalError, match=why):
+        SmootherSoFar().look(leg, config)
