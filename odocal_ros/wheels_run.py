@@ -50,8 +50,10 @@ def wheels(run):
     # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself
     reasons = tuple(r for r in (found.reasons if found else ())
                     if r.code is not Code.WHEELS_NOT_SEPARABLE)
+    own = tuple(r for r in method.reasons       # why the track is far off, the leg has said
+                if r.code is not Code.TRACK_MISMATCH or not _uneven(run))
     method = replace(method, details=method.details | more, reasons=(
-        *method.reasons, *reasons, *judge(method.estimates, run.nominal, run.config)))
+        *own, *reasons, *judge(method.estimates, run.nominal, run.config)))
     return method, _path(run, leg, method)
 
 
@@ -72,8 +74,12 @@ def _leg(run) -> WheelLeg | None:
         t_start=ends[0], t_stop=ends[1], alignment=run.alignment, lever_b=run.lever_b,
         nominal=run.nominal, rough=run.rough, scale_unit=inputs.scale_unit,
         interval=float(np.median(np.diff(left.t))), doubt=(inputs.doubt_t, inputs.doubt_sigma),
-        slips=drawn_out(slips.begin, slips.end, slips.size), uneven=bool(slips.change) or bool(
-            UNEVEN & {r.code for r in run.reasons}))
+        slips=drawn_out(slips.begin, slips.end, slips.size),
+        uneven=bool(slips.change) or _uneven(run))
+
+
+def _uneven(run) -> bool:
+    return bool(UNEVEN & {r.code for r in run.reasons})
 
 
 def _search(run, leg, pitch):
