@@ -117,8 +117,8 @@ def facing(t, w_b, f_b, travel, metres_per_unit) -> Facing | None:
     inverse = np.linalg.inv(normal)
     gain = inverse @ (A.conj().T @ force)
     rest = force - A @ gain
-    # half of the residual lies across; changes share bins: every other is a draw
-    variance = np.vdot(rest, rest).real / len(A) * 2 / 2 * inverse[0, 0].real
+    # only half of the residual lies across, only every other change (they share bins) is a draw
+    variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
     sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
     if sigma > SURE or not GAIN[0] < abs(gain[0]) < GAIN[1]:
         return None
