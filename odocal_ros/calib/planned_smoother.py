@@ -6,10 +6,10 @@ from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.calib.planned_samples import Ideal, ideal
 from odocal_ros.calib.predict import Sigmas
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.accel_scale import scale_priors
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
+from odocal_ros.calib.smoother.imperfect import judged_priors
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
 from odocal_ros.calib.smoother.problem import Problem, sensor_noise, SPACING
@@ -53,7 +53,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels, problem.priors)
-        priors, _ = scale_priors(fit, None, sigmas.config)
+        priors = judged_priors(fit, sigmas.config, found=False)
         if priors is not fit.priors:
             fit = _fit(problem, made, levels, priors)
     except (NotPositive, np.linalg.LinAlgError) as error:

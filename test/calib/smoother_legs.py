@@ -22,7 +22,8 @@ def made(**options):
     """Return a drive, its settings and its leg for the smoother."""
     drive = simulate(SimOptions(**({'scenario': 'town', 'imu_rate': 50.0} | options)))
     # of an accelerometer without scale error, as it is simulated unless asked for
-    config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0)
+    config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0,
+                      imu__misalignment_sigma=0.0, imu__gyro_by_force_sigma=0.0)
     return drive, config, leg_of(drive.leg(), config)
 
 

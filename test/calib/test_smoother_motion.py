@@ -8,7 +8,7 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL_SCALE, BARE, E, GNSS_DELAY, GYRO_SCALE, M
+from odocal_ros.calib.smoother.state import ACCEL, BARE, E, GNSS_DELAY, GYRO, IMPERFECT, M
 
 ARMS = {'imu_lever_arm': (1.2, 0.3, 0.4), 'antenna_lever_arm': (0.5, -0.2, 1.5)}
 
@@ -42,7 +42,7 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     problem = Problem.of(leg, config)
     state = truth(drive, config, leg)
     c = state.constants.copy()
-    c[ACCEL_SCALE] = error / (1 + error)      # of what is measured
+    c[ACCEL.start:ACCEL.start + 2] = error / (1 + error)      # of what is measured
     # on a level road the force along z is gravity, but for the tilt: the error a bias
     bias = state.accel_bias + [0.0, 0.0, error * 9.80154]
     state = replace(state, constants=c, accel_bias=bias)
@@ -54,7 +54,7 @@ def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):
     assert np.abs(r[:, :2] - kinks[:, :2]).max() < 2e-5
     assert np.abs(r[:, 3:5] - kinks[:, 3:5]).max() < 2e-5
     # and sums brought here from where there was none say the same, to first order
-    none = replace(state, constants=state.constants - c * np.isin(np.arange(M), [13, 14]))
+    none = replace(state, constants=state.constants - c * (np.arange(M) >= ACCEL.start))
     moved = Equations(problem, state, problem.sums(none)).motion.residual
     np.testing.assert_allclose(moved, r, atol=1e-9)
 
@@ -65,6 +65,8 @@ def _shaken(state):
     step = 1e-3 * rng.standard_normal((len(state.t), BARE))
     step[:, 6:12] *= 0.1
     c = 1e-3 * rng.standard_normal(M)
+    # of the size that there is: derivatives leave out how these change what the others do
+    c[IMPERFECT] *= [1, 1, *[0.1] * 6, 1, 1, 1, 1, 1, 0.1, 0.003, 0.0, 0.0]
     return state.moved(step, c)
 
 
@@ -96,7 +98,7 @@ def test_derivatives_of_the_motion(perfect, where):
         expected = J[seen, :, column + i]
         # left out: Earth rate times a second, 7e-5 rad, and half the attitude residual, 2e-4
         np.testing.assert_allclose(numeric[seen], expected, atol=3e-4 * max(
-            1.0, np.abs(expected).max()))
+            1.0, np.abs(expected).max()), err_msg=str(i))
 
 
 def test_derivatives_of_the_fixes(perfect):
@@ -119,7 +121,7 @@ def test_derivatives_of_the_fixes(perfect):
 
         numeric = (raw(h) - raw(-h)) / (2 * h)
         expected = J[:, :, i] if i < BARE else Jc[:, :, i - BARE]
-        if i == BARE + GYRO_SCALE:      # a gyro's scale within a second: no fix sees it
+        if GYRO.start <= i - BARE < GYRO.stop:    # within a second: no fix sees it
             continue
         # biases act within a second by a few metres a unit: taken as under constant force and no
         # turn, of which a vehicle makes up to 0.3 rad

@@ -51,14 +51,14 @@ class Priors:
 class Equations:
     """Normal equations and residual sums at one linearisation, for any levels."""
 
-    def __init__(self, problem, state, sums, priors=None, spread=None):
+    def __init__(self, problem, state, sums, priors=None, spread=None, fitted=False):
         self.state, self.still = state, problem.still
         self.priors = priors or problem.priors
         self.travel_floor = problem.travel_floor       # variance of the odometer's rounding
         self.travel_weight = once_a_rest(problem.still)
         leg = problem.leg
         intervals, gyro_change, delay_change, fix_change = sums.near(state)
-        self.motion = Motion(leg, state, intervals, (gyro_change, delay_change))
+        self.motion = Motion(leg, state, intervals, (gyro_change, delay_change), fitted)
         self.noise = interval_noise(
             self.motion, leg, self.still[:-1] & self.still[1:], spread)
         self.fixes = Fixes(leg, state, sums.points, intervals, problem.use, fix_change)

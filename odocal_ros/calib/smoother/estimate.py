@@ -15,10 +15,11 @@ from odocal_ros.calib.smoother.chain import solve, Solved
 from odocal_ros.calib.smoother.components import components, road_noise
 from odocal_ros.calib.smoother.equations import Equations, Priors, Weighted
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.problem import NO_SCALE, Problem
-from odocal_ros.calib.smoother.state import ACCEL_SCALE, M, PITCH, State, YAW
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, State, YAW
 
 MOST = 25            # iterations
+NEAR = 1.0           # sigmas of a step from which residuals are noise
 SETTLED = 0.03       # sigmas that the constants may still move
 NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
 SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant is held to that
@@ -36,6 +37,8 @@ ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
 OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
 GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
 MOST_WIDE = 30.0     # times its own sigma
+SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there or is not
+KNOWN = 0.5          # of the prior's variance: what is left where the data know as much
 
 
 @dataclass(eq=False)
@@ -78,19 +81,21 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         Called with each pass, for benchmarks.
 
     """
-    before, settled = np.ones(3), False
+    before, settled, fitted = np.ones(3), False, about is not None
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
     tails = 1 if about else FIRST_TAILS
     for count in range(1, most + 1):
         sums = problem.sums_near(state)
-        weighted = Equations(problem, state, sums, priors, spread).at(levels)
+        weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
         sigma = np.sqrt(np.diag(solved.covariance))
         move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(move < SETTLED and (frozen or change < QUIET and count > tails + 2))
+        settled = bool(fitted and move < SETTLED
+                       and (frozen or change < QUIET and count > tails + 2))
+        fitted = fitted or move < NEAR
         part = PART if count > LAST_TAILS and not settled else 1.0
         state = state.moved(part * solved.step, part * solved.step_border)
         weighted.after(solved)
@@ -137,15 +142,15 @@ def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
     """
     Return priors widened where the data are far from their centre.
 
-    That the accelerometer has no scale error does not give way by steps: it is weighed as a whole
-    against its having one (accel_scale), from the data as they are under that belief.
+    Those of what is small give way only where the data know more than they do: nothing would
+    gainsay a wide one.
     """
     n = solved.step.shape[1]
     P0 = np.diagonal(neighbours[0])[:n]
-    constants = _wider(first.constants, now.constants, state.constants - first.centre,
-                       np.diag(solved.covariance))
-    if (first.constants[ACCEL_SCALE] <= NO_SCALE).all():
-        constants[ACCEL_SCALE] = first.constants[ACCEL_SCALE]
+    variance = np.diag(solved.covariance)
+    constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
+    untold = SMALL & (variance > KNOWN * now.constants**2)
+    constants[untold] = now.constants[untold]
     return replace(
         now,
         gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),

@@ -5,11 +5,12 @@ import numpy as np
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BA,
     BARE,
     BG,
     C_bv_gradient,
+    FIX_LAG2,
     GNSS_ARM,
     GNSS_DELAY,
     M,
@@ -56,7 +57,10 @@ class Fixes:
             self.C_t, np.cross(intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[use] - place - self.arm_n - slow
-        self.raw = np.nan_to_num(raw) + self.v_n * later
+        # of a receiver that smooths, the place is v tau late as for a delay, and a tau^2 / 2 more
+        self.accel_n = (np.diff(state.v_n, axis=0) / np.diff(state.t)[:, None])[k]
+        lag = state.constants[FIX_LAG2] / 2 * self.accel_n
+        self.raw = np.nan_to_num(raw) + self.v_n * later - lag
 
     def jacobians(self, n):
         """
@@ -80,7 +84,8 @@ class Fixes:
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
-        c[:, :, ACCEL_SCALE] = self.C @ self.points.FF
+        c[:, :, FIX_LAG2] = -self.accel_n / 2
+        c[:, :, ACCEL] = self.C @ self.points.FF
         return J, c
 
 

@@ -11,11 +11,11 @@ from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BG,
     CONSTANTS,
     GNSS_ARM,
-    GYRO_SCALE,
+    GYRO,
     HEADING,
     LN_K,
     ODO_ARM,
@@ -35,7 +35,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = (GYRO_SCALE, *range(ACCEL_SCALE.start, ACCEL_SCALE.stop))     # errors of the Imu
+SCALES = range(GYRO.start, ACCEL.stop)     # errors of the Imu
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
 

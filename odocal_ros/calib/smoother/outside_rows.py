@@ -8,7 +8,7 @@ from odocal_ros.calib.smoother.fixes import FAR, heavy, weights
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BA,
     BARE,
     BG,
@@ -104,7 +104,7 @@ def _velocity(problem, state, points, later):
     c[:, :, GNSS_ARM] = -W @ state.C_bv
     c[:, :, GNSS_DELAY] = faster
     c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * points.rate[:, 2:]
-    c[:, :, ACCEL_SCALE] = C @ points.F
+    c[:, :, ACCEL] = C @ points.F
     return Rows('velocity', k, raw, J, c, 1 / sent.sigma)
 
 

@@ -14,11 +14,17 @@ from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, p
 from odocal_ros.calib.smoother.slide import least_slide, SIDEWAYS, turned
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
     GNSS_ARM,
     GNSS_DELAY,
+    GYRO,
+    GYRO_AXIS,
     GYRO_SCALE,
+    GYRO_SIGNAL,
     HEADING,
+    IMPERFECT,
     M,
     ODO_ARM,
     ODO_DELAY,
@@ -38,10 +44,8 @@ LEAST_FIX = 0.005    # m
 # noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
 # (or a simulator's) is silent at rest
 LEAST_SENSOR = {'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7}
-NO_SCALE = 1e-5      # relative, of the accelerometer: as good as none, until the fit is judged
-# of a gyro in use: a chip of the first two grades may be as far off as grades.GRADES has it, which
-# is what its maker guarantees; the drive's turns tell, and the belief gives way up to 30 times
-GYRO_SCALE_SIGMA = {'consumer': 3e-3, 'industrial': 2e-3, 'tactical': 3e-4, 'navigation': 1e-5}
+NO_ERROR = 1e-12     # of what there is none of
+WARMING = 600.0      # s
 
 
 @dataclass(eq=False)
@@ -110,9 +114,8 @@ class Problem:
         all_t = np.concatenate(times)
         order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
-            self.imu, state.gyro_bias[:-1], state.accel_bias[:-1], c[GYRO_SCALE],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order],
-            c[ACCEL_SCALE])
+            self.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c)
         if not self.outside:
             return Sums(state, intervals, points, {})
         points = points.take(np.argsort(order, kind='stable'))
@@ -133,28 +136,51 @@ class Sums:
 
     def _apart(self, state):
         a, b = state, self.about
-        gyro = (a.gyro_bias - b.gyro_bias)[:-1]
-        gyro = gyro + (a.constants[GYRO_SCALE] - b.constants[GYRO_SCALE]) * (
-            self.intervals.mean_rate * [0.0, 0.0, 1.0])
         c = a.constants - b.constants
+        gyro = (a.gyro_bias - b.gyro_bias)[:-1]
+        gyro = np.concatenate([gyro, np.broadcast_to(c[GYRO], (len(gyro), len(c[GYRO])))], axis=1)
         return gyro, (a.accel_bias - b.accel_bias)[:-1], c
 
     def near(self, state):
         """Return intervals for a state nearby, and what they leave to be taken in."""
         gyro, accel, c = self._apart(state)
-        if not (gyro.any() or accel.any() or c[ACCEL_SCALE].any()):
+        if not (gyro.any() or accel.any() or c[ACCEL].any()):
             return self.intervals, 0.0, c[ODO_DELAY], c[GNSS_DELAY]
-        return (self.intervals.shifted(gyro, accel, c[ACCEL_SCALE]), gyro, c[ODO_DELAY],
-                c[GNSS_DELAY])
+        return self.intervals.shifted(gyro, accel, c[ACCEL]), gyro, c[ODO_DELAY], c[GNSS_DELAY]
 
     def hold_at(self, state) -> bool:
         """Tell whether a state is near enough for first order."""
         gyro, accel, c = self._apart(state)
-        accel[:, :2] += self.intervals.mean_force[:, :2] * c[ACCEL_SCALE]
+        rate, force = self.intervals.mean_rate, self.intervals.mean_force
+        signals = np.concatenate([rate, force], axis=1)
+        gyro = gyro[:, :3] + _errors(signals, c[GYRO], GYRO_AXIS, GYRO_SIGNAL)
+        accel = accel + _errors(force, c[ACCEL], ACCEL_AXIS, ACCEL_SIGNAL)
         return bool(np.abs(gyro).max() < NEAR_GYRO and np.abs(accel).max() < NEAR_ACCEL
                     and abs(c[ODO_DELAY]) < NEAR_ODO_TIME
                     and abs(c[GNSS_DELAY]) < NEAR_GNSS_TIME
                     and np.abs(c[:3]).max() < NEAR_FORWARD)
+
+
+def _errors(signals, constants, axes, by):
+    """Return what constants make of signals (K, s) on each axis: (K, 3)."""
+    matrix = np.zeros((3, signals.shape[1]))
+    matrix[axes, by] = constants
+    return signals @ matrix.T
+
+
+def imperfect_sigmas(config, duration):
+    """
+    Return the sigmas of IMPERFECT, 0 for none: (k,).
+
+    Those of the Imu by its grade and the settings. A receiver that smooths does so over a second.
+    Tyres change by 0.2 % from 5 to 25 m/s, and by 0.25 % as they warm within ten minutes or so;
+    a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
+    """
+    grade = grade_of(config.imu)
+    axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
+    imu = np.repeat([grade.gyro_scale_error, grade.gyro_by_force, grade.accel_scale_error, axes],
+                    [2, 6, 2, 2])
+    return np.r_[imu, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 5e-3]
 
 
 def sensor_noise(grade) -> dict[str, float]:
@@ -209,11 +235,10 @@ def _priors(config, grade, leg) -> Priors:
     sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
-    given = config.imu.gyro_scale_sigma
-    sigma[GYRO_SCALE] = GYRO_SCALE_SIGMA[config.imu.grade] if np.isnan(given) else max(
-        given, NO_SCALE)
     sigma[HEADING] = leg.heading.sigma
-    sigma[ACCEL_SCALE] = NO_SCALE
-    accel_bias = np.full(3, max(grade.accel_bias, 1e-6))
-    accel_bias[2] = np.hypot(accel_bias[2], grade.accel_scale_error * G)
+    sigma[GYRO_SCALE] = max(grade.gyro_scale_error, NO_ERROR)
+    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(config, leg.t_stop - leg.t_begin), NO_ERROR)
+    # what gravity makes of axes and scale is a bias
+    level = np.sqrt(2) * G * grade.misalignment
+    accel_bias = np.hypot(max(grade.accel_bias, 1e-6), [level, level, grade.accel_scale_error * G])
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, np.zeros(M))

@@ -6,13 +6,13 @@ from odocal_ros.calib.result import Source
 from odocal_ros.calib.smoother.components import units
 from odocal_ros.calib.smoother.noise import INTERVAL
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BA,
     BG,
     E,
     GNSS_ARM,
     GNSS_DELAY,
-    GYRO_SCALE,
+    GYRO,
     HEADING,
     M,
     ODO_ARM,
@@ -29,8 +29,10 @@ NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyr
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
           'fix_latency': slice(GNSS_DELAY, GNSS_DELAY + 1),
-          'gyro_scale': slice(GYRO_SCALE, GYRO_SCALE + 1),
-          'accelerometer_scale': ACCEL_SCALE,
+          'gyro_scale': slice(GYRO.start, GYRO.start + 3),
+          'gyro_by_force': slice(GYRO.start + 3, GYRO.stop),
+          'accelerometer_scale': slice(ACCEL.start, ACCEL.start + 2),
+          'accelerometer_axes': slice(ACCEL.start + 2, ACCEL.stop),
           'heading': slice(HEADING, HEADING + 1)}
 P = 3        # parameters: ln K, yaw, pitch
 

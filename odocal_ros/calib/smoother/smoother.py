@@ -3,10 +3,10 @@
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.accel_scale import judge_scale
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.imperfect import judge_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
@@ -57,8 +57,8 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 
 def best_fit(problem, config, trace=None):
-    """Return the likeliest fit, the accelerometer's scale error judged."""
-    return judge_scale(problem, likeliest_fit(problem, config, trace), config, trace)
+    """Return the likeliest fit, the Imu's own errors judged."""
+    return judge_imperfect(problem, likeliest_fit(problem, config, trace), config, trace)
 
 
 def likeliest_fit(problem, config, trace=None):
@@ -111,7 +111,7 @@ def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
 
     """
     problem = Problem.of(leg, config)
-    equations = Equations(problem, truth, problem.sums(truth))
+    equations = Equations(problem, truth, problem.sums(truth), fitted=True)
     return solve(equations.at(levels).normal()).covariance
 
 

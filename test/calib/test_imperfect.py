@@ -1,54 +1,52 @@
-"""The accelerometer's scale error: judged from the drive, held by the sigma."""
+"""The Imu's own errors: judged from the drive, held by the sigma."""
 
 import numpy as np
 import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.accel_scale import believed
-from odocal_ros.calib.smoother.problem import NO_SCALE
+from odocal_ros.calib.smoother.imperfect import believed
 from odocal_ros.config import with_settings
 
 GRADE, BELIEF = 3e-3, 0.8
+BOTH = np.full(2, GRADE)
 TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
 
 
-def seen(sigma, error):
-    """Return covariance and values under the belief of none, of data that tell both so well."""
+def seen(sigma, error, held=BOTH):
+    """Return covariance, values and priors, of data that tell both so well."""
     data = 1 / sigma**2
-    both = data + 1 / NO_SCALE**2
-    return np.eye(2) / both, np.full(2, data * error / both)
+    both = data + 1 / held**2
+    return np.diag(1 / both), data * error / both, GRADE * np.ones(2), BELIEF, held
 
 
 def test_weights_are_the_evidence_written_out():
-    prior, weight = believed(*seen(1e-3, 2e-3), GRADE, BELIEF)
-    # each axis: the value seen is N(0, s^2) without a scale error, N(0, s^2 + grade^2) with one
+    prior, weight = believed(*seen(1e-3, 2e-3))
+    # each axis: the value seen is N(0, s^2) without an error, N(0, s^2 + grade^2) with one
     total = 1e-3**2 + GRADE**2
     odds = BELIEF / (1 - BELIEF) * (1e-6 / total * np.exp(4e-6 * (1 / 1e-6 - 1 / total)))
-    assert weight == pytest.approx(odds / (1 + odds), rel=2e-3)      # NO_SCALE and 1e-3 of belief
-    # the posterior of that prior has the mean square of both beliefs: w var + w (1 - w) mean^2
+    assert weight == pytest.approx(odds / (1 + odds), rel=2e-3)      # 1e-3 is added to the data
+    # the posterior of that prior has the mean square of both: w var + w (1 - w) mean^2
     var, mean = 1 / (1e6 + GRADE**-2), 2e-3 * GRADE**2 / total
     square = weight * var + weight * (1 - weight) * mean**2
     expected = min(1 / (1 / square - 1e6), GRADE**2) if square < 1e-6 else GRADE**2
     assert prior**2 == pytest.approx(expected, rel=5e-3)
 
 
-@pytest.mark.parametrize('held', [1e-4, GRADE])
+@pytest.mark.parametrize('held', [1e-4, 1e-3])
 def test_what_was_believed_before_does_not_weigh_twice(held):
-    data, error = 1 / 1e-3**2, 2e-3
-    both = data + 1 / held**2
-    again = believed(np.eye(2) / both, np.full(2, data * error / both), GRADE, BELIEF, held)
-    for now, first in zip(again, believed(*seen(1e-3, error), GRADE, BELIEF), strict=True):
-        # differences of 1e10 leave 1e-6 of 1e6 by rounding
-        np.testing.assert_allclose(now, first, rtol=1e-4)
+    again = believed(*seen(1e-3, 2e-3, np.full(2, held)))
+    for now, first in zip(again, believed(*seen(1e-3, 2e-3)), strict=True):
+        # differences of 1e3 leave 1e-13 of it by rounding
+        np.testing.assert_allclose(now, first, rtol=1e-9)
 
 
 def test_a_drive_that_tells_there_is_none_is_believed():
-    prior, weight = believed(*seen(1e-4, 0.0), GRADE, BELIEF)
+    prior, weight = believed(*seen(1e-4, 0.0))
     assert weight < 0.01
     assert prior.max() < 2e-5
     # and one that tells nothing is not
-    blind, weight = believed(*seen(0.1, 0.0), GRADE, BELIEF)
+    blind, weight = believed(*seen(0.1, 0.0))
     assert weight == pytest.approx(BELIEF, rel=2e-3)
     assert blind.max() > 0.8 * GRADE
 
