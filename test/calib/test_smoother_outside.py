@@ -12,7 +12,7 @@ from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside import Heading
-from odocal_ros.calib.smoother.outside_rows import alike
+from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import (
     ACCEL_SCALE,
