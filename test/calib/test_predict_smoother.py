@@ -148,11 +148,11 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
     sigmas = replace(town_sigmas, config=config, fix=0.02)
     one = ideal(drive, sigmas, 1.0)
     problem = Problem.of(one.leg, config, one.imu)
-    equations = Equations(problem, one.state, problem.sums(one.state))
+    parts = Equations(problem, one.state, problem.sums(one.state)).parts
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
     # most, beside what a planned drive's own steps of 0.1 s leave
-    assert np.abs(equations.fixes.raw).max() < 0.03
-    r = equations.motion.residual
+    assert np.abs(parts['fixes'].raw).max() < 0.03
+    r = parts['motion'].raw
     assert np.abs(r[:, 3:6]).max() < 0.1        # velocity
     assert np.abs(r[:, 6:9]).max() < 0.01       # attitude
     assert np.median(np.abs(r[:, 15:18]), axis=0).max() < 1e-3      # way by odometer, m
