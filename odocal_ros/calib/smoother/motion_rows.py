@@ -90,21 +90,21 @@ class MotionRows(Part):
         """Tell which unit noises are of these levels: (c,) bool."""
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
-    def components(self, P):
+    def components(self, near):
         """Return for each level its quadratic sum and what is expected of it."""
         A, Y = self._units()
         quadratic = (np.einsum('kic,ki->kc', A, self.r)**2).sum(axis=0)
-        expected = (A**2).sum(axis=(0, 1)) - (Y * (P @ Y)).sum(axis=(0, 1))
+        expected = (A**2).sum(axis=(0, 1)) - (Y * (near @ Y)).sum(axis=(0, 1))
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
-    def effects(self, P):
+    def effects(self, near):
         """Yield what the unit noises of each level do."""
-        X = self.to_told(P) @ self._units()[1]
+        X = self.to_told(near) @ self._units()[1]
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.of(name)]
 
-    def road_noise(self, P):
+    def road_noise(self, near):
         """
         Return the odometer's noise of each interval, along, side, up: (K, 3) each.
 
@@ -113,7 +113,7 @@ class MotionRows(Part):
         """
         A, Y = self._units()
         estimate = np.einsum('kic,ki->kc', A, self.r)
-        seen = (A**2).sum(axis=1) - (Y * (P @ Y)).sum(axis=1)
+        seen = (A**2).sum(axis=1) - (Y * (near @ Y)).sum(axis=1)
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))

@@ -42,8 +42,9 @@ class Part:
     """
     One part, here one that says nothing; those of today are listed in ``equations``.
 
-    A sensor's own class has ``__init__(problem, here)`` and what differs from this. ``P`` are the
-    covariances of ``Solved.neighbours``: (K, 2n + M, 2n + M), n unknowns a block.
+    A sensor's own class has ``__init__(problem, here)`` and what differs from this; one with rows
+    of its own also raw, its residuals, and ``jacobians(n)``, their derivatives by the keyframes
+    and by the constants. ``near`` is what ``Solved.neighbours`` returns: (K, 2n + M, 2n + M).
     """
 
     name: ClassVar[str]
@@ -85,17 +86,17 @@ class Part:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
 
-    def components(self, P) -> dict[str, tuple[float, float]]:
+    def components(self, near) -> dict[str, tuple[float, float]]:
         """Return of each level its quadratic sum and what is expected of it."""
         return {}
 
-    def effects(self, P):
+    def effects(self, near):
         """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
         return ()
 
-    def to_told(self, P):
+    def to_told(self, near):
         """Return the covariance of scale, yaw and pitch with the unknowns: (K, 3, 2n + M)."""
-        return P[:, 2 * self.n:2 * self.n + TOLD, :]
+        return near[:, 2 * self.n:2 * self.n + TOLD, :]
 
 
 def hold(out, k, columns, variance, residual, weight=1.0):

@@ -129,12 +129,12 @@ class PointRows(Part):
         n = self.n
         return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
 
-    def components(self, P):
+    def components(self, near):
         """Return for each level its quadratic sum and what is expected of it."""
         if len(self.k) < FEWEST_ROWS:
             return {}
         (own, end), J = self._columns(), self.by_interval(self.J)
-        block = P[np.unique(self.k)]
+        block = near[np.unique(self.k)]
         taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
         if self.J_end is not None:
             B = self.by_interval(self.J_end)
@@ -148,10 +148,10 @@ class PointRows(Part):
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
 
-    def effects(self, P):
+    def effects(self, near):
         """Yield what a unit error of each row does."""
         own, end = self._columns()
-        block = P[np.unique(self.k), 2 * self.n:2 * self.n + TOLD]
+        block = near[np.unique(self.k), 2 * self.n:2 * self.n + TOLD]
         X = block[:, :, own] @ np.swapaxes(self.by_interval(self.J), 1, 2)
         if self.J_end is not None:
             X = X + block[:, :, end] @ np.swapaxes(self.by_interval(self.J_end), 1, 2)

@@ -63,9 +63,9 @@ class PriorRows(Part):
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
         return total + (self._constants_off()**2 / self.priors.constants**2).sum()
 
-    def effects(self, P):
+    def effects(self, near):
         """Yield what the turn-on biases do."""
-        first = self.to_told(P)[0]
+        first = self.to_told(near)[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 
