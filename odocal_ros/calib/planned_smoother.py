@@ -10,9 +10,10 @@ from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
 from odocal_ros.calib.smoother.imperfect import judged_priors
+from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
-from odocal_ros.calib.smoother.problem import Problem, sensor_noise, SPACING
+from odocal_ros.calib.smoother.problem import Problem, SPACING
 from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.equations import Priors
 from odocal_ros.calib.smoother.imperfect import with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import ImuRows, preintegrate
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
+from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, Priors, State
 from odocal_ros.nav.strapdown import rotation_increments
 
 SPEED_WINDOW = 0.4          # s each side, over which a speed is taken

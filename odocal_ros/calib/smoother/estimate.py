@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import solve, Solved
-from odocal_ros.calib.smoother.components import components, road_noise
-from odocal_ros.calib.smoother.equations import Equations, Priors, Weighted
+from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, State, YAW
+from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, Priors, State, YAW
 
 MOST = 25            # iterations
 NEAR = 1.0           # sigmas of a step from which residuals are noise
@@ -118,7 +117,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
 def update(weighted, neighbours, levels, problem, haste=HASTE) -> Levels:
     """Return levels moved towards the maximum of the restricted likelihood."""
     new = {}
-    for name, (quadratic, expected) in components(weighted, neighbours).items():
+    for name, (quadratic, expected) in weighted.components(neighbours).items():
         level = levels[name]
         belief = SENSOR.get(name, INERTIA)
         pull = belief * (problem.first_levels[name] / level if name in SENSOR else 1.0)
@@ -131,7 +130,7 @@ def update(weighted, neighbours, levels, problem, haste=HASTE) -> Levels:
 
 def slips(weighted, neighbours, spread):
     """Return factors on the odometer's variances where an interval lies far out: (K, 3)."""
-    noise, found = road_noise(weighted, neighbours)
+    noise, found = weighted['motion'].road_noise(neighbours)
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro

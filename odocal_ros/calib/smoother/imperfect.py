@@ -91,7 +91,7 @@ def judged_priors(now: Fit, config, found=True):
     usual = imperfect_sigmas(config, now.state.t[-1] - now.state.t[0])
     there = np.flatnonzero(usual > 0)
     sigma, last = usual[there], now.priors.constants[IMPERFECT][there]
-    if now.levels.correlation_time:
+    if now.levels.correlation_time or not len(there):
         return now.priors
     pick = IMPERFECT.start + there
     both = np.linalg.inv(now.solved.covariance[np.ix_(pick, pick)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.problem import sensor_noise
+from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
@@ -33,7 +33,7 @@ def mismatch(problem, fit, neighbours, config):
     widen, odd = 1.0, []
     if worse:       # what shakes a vehicle is not white, and how it is coloured is not known
         odd.append('the Imu errs more than its grade, in ways that are not white noise')
-    share = float((fit.weighted.fix_weight[:, 0] < 0.5).mean())
+    share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
     share = float((fit.spread[:, 0] > 1.5).mean())

@@ -164,13 +164,12 @@ def _undetermined(sigma, limit, config, yaw):
 
 
 def _details(leg, problem, fit, sources, ratio, widen, sigma):
-    state, w = fit.state, fit.weighted
+    state, motion, fixes = fit.state, fit.weighted['motion'].motion, fit.weighted['fixes']
     K = state.scale
-    arm = state.C_bv @ w.eq.motion.arm_v
+    arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // TRACK_ROWS)
     t_fix = leg.t_fix[problem.use]
-    alike, _ = correlation(t_fix, w.fix_r[:, :2])
-    motion = w.eq.motion
+    alike, _ = correlation(t_fix, fixes.r[:, :2])
     speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
                     * motion.T[:, 0]).sum()
@@ -184,9 +183,9 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'posterior_to_prior': ratio,
         **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
-        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((w.fix_r[:, :2]**2).mean())),
+        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
-                      'fixes_downweighted': int((w.fix_weight[:, 0] < 0.5).sum()),
+                      'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix),
                       'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
@@ -203,8 +202,8 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
 def _outside(leg, problem, fit, sigma):
     """Return what the drive says of velocity and heading from outside."""
     out = {}
-    for rows in fit.weighted.outside:
-        out[rows.name] = {'messages': len(rows.k), 'alike': problem.thin.get(rows.name, 1.0)}
+    for name in problem.outside:
+        out[name] = {'messages': len(fit.weighted[name].k), 'alike': problem.thin.get(name, 1.0)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
                            'error': float(fit.state.constants[HEADING]),

@@ -10,7 +10,7 @@ from odocal_ros.calib.smoother.imperfect import judge_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
-from odocal_ros.calib.smoother.outside_rows import alike
+from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
 from odocal_ros.calib.smoother.start import first_state
@@ -76,7 +76,7 @@ def likeliest_fit(problem, config, trace=None):
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
         fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.thin = {rows.name: alike(rows) for rows in best.weighted.outside}
+    problem.thin = {name: alike(best.weighted[name]) for name in problem.outside}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
         return with_slow_errors(problem, best, asked, trace)

@@ -113,3 +113,13 @@ def C_bv_gradient(yaw, pitch):
     by_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
     by_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
     return by_yaw, by_pitch
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """What is believed beforehand, 1 sigma: (3,), (3,), (M,), inf where nothing is."""
+
+    gyro_bias: Floats
+    accel_bias: Floats
+    constants: Floats
+    centre: Floats               # (M,) of the constants
