@@ -13,11 +13,12 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
 NONE3: Vector = (0.0, 0.0, 0.0)
 NONE9: Matrix = (0.0,) * 9
-ROUNDINGS = ('floor', 'round')
+WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
           'odometer_arm_error', 'antenna_arm_error', 'sideslip', 'squat', 'body_roll')
-POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor')
+POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
+            'imu_batch')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,45 +78,46 @@ class Real:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
+            value = _checked(field.name, getattr(self, field.name), field.default)
+            object.__setattr__(self, field.name, value)
 
     def matrix(self, name: str):
         """Return a matrix by its name: (3, 3)."""
         return np.reshape(getattr(self, name), (3, 3))
 
 
-
-def _checked(field, value):
-    name = field.name
+def _checked(name, value, default):
+    """Return a figure as numbers and tuples of them, or say what is wrong with it."""
+    if name in WORDS:
+        if value not in WORDS[name] and value != default:
+            raise BadUsage(f'--real {name}={value}: want one of {", ".join(WORDS[name])}')
+        return value
+    if value is None and default is None:
+        return None
     if isinstance(value, list | tuple):
         value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
-    if name == 'speed_rounding' and value not in ROUNDINGS:
-        raise BadUsage(f'--real {name}={value}: want one of {", ".join(ROUNDINGS)}')
-    if name == 'told_grade' and value is not None and value not in GRADES:
-        raise BadUsage(f'--real {name}={value}: want one of {", ".join(GRADES)}')
-    if isinstance(value, str | None):
-        return value
-    numbers = [x for v in (value if isinstance(value, tuple) else (value,))
-               for x in (v if isinstance(v, tuple) else (v,))]
-    want = 3 if name in ('gyro_bias', 'accel_bias') else (
-        len(field.default) if isinstance(field.default, tuple) else 0)
-    if want and len(numbers) != want or isinstance(value, tuple) != isinstance(
-            field.default, tuple | None) or name == 'slow_errors' and not all(
-            isinstance(v, tuple) and len(v) == 2 and v[1] > 0 for v in value):
-        raise BadUsage(f'--real {name}: want {_form(name, want)}')
+    numbers = _numbers(name, value, default)
     if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
         raise BadUsage(f'--real {name}: want finite numbers')
-    least = min(numbers, default=0.0)
-    if name not in SIGNED and least < 0 or name in POSITIVE and least <= 0 or (
-            name == 'imu_batch' and least < 1) or name == 'drops' and least >= 1:
-        raise BadUsage(f'--real {name}={value:g}: out of range')
+    least = min(numbers, default=1.0)
+    if (name not in SIGNED and least < 0 or name in POSITIVE and least <= 0
+            or name == 'drops' and least >= 1 or name == 'imu_batch' and least != int(least)):
+        raise BadUsage(f'--real {name}={value}: out of range')
     return value
 
 
-def _form(name, want):
+def _numbers(name, value, default):
+    """Return the numbers of a figure whose form is right."""
     if name == 'slow_errors':
-        return 'pairs of sigma and correlation time, such as ((1.5,60),(1,900))'
-    return f'{want} numbers, such as (0,0,0)' if want else 'one number'
+        if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
+                                                 for v in value)):
+            raise BadUsage('--real slow_errors: want pairs of sigma and correlation time, such '
+                           'as ((1.2,60),(0.9,900))')
+        return [x for pair in value for x in pair]
+    count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
+    if isinstance(value, tuple) != bool(count) or count and len(value) != count:
+        raise BadUsage(f'--real {name}: want {f"{count} numbers" if count else "one number"}')
+    return value if count else (value,)
 
 
 def parsed(text: str) -> tuple:
