@@ -11,11 +11,12 @@ drive and grades take turns, so that 15 drives hold each pair once. Rows go to t
 line: an interrupted run goes on where it stopped.
 
 Printed by effect, kind and grade, for scale, yaw and pitch by the Imu's own axes (and by its
-housing, where the product states that): how many were given, share within 1.96 sigma, RMS of error
-over sigma, median sigma, worst error over sigma. ``off``: not rejected though beyond 3.5 sigma;
-``unnamed``: of these, without a reason that names a cause that is there (that the model does not
-fit names none); ``silent``: without any reason that something there explains. ``false``: reasons
-that nothing in the drive explains.
+housing, where the product states that): how many were given in drives that are not rejected, share
+within 1.96 sigma, RMS of error over sigma, median sigma, worst error over sigma. ``off``: not
+rejected though beyond 3.5 sigma; ``unnamed``: of these, without a reason that names a cause that is
+there (that the model does not fit names none); ``silent``: without any reason that something there
+explains; ``accepted``: with that verdict. ``false reasons``: drives with a reason that nothing in
+them explains.
 """
 
 import argparse
@@ -113,26 +114,33 @@ def outcome(calibration, truth):
     """Return verdict, codes and, for each figure, value, sigma and error (scale: relative)."""
     row = {'verdict': calibration.verdict.value,
            'codes': sorted({r.code.name for r in calibration.reasons})}
-    for name, key, true, unit in (
-            ('scale_factor', 'scale', truth.scale, truth.scale),
-            ('yaw_mounting_angle', 'yaw', truth.yaw, 1.0),
-            ('pitch_mounting_angle', 'pitch', truth.pitch, 1.0),
-            ('yaw_mounting_angle_housing', 'yaw_housing', truth.yaw_housing, 1.0),
-            ('pitch_mounting_angle_housing', 'pitch_housing', truth.pitch_housing, 1.0)):
-        estimate = calibration.estimates.get(name)
+    found = calibration.estimates
+    for name, key, true, unit in (('scale_factor', 'scale', truth.scale, truth.scale),
+                                  ('yaw_mounting_angle', 'yaw', truth.yaw, 1.0),
+                                  ('pitch_mounting_angle', 'pitch', truth.pitch, 1.0)):
+        estimate = found.get(name)
         if estimate is None or estimate.value is None:
             continue
         row |= {key: estimate.value, f'{key}_sigma': estimate.sigma / unit,
                 f'{key}_error': (estimate.value - true) / unit, f'{key}_by': estimate.method}
-        if key in ('yaw', 'pitch'):     # by the housing, with its own sigma where there is one
-            own = calibration.estimates.get(f'{name}_housing_sigma')
-            row |= {f'{key}_error_housing': estimate.value - getattr(truth, f'{key}_housing')}
-            if own is not None and own.value is not None:
-                row |= {f'{key}_sigma_housing': own.value}
+        if key != 'scale':
+            row |= against_housing(found, name, key, getattr(truth, f'{key}_housing'))
     smoother = calibration.legs[0].methods.get('smoother')
     details = smoother.details if smoother else {}
     return row | {name: details[name] for name in ('iterations', 'settled', 'widened')
                   if isinstance(details.get(name), int | float | bool)}
+
+
+def against_housing(found, name, key, true):
+    """Return the error against the housing's angle, and its sigma where the product states one."""
+    own, sigma = (found.get(f'{name}_housing{what}') for what in ('', '_sigma'))
+    value = found[name].value if own is None or own.value is None else own.value
+    row = {f'{key}_housing_error': value - true}
+    if sigma is not None and sigma.value is not None:
+        row[f'{key}_housing_sigma'] = sigma.value
+    elif own is not None and own.sigma is not None:
+        row[f'{key}_housing_sigma'] = own.sigma
+    return row
 
 
 def run_block(seeds, duration):

@@ -44,7 +44,7 @@ def off(row):
     """Tell whether a row that is not rejected has a figure far beyond its sigma."""
     return row['verdict'] in ('accepted', 'caution') and any(
         abs(row[f'{key}_error']) > OFF * row[f'{key}_sigma'] for key, _, _ in FIGURES
-        if f'{key}_error' in row)
+        if f'{key}_sigma' in row)
 
 
 def silent(row):
@@ -65,7 +65,7 @@ def false_codes(row):
 def print_tables(rows):
     """Print all together, then by run or effect, by kind, by grade; then what was said falsely."""
     runs = list(dict.fromkeys(row['run'] for row in rows))
-    print(f'{"":24}{"drives":>6}{"":7}{"given":>6}{"95 %":>7}{"/sigma":>9}{"sigma":>10}'
+    print(f'{"":24}{"drives":>6}{"":14}{"given":>6}{"95 %":>7}{"/sigma":>9}{"sigma":>10}'
           f'{"worst":>9}')
     groups = [('together', rows)] if len(runs) > 1 or runs == ['all'] else []
     groups += [(run, [r for r in rows if r['run'] == run]) for run in runs if run != 'all']
@@ -88,10 +88,10 @@ def print_tables(rows):
 
 def _print_group(title, rows):
     for key, unit, scale in FIGURES:
-        have = [r for r in rows if f'{key}_error' in r and r['verdict'] != 'rejected']
+        have = [r for r in rows if f'{key}_sigma' in r and r['verdict'] != 'rejected']
         if not have and key.endswith('housing'):
             continue
-        line = f'{title:24}{len(rows) if title else "":>6} {key:6}{len(have):>6}'
+        line = f'{title:24}{len(rows) if title else "":>6} {key:14}{len(have):>5}'
         if have:
             error, sigma = (np.array([r[f'{key}_{what}'] for r in have])
                             for what in ('error', 'sigma'))

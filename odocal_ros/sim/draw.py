@@ -69,7 +69,14 @@ def drawn(seed: int, kind: str, grade: str, effects=None, **given):
     for name in names:
         if name not in EFFECTS:
             raise BadUsage(f'--effect {name}: want one of {", ".join(EFFECTS)}')
+    if set(ODOMETER_EFFECTS) <= set(effects or ()):
+        raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer')
+    own = given.pop('real', {})
     vehicle, options = _clean(seed, kind, grade, alone=effects is not None)
+    if 'scale' in given:
+        ratio = options['nominal_scale'] / options['scale']
+        given = {'nominal_scale': given['scale'] * ratio} | given
+    options |= given
     if effects is None:
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == _odometer_of(vehicle, seed)]
     real: dict = {}
@@ -80,7 +87,6 @@ def drawn(seed: int, kind: str, grade: str, effects=None, **given):
             there.append(name)
         options |= changes
         real |= figures
-    own = given.pop('real', {})
     return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
 
 

@@ -110,7 +110,7 @@ def _numbers(name, value, default):
     """Return the numbers of a figure whose form is right."""
     if name == 'slow_errors':
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
-                                                 for v in value)):
+                                                 and v[1] for v in value)):
             raise BadUsage('--real slow_errors: want pairs of sigma and correlation time, such '
                            'as ((1.2,60),(0.9,900))')
         return [x for pair in value for x in pair]

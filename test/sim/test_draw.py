@@ -65,7 +65,20 @@ def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
     assert len(wrong) == pytest.approx(60 / 3, abs=5 * np.sqrt(60 * 2 / 9))
 
 
+def test_what_is_given_is_what_effects_go_by():
+    arm = (1.0, 0.2, 1.5)
+    seed = next(s for s in range(50) if np.allclose(np.add(
+        (o := drawn(s, 'town', 'consumer')[0]).antenna_lever_arm, o.real.antenna_arm_error), 0))
+    options, _ = drawn(seed, 'town', 'consumer', antenna_lever_arm=arm, scale=0.5,
+                       real={'squat': 0.0})
+    assert options.antenna_lever_arm == arm
+    assert options.real.antenna_arm_error == (-1.0, -0.2, -1.5)
+    assert options.scale == 0.5
+    assert options.real.squat == 0
+
+
 @pytest.mark.parametrize(('change', 'told'), [
+    ({'effects': ODOMETER_EFFECTS}, 'a vehicle has one odometer'),
     ({'effects': ('rust',)}, '--effect rust: want one of triads'),
     ({'grade': 'navigation'}, 'want one of consumer')])
 def test_what_cannot_be_drawn_is_said(change, told):

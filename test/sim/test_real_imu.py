@@ -101,6 +101,7 @@ def test_late_stamps_move_no_true_mark():
     ({'gyro_bias': 1.0}, 'want 3 numbers'), ({'vibration': -1}, 'out of range'),
     ({'speed_rounding': 'up'}, 'want one of floor, round'), ({'drops': 1.0}, 'out of range'),
     ({'told_grade': 'best'}, 'want one of consumer'), ({'slow_errors': (1, 60)}, 'want pairs'),
+    ({'slow_errors': ((1, 0),)}, 'want pairs'),
     ({'warm_time': 0.0}, 'out of range'), ({'squat': float('nan')}, 'want finite'),
     ({'imu_batch': 1.5}, 'out of range')])
 def test_figures_that_cannot_be_are_refused(figures, told):
