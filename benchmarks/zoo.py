@@ -13,10 +13,10 @@ line: an interrupted run goes on where it stopped.
 Printed by effect, kind and grade, for scale, yaw and pitch by the Imu's own axes (and by its
 housing, where the product states that): how many were given in drives that are not rejected, share
 within 1.96 sigma, RMS of error over sigma, median sigma, worst error over sigma. ``off``: not
-rejected though beyond 3.5 sigma; ``unnamed``: of these, without a reason that names a cause that is
-there (that the model does not fit names none); ``silent``: without any reason that something there
-explains; ``accepted``: with that verdict. ``false reasons``: drives with a reason that nothing in
-them explains.
+rejected though beyond 3.5 sigma; ``unnamed``: of these, without a reason that names a cause that
+is there (that the model does not fit names none); ``silent``: without any reason that something
+there explains; ``accepted``: with that verdict. ``false reasons``: drives with a reason that
+nothing in them explains.
 """
 
 import argparse
@@ -84,7 +84,8 @@ def run_drive(seed, duration=None):
     begin = time.process_time()
     drive = simulate(options)
     row = {'seed': seed, 'run': run, 'kind': kind, 'grade': grade, 'effects': list(there),
-           'drawn': compact(drive.options), 'simulated': time.process_time() - begin}
+           'drawn': compact(drive.options), 'asked': duration,
+           'simulated': time.process_time() - begin}
     config, begin = configured(drive), time.process_time()
     try:
         calibration = combine([calibrate(drive.leg(), config)], config)
@@ -149,7 +150,8 @@ def run_block(seeds, duration):
 
 
 def _run(seeds, args):
-    have = read_rows(args.file)
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row.get('asked') == args.duration}
     missing = [seed for seed in seeds if seed not in have]
     blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
     begin, done = time.monotonic(), 0
