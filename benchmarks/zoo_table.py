@@ -19,7 +19,8 @@ FIXES = {'FIXES_NOISIER_THAN_SAID', 'PLANES_DISAGREE', *GENERAL}
 IMU = {'IMU_WORSE_THAN_GRADE', *GENERAL}
 WHEELS = {'WHEEL_SLIP', *GENERAL}
 EXPLAINS = {
-    'triads': IMU, 'g_sensitivity': IMU, 'bias': IMU, 'temperature': IMU,
+    'triads': IMU, 'g_sensitivity': IMU, 'bias': {'TRACK_MISMATCH', *IMU},
+    'temperature': {'TRACK_MISMATCH', *IMU},      # what the standstill told no longer holds
     'vibration': IMU | WHEELS, 'grade': IMU,
     'imu_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *IMU},
     'coarse_speed': WHEELS, 'coarse_pulses': GENERAL,
