@@ -43,15 +43,17 @@ class Border:
         """
         Return the border of a leg whose constants differ from the vehicle's by errors of its own.
 
-        sigmas : by name, of each constant's own error d. The data see x + d; d is taken out:
-        D - D A (1 + A' D A)^-1 A' D, A the sigmas as columns.
+        sigmas : by name, of each constant's own error d, inf: the leg then says nothing of it.
+        The data see x + d; d is taken out: D - D A (1 + A' D A)^-1 A' D, A the sigmas as columns.
         """
-        A = np.zeros((len(self.names), len(sigmas)))
-        for k, (name, sigma) in enumerate(sigmas.items()):
-            A[self.names.index(name), k] = sigma
-        D = self.information
+        D, at = self.information, [self.names.index(name) for name in sigmas]
+        size = np.array(list(sigmas.values()))
+        known, own = np.isfinite(size), np.diag(D)[at]
+        # a column of any length will do for what is not bounded
+        size = np.where(known, size, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
+        A = np.eye(len(D))[:, at] * size
         DA = D @ A
-        taken = DA @ np.linalg.inv(np.eye(len(sigmas)) + A.T @ DA)
+        taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A.T @ DA)
         information = D - taken @ DA.T
         return replace(self, information=(information + information.T) / 2,
                        pull=self.pull - taken @ (A.T @ self.pull))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, total_covariance
-from odocal_ros.calib.joint import chi2_95
+from odocal_ros.calib.joint import deviate, Z95
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
@@ -104,7 +104,7 @@ def _combine(parameter, i, have):
     freedom = len(y) - 1
     chi2 = float(((y - mean)**2 / apart).sum()) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
-    if freedom and chi2 > chi2_95(freedom):
+    if freedom and deviate(chi2, freedom) > Z95:
         factor = np.sqrt(chi2 / freedom)
         variance *= factor**2
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter} differs between the {len(y)} legs '

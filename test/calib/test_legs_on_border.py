@@ -160,14 +160,16 @@ def test_chi_square_has_its_mean_and_variance():
         constants[:, 0] += np.concatenate([[0.0], np.cumsum(
             STEPS * rng.standard_normal(LEGS - 1))])
         return of(small.draw(rng, constants).borders())
-    found = [drawn() for _ in range(1000)]
+    found = [drawn() for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
     assert walk[-1] > 0
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
     assert freedom == 22 + 4 - 9
-    assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 1000))
-    assert chi2.var() == pytest.approx(2 * freedom, rel=0.2)       # 4 sigmas of it
-    assert 0.03 < np.mean([bool(f.spread) for f in found]) < 0.075
+    assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
+    assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
+    # each of five constants in one of 300, and all together in one of 20
+    assert np.mean([bool(f.spread) for f in found]) < 0.035
+    assert 0.03 < np.mean([f.factor > 1 for f in found]) < 0.07
     z = np.concatenate([f.deviation.ravel() for f in found])
     assert z[z != 0].std() == pytest.approx(1.0, abs=0.03)
 
