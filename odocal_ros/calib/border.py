@@ -64,14 +64,24 @@ class Border:
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
+    def told(self, unit, least) -> 'Border':
+        """Return what is left of it in directions with so much information, in units of (m,)."""
+        size, V = self._directions(unit, least)
+        V, W = V / unit[:, None], V * unit[:, None]
+        return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
+
     def rows(self, unit):
         """
         Return the data as rows of unit variance: (r, m), and what they should be: (r,).
 
-        unit : (m,) of the constants. Directions with next to no information are none.
+        unit : (m,) of the constants. Directions in which there is but rounding are no rows.
         """
-        size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
-        keep = size > LEAST * max(size[-1], 1e-300)
-        root, V = np.sqrt(size[keep]), V[:, keep]
+        size, V = self._directions(unit, 0.0)
+        root = np.sqrt(size)
         R = (V * root).T / unit
         return R, R @ self.value + V.T @ (self.pull * unit) / root
+
+    def _directions(self, unit, least):
+        size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
+        keep = size > max(LEAST * size[-1], least, 1e-300)
+        return size[keep], V[:, keep]

@@ -76,9 +76,8 @@ def joint(borders, steps, drifting='scale_factor', angles=(), curved=()) -> Join
     bent = _bend(legs, [n for n in curved if n in legs.names])
     chi2, freedom = legs.disagreement()
     deviation, spread = legs.deviations(), _disputed(legs)
-    now, _ = legs.disagreement(spread)
-    wide = freedom and deviate(now, freedom) > Z95
-    factor = float(np.sqrt(now / freedom)) if wide else 1.0
+    left, rest = legs.disagreement(spread)
+    factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
     x, C = legs.solve(spread)
     where = legs.place(len(borders) - 1)
     return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,

@@ -6,6 +6,7 @@ from odocal_ros.calib.border import Border, UNIT
 
 LEAST_STEP = 1e-7    # of ln K between legs: what no vehicle keeps, and no equations hold
 NO_NEWS = 1e-6       # share of a leg's information on a constant that others do not foresee
+TELLS = 1.0          # information by that believed: what a leg tells of a constant
 SAME = 1e-8          # singular value, of the largest, that is rounding
 
 
@@ -34,11 +35,11 @@ class LinkedLegs:
         where[self.drifting] = m + j
         return where
 
-    def system(self, spread=None):
+    def system(self, spread=None, borders=None):
         """Return the rows of all legs and of the walk, and what they should be."""
         m, J = len(self.names), len(self.borders)
         A, b = [], []
-        for j, border in enumerate(self.borders):
+        for j, border in enumerate(borders or self.borders):
             R, y = (border.loosened(spread) if spread else border).rows(self.unit)
             A.append(np.zeros((len(R), m + J)))
             A[-1][:, self.columns(j)] = R
@@ -70,8 +71,13 @@ class LinkedLegs:
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
     def disagreement(self, spread=None):
-        """Return by how much the least cost rises when legs are one vehicle's, and freedom."""
-        A, b = self.system(spread)
+        """
+        Return by how much the least cost rises when legs are one vehicle's, and freedom.
+
+        Of what legs tell at least as well as it was believed: farther off than that their
+        equations need not be true.
+        """
+        A, b = self.system(spread, [b.told(self.unit, TELLS) for b in self.borders])
         U, size, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, size > SAME * size[0]]
         rest = b - U @ (U.T @ b)
@@ -87,11 +93,12 @@ class LinkedLegs:
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
         for j, border in enumerate(self.borders):
+            border = border.told(self.unit, TELLS)
             border = border.loosened(spread) if spread else border
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
-            news = variance > NO_NEWS * np.maximum(np.diag(D), 1e-300)
+            news = variance > np.maximum(NO_NEWS * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 

@@ -1,6 +1,7 @@
 """Legs combined on their border are one fit of all their rows, whatever each is blind to."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from odocal_ros.calib.joint import joint
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.several import combine_legs
+from odocal_ros.calib.wheels.slips import NO_SLIPS
 from odocal_ros.combination import combine
 from odocal_ros.config import with_settings
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.slow_slip import held
 
 NAMES = ('k', 'z0', 'z1', 'z2', 'z3')
 LEGS, STATES, ROWS = 5, 80, 130
@@ -28,6 +31,7 @@ class Toy:
     def __init__(self, rng, legs=LEGS, states=STATES, rows=ROWS):
         self.A = rng.standard_normal((legs, rows, states))
         self.B = rng.standard_normal((legs, rows, len(NAMES)))
+        self.B[:, :, 0] *= 100.0          # of ln K much is told
         # one leg is blind to z0 and to z1 - z2, another to k
         self.B[1, :, 1] = 0.0
         self.B[1, :, 3] = -self.B[1, :, 2]
@@ -152,9 +156,7 @@ def test_a_leg_without_information_changes_nothing(toy):
 
 def test_chi_square_has_its_mean_and_variance():
     rng = np.random.default_rng(2)
-    small = Toy(rng, states=6, rows=20)
-    walk = np.concatenate([[0.0], np.cumsum(STEPS)])
-
+    small = Toy(rng, states=6, rows=60)
     def drawn():
         constants = np.tile(TRUTH, (LEGS, 1))
         constants[:, 0] += np.concatenate([[0.0], np.cumsum(
@@ -162,7 +164,6 @@ def test_chi_square_has_its_mean_and_variance():
         return of(small.draw(rng, constants).borders())
     found = [drawn() for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
-    assert walk[-1] > 0
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
     assert freedom == 22 + 4 - 9
     assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
@@ -276,6 +277,22 @@ def test_sources_of_legs_combined_make_their_sigma(legs):
     assert 'heading' not in {s.name for s in whole.sources}       # there was none
 
 
+def test_a_shared_source_is_what_an_error_of_that_belief_does(legs):
+    _, config, results = legs
+
+    def combined(name, sigmas):
+        at = results[0].border.names.index(name)
+        moved = [r.border.centre + sigmas * r.border.used[at] * np.eye(len(r.border.names))[at]
+                 for r in results]
+        return combine_legs([replace(r, border=replace(r.border, centre=c)) for r, c in
+                             zip(results, moved, strict=True)], [0, 1, 2], config)
+    before, after = (combined('gnss_delay', sigmas) for sigmas in (0.0, 1.0))
+    (effect,) = [s.effects[:, 0] for s in before.sources if s.name == 'fix_latency']
+    pitch = 'pitch_mounting_angle'
+    assert after.estimates[pitch].value - before.estimates[pitch].value \
+        == pytest.approx(effect[2], rel=1e-3)
+
+
 def test_a_scale_that_walks_is_that_of_the_last_leg(legs):
     _, config, results = legs
     day = 86400 * 10**9
@@ -293,6 +310,17 @@ def test_a_leg_widened_for_its_model_counts_less(legs):
     doubted = replace(results[0], border=results[0].border.widened(2.0))
     sure, unsure = (combine_legs([one, one], [0, 1], config) for one in (results[0], doubted))
     assert unsure.estimates[SCALE].sigma == pytest.approx(2 * sure.estimates[SCALE].sigma, rel=0.1)
+
+
+def test_a_slip_that_the_smoother_does_not_hold_is_in_its_border_too(legs):
+    _, config, results = legs
+    run = SimpleNamespace(wheel_slips=replace(NO_SLIPS, change=8e-4), distance=1000.0,
+                          nominal=0.0, config=config)
+    loose = held(results[0], run)
+    scale = loose.estimates[SCALE]
+    assert scale.sigma / scale.value > 2e-4
+    C = joint([loose.border], []).covariance
+    assert np.sqrt(C[0, 0]) == pytest.approx(scale.sigma / scale.value, rel=1e-6)
 
 
 def test_a_dispute_names_leg_and_parameter(legs):

@@ -12,6 +12,7 @@ from odocal_ros.reasons import Code, Reason
 
 P = 3                # parameters: ln K, yaw, pitch, the first of CONSTANTS
 DAY = 86400e9        # ns
+FAR_OFF = 5.0        # sigmas at which a delay or a lever arm that differs is worth saying
 ROUNDING = 1e-9      # of a correlation: there is none
 AXES = ('x', 'y', 'z', 'xy', 'zx')      # ends of names: constants that are one source
 CALLED = {'gnss_delay': 'fix_latency', 'heading_offset': 'heading'}    # in a leg's budget
@@ -69,6 +70,8 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
     for name in found.spread:
         z = found.deviation[:, found.names.index(name)]
         k = int(np.argmax(np.abs(z)))
+        if name not in PARAMETERS and abs(z[k]) < FAR_OFF:
+            continue
         # of two each differs from the other alike
         who = f', leg {numbers[k]} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
         said.append(f'{name} differs between the {J} legs {np.sqrt((z**2).mean()):.1f} times more '
@@ -99,5 +102,5 @@ def _details(found: Joint, value, C, sources, legs):
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
         'correlation': correlations(C[:P, :P], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
-                         'between_legs': found.spread},
+                         'between_legs': found.spread, 'curvature': found.bent},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}
