@@ -49,7 +49,8 @@ def driven(vehicle, legs, grade, fixes):
     own = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
            'gyro_scale_error': float(of_grade.gyro_scale_error / 3 * rng.standard_normal()),
            'scale': float(0.0213 * np.exp(0.01 * rng.standard_normal())),
-           'yaw': float(np.deg2rad(2.0) * rng.standard_normal())}
+           'yaw': float(np.deg2rad(2.0) * rng.standard_normal()),
+           'pitch': float(np.deg2rad(1.0) * rng.standard_normal())}
     results, times = [], []
     for j in range(legs):
         drive, config = simulated(
