@@ -102,5 +102,5 @@ def _details(found: Joint, value, C, sources, legs):
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
         'correlation': correlations(C[:P, :P], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
-                         'between_legs': found.spread, 'curvature': found.bent},
+                         'between_legs': found.spread, 'curvature': found.bent.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}
