@@ -182,6 +182,8 @@ class VerdictConfig:
     max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw '
                                    'mounting angle.')
     min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='How far the scale '
+                                         'factor walks between legs, relative, 1 sigma (tyres).')
 
 
 @dataclass(frozen=True, kw_only=True)

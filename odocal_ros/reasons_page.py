@@ -156,8 +156,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'three sigmas of their difference.',
     },
     'Several legs': {
-        Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow. The sigma of the '
-        'combination holds that.',
+        Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow; in what, and of the '
+        'smoother which leg most, is said. The sigma of the combination holds that.',
         Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
         'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
         'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
@@ -48,6 +49,7 @@ class MethodResult:
     parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
     sources: tuple[Source, ...] = ()
     details: dict = field(default_factory=dict)
+    border: Border | None = None        # of one leg, None where the method has none
 
     @property
     def verdict(self) -> Verdict:

@@ -9,7 +9,6 @@ import pytest
 from smoother_legs import leg_of, made, truth
 
 from odocal_ros.calib.budget import total_covariance
-from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.noise import Levels
@@ -119,14 +118,6 @@ def test_sources_add_up_to_the_sigma():
     scale = method.estimates['scale_factor']
     assert total[0] == pytest.approx(scale.sigma / scale.value, rel=1e-3)
     assert total[1] == pytest.approx(method.estimates['yaw_mounting_angle'].sigma, rel=1e-3)
-
-
-def test_legs_combine():
-    _, one = result()
-    _, two = result(seed=2)
-    both = combine_method('smoother', [one, two])
-    assert both.estimates['scale_factor'].sigma < one.estimates['scale_factor'].sigma
-    assert both.estimates['gyro_bias_z'].value == two.estimates['gyro_bias_z'].value
 
 
 def test_an_even_drive_straight_on_tells_no_yaw():

@@ -5,6 +5,7 @@ import numpy as np
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
@@ -18,6 +19,7 @@ from odocal_ros.calib.smoother.state import (
     GYRO,
     HEADING,
     LN_K,
+    M,
     ODO_ARM,
     PITCH,
     YAW,
@@ -75,26 +77,11 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     reasons += slip_reasons(fit, slips)
     sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
     state, c = fit.state, fit.state.constants
-    K, yaw, pitch = state.scale, float(wrap(c[YAW])), float(c[PITCH])
-    found = _unknown(leg.scale_unit)
-    if sigma[LN_K] <= SCALE_LIMIT:
-        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), leg.scale_unit)
-        if leg.nominal_scale:
-            ratio = K / leg.nominal_scale
-            found['scale_ratio'] = Estimate(ratio, float(ratio * sigma[LN_K]), '1')
-    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
-    for name, i, value in (('yaw_mounting_angle', YAW, yaw),
-                           ('pitch_mounting_angle', PITCH, pitch)):
-        if sigma[i] <= limit:
-            found[name] = Estimate(value, float(sigma[i]), 'rad')
-    reasons += _undetermined(sigma, limit, config, yaw)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
-    for i in OPTIONAL:
-        name = CONSTANTS[i]
-        if ratio[name] < INFORMED:
-            value = c[i] + _configured(leg, i)
-            found[name] = Estimate(float(value), float(sigma[i]), UNITS[name])
+    found, undetermined = told(c + configured(leg), sigma, after, leg.scale_unit,
+                               leg.nominal_scale, config)
+    reasons += undetermined
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
@@ -110,7 +97,48 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     sources = [_widened(s, widen) for s in shares(fit, near)]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
-                        | {'slips': [vars(s) for s in slips]})
+                        | {'slips': [vars(s) for s in slips]},
+                        border_of(fit, configured(leg)).widened(widen))
+
+
+def told(value, sigma, ratio, scale_unit, nominal, config):
+    """
+    Return the estimates of the constants as far as the data tell them, and why not further.
+
+    Parameters
+    ----------
+    value, sigma : (M,) arrays
+        Of the constants, ln K first, whole lever arms.
+    ratio : (M,) array
+        Sigma by that believed beforehand.
+    scale_unit, nominal : str, float
+        Of the scale; K0, 0 unknown.
+    config : Config
+        Limits.
+
+    """
+    K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
+    found = _unknown(scale_unit)
+    if sigma[LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
+        if nominal:
+            found['scale_ratio'] = Estimate(K / nominal, float(K / nominal * sigma[LN_K]), '1')
+    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
+    for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
+                           ('pitch_mounting_angle', PITCH, pitch)):
+        if sigma[i] <= limit:
+            found[name] = Estimate(angle, float(sigma[i]), 'rad')
+    for i in OPTIONAL:
+        if ratio[i] < INFORMED:
+            found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
+    return found, _undetermined(sigma, limit, config, yaw)
+
+
+def configured(leg):
+    """Return the values of the settings that constants are corrections to: (M,)."""
+    value = np.zeros(M)
+    value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
+    return value
 
 
 def in_words(names):
@@ -129,13 +157,6 @@ def in_words(names):
 
 def _widened(source, widen):
     return type(source)(source.name, source.effects * widen, source.shared)
-
-
-def _configured(leg, i):
-    """Return the configured value that a constant is a correction to, 0 for delays."""
-    if ODO_ARM.start <= i < ODO_ARM.stop:
-        return leg.odometer_arm[i - ODO_ARM.start]
-    return leg.antenna_arm[i - GNSS_ARM.start] if GNSS_ARM.start <= i < GNSS_ARM.stop else 0.0
 
 
 def _undetermined(sigma, limit, config, yaw):
