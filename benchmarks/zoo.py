@@ -125,22 +125,20 @@ def outcome(calibration, truth):
         row |= {key: estimate.value, f'{key}_sigma': estimate.sigma / unit,
                 f'{key}_error': (estimate.value - true) / unit, f'{key}_by': estimate.method}
         if key != 'scale':
-            row |= against_housing(found, name, key, getattr(truth, f'{key}_housing'))
+            row |= against_housing(calibration, name, key, getattr(truth, f'{key}_housing'))
     smoother = calibration.legs[0].methods.get('smoother')
     details = smoother.details if smoother else {}
     return row | {name: details[name] for name in ('iterations', 'settled', 'widened')
                   if isinstance(details.get(name), int | float | bool)}
 
 
-def against_housing(found, name, key, true):
+def against_housing(calibration, name, key, true):
     """Return the error against the housing's angle, and its sigma where the product states one."""
-    own, sigma = (found.get(f'{name}_housing{what}') for what in ('', '_sigma'))
-    value = found[name].value if own is None or own.value is None else own.value
-    row = {f'{key}_housing_error': value - true}
-    if sigma is not None and sigma.value is not None:
-        row[f'{key}_housing_sigma'] = sigma.value
-    elif own is not None and own.sigma is not None:
-        row[f'{key}_housing_sigma'] = own.sigma
+    estimate = calibration.estimates[name]
+    details = calibration.methods[estimate.method].details
+    row = {f'{key}_housing_error': estimate.value - true}
+    if 'beside' in details:
+        row[f'{key}_housing_sigma'] = details['beside'][f'{name}_housing_sigma']['value']
     return row
 
 

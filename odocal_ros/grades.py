@@ -4,6 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 import math
 
+G = 9.80665          # m/s^2
+
 
 @dataclass(frozen=True)
 class Grade:
@@ -39,7 +41,7 @@ def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_b
         accel_bias_walk=accel_bias_walk / root_hour,
         gyro_scale_error=gyro_scale_error, accel_scale_error=accel_scale_error,
         misalignment=math.radians(misalignment),
-        gyro_by_force=math.radians(gyro_by_force) / 9.80665)
+        gyro_by_force=math.radians(gyro_by_force) / G)
 
 
 # Gyro scale: data sheets of consumer MEMS give limits of 3 % for a new chip (MPU-6050: +-3 % at
@@ -61,6 +63,23 @@ SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
             'accel_scale_error': 'accel_scale_sigma',
             'misalignment': 'misalignment_sigma',
             'gyro_by_force': 'gyro_by_force_sigma'}     # named otherwise than the figure
+
+
+def grade_as_seen(imu, variance) -> Grade:
+    """
+    Return the grade of the imu settings, or a worse one that its noise at rest is nearer to.
+
+    One taken for better than it is would have its bias and its scale held to what they are not.
+
+    variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
+    """
+    grades = [grade_of(dataclasses.replace(imu, grade=name)) for name in GRADES]
+    told = list(GRADES).index(imu.grade)
+    if not variance:
+        return grades[told]
+    return min(reversed(grades[:told + 1]), key=lambda grade: sum(
+        abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
+        for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))))
 
 
 def grade_of(imu) -> Grade:

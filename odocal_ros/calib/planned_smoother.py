@@ -54,7 +54,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels, problem.priors)
-        priors = judged_priors(fit, sigmas.config, found=False)
+        priors = judged_priors(fit, problem.grade, found=False)
         if priors is not fit.priors:
             fit = _fit(problem, made, levels, priors)
     except (NotPositive, np.linalg.LinAlgError) as error:

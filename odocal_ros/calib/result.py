@@ -9,6 +9,11 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
+# what stands in a result beside its estimates (calibration.json)
+BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
+                    'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
+                    'pitch_mounting_angle_housing_sigma'})
+
 
 @dataclass(frozen=True)
 class Estimate:

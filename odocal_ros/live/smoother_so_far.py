@@ -160,7 +160,7 @@ class SmootherSoFar:
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
-        best = judge_running(best, config)      # more of a drive tells more of it
+        best = judge_running(best, problem.grade)      # more of a drive tells more of it
         best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
         if not best.settled:
             best = fit(problem, best.state, best.levels, MORE, about=best, trace=trace)
@@ -202,7 +202,7 @@ def _decided_anew(best, anew, problem, config, trace):
     apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
     if apart.max() > AGREE:
         return best_fit(problem, config, trace)
-    return judge_imperfect(problem, best, config, trace)
+    return judge_imperfect(problem, best, trace)
 
 
 def _refuse_unusable(found):

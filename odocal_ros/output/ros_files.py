@@ -4,7 +4,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.config import Config
 from odocal_ros.output.controller_files import CONTROLLERS, controllers
 from odocal_ros.output.device_files import DEVICES, devices
@@ -52,7 +52,7 @@ def _params(calibration, content) -> str:
              '/**:', '  ros__parameters:', '    result:']
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     for name, entry in (unknown | content['result']).items():
-        if name != 'imu_rotation':
+        if name not in BESIDE:
             lines += [f'      {name}: {number(entry["value"])}',
                       f'      {name}_sigma: {number(entry["sigma"])}']
     valid = calibration.verdict is not Verdict.REJECTED

@@ -82,13 +82,14 @@ def weigh_kinds(data, gradient, kinds):
     return prior
 
 
-def judged_priors(now: Fit, config, found=True):
+def judged_priors(now: Fit, grade, found=True):
     """
     Return a fit's priors with what is to be believed of imperfections.
 
-    found : False: as where there are none, whatever the fit's values.
+    grade : Grade, that the Imu is taken for.   found : False: as where there are none, whatever
+    the fit's values.
     """
-    usual = imperfect_sigmas(config, now.state.t[-1] - now.state.t[0])
+    usual = imperfect_sigmas(grade, now.state.t[-1] - now.state.t[0])
     there = np.flatnonzero(usual > 0)
     sigma, last = usual[there], now.priors.constants[IMPERFECT][there]
     if now.levels.correlation_time or not len(there):
@@ -110,9 +111,9 @@ def judged_priors(now: Fit, config, found=True):
     return with_imperfect(now.priors, sigmas)
 
 
-def judge_running(now: Fit, config) -> Fit:
+def judge_running(now: Fit, grade) -> Fit:
     """Return a fit with what it tells of imperfections believed: where the next sets out."""
-    priors = judged_priors(now, config)
+    priors = judged_priors(now, grade)
     if priors is now.priors:
         return now
     return replace(now, priors=priors,
@@ -126,13 +127,13 @@ def with_imperfect(priors, sigmas):
     return replace(priors, constants=constants)
 
 
-def judge_imperfect(problem, now: Fit, config, trace=None) -> Fit:
+def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
     """
     Return a fit whose sigmas hold the imperfections that there may be, and no more.
 
     now : made with the usual ones.   trace : as for ``fit``.
     """
-    about = judge_running(now, config)
+    about = judge_running(now, problem.grade)
     if about is now:
         return now
     last = fit(problem, now.state, now.levels, FEW, about=about, frozen=True, trace=trace)

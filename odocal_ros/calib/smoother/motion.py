@@ -40,6 +40,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 D = slice(15, 18)       # rows of the odometer
 ROWS = 18
+SPRUNG = 0.07       # s, 2 z / w of a body on springs: 1.3 Hz, damped by 0.3
 
 
 def rotvec(C):
@@ -110,6 +111,8 @@ class Motion:
         state, T, c = self.state, self.T, self.state.constants
         gained = np.diff(state.v_n, axis=0) / T
         self.accel_v = turn(np.swapaxes(self.C @ state.C_bv, 1, 2), gained)
+        if len(T) > 1:       # a body answers to what accelerates it a moment later
+            self.accel_v -= SPRUNG * np.gradient(self.accel_v, axis=0) / T
         way = np.linalg.norm(self.sums.S @ self.f, axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         total = max(way.sum(), 1e-9)

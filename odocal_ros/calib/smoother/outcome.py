@@ -4,9 +4,10 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.mismatch import mismatch
+from odocal_ros.calib.smoother.remarks import beside, FLOOR, level_pitch, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
@@ -75,8 +76,10 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     widen, reasons = mismatch(problem, fit, near, config)
     slips = find_slips(fit, near)
     reasons += slip_reasons(fit, slips)
-    sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
     state, c = fit.state, fit.state.constants
+    covariance = floored(fit.solved.covariance * widen**2)
+    sigma = np.sqrt(np.diag(covariance))
+    reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = told(c + configured(leg), sigma, after, leg.scale_unit,
@@ -94,11 +97,20 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                               f'{in_words(unsaid)}; what the settings say of it is kept'))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
-    sources = [_widened(s, widen) for s in shares(fit, near)]
+    sources = [*(_widened(s, widen) for s in shares(fit, near)), Source('model', np.diag(FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
-                        | {'slips': [vars(s) for s in slips]},
+                        | {'slips': [vars(s) for s in slips],
+                           'beside': beside(c, covariance, problem.grade),
+                           'level_pitch_angle': level_pitch(fit, near, widen)},
                         border_of(fit, configured(leg)).widened(widen))
+
+
+def floored(covariance):
+    """Return the covariance of the constants with what the model does not hold."""
+    covariance = covariance.copy()
+    covariance[range(len(FLOOR)), range(len(FLOOR))] += FLOOR**2
+    return covariance
 
 
 def told(value, sigma, ratio, scale_unit, nominal, config):

@@ -7,7 +7,7 @@ import numpy as np
 from odocal_ros.calib.sanity import G
 from odocal_ros.calib.smoother.equations import PARTS
 from odocal_ros.calib.smoother.fixes import whitener
-from odocal_ros.calib.smoother.imu_noise import shaken
+from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside_rows import used
@@ -33,7 +33,7 @@ from odocal_ros.calib.smoother.state import (
     Priors,
     State,
 )
-from odocal_ros.grades import Grade, grade_of
+from odocal_ros.grades import Grade, grade_as_seen
 
 # how near to the last pass over the samples a state must lie to do without another: first order
 # leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix
@@ -70,7 +70,7 @@ class Problem:
         t = imu.t[imu.key]
         still = standing(leg, t)
         use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
-        grade = grade_of(config.imu)
+        grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, root, still, used(leg, t),
                    turned(leg, imu))
@@ -153,18 +153,17 @@ def _errors(signals, constants, axes, by):
     return signals @ matrix.T
 
 
-def imperfect_sigmas(config, duration):
+def imperfect_sigmas(grade, duration):
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
-    Those of the Imu by its grade and the settings. A receiver that smooths does so over a second.
+    Those of the Imu by its grade. A receiver that smooths does so over a second.
     Tyres change by 0.2 % from 5 to 25 m/s, and by 0.25 % as they warm within ten minutes or so;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
     """
-    grade = grade_of(config.imu)
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     imu = np.repeat([grade.gyro_scale_error, grade.gyro_by_force, grade.accel_scale_error, axes],
-                    [2, 6, 2, 2])
+                    [2, 6, 3, 2])
     return np.r_[imu, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 5e-3]
 
 
@@ -175,7 +174,7 @@ def _priors(config, grade, leg) -> Priors:
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[HEADING] = leg.heading.sigma
     sigma[GYRO_SCALE] = max(grade.gyro_scale_error, NO_ERROR)
-    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(config, leg.t_stop - leg.t_begin), NO_ERROR)
+    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade, leg.t_stop - leg.t_begin), NO_ERROR)
     # what gravity makes of axes and scale is a bias
     level = np.sqrt(2) * G * grade.misalignment
     accel_bias = np.hypot(max(grade.accel_bias, 1e-6), [level, level, grade.accel_scale_error * G])

@@ -6,16 +6,17 @@ from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
-from odocal_ros.calib.smoother.outcome import in_words, OPTIONAL, SCALES, told
+from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
+from odocal_ros.calib.smoother.priors import SHARED
+from odocal_ros.calib.smoother.remarks import beside, FLOOR
 from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
+from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
 
 P = 3                # parameters: ln K, yaw, pitch, the first of CONSTANTS
 DAY = 86400e9        # ns
 FAR_OFF = 5.0        # sigmas at which a delay or a lever arm that differs is worth saying
 ROUNDING = 1e-9      # of a correlation: there is none
-AXES = ('x', 'y', 'z', 'xy', 'zx')      # ends of names: constants that are one source
-CALLED = {'gnss_delay': 'fix_latency', 'heading_offset': 'heading'}    # in a leg's budget
 
 
 def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
@@ -47,7 +48,8 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     found = joint([leg.border for leg in legs], config.verdict.scale_drift_per_day * np.sqrt(days),
                   CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
     at = [found.names.index(name) for name in CONSTANTS]
-    sigma = np.sqrt(np.diag(found.covariance))[at]
+    C = floored(found.covariance[np.ix_(at, at)])
+    sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
     scale = legs[-1].estimates['scale_factor']
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
@@ -58,10 +60,10 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     if unsaid:
         why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
                           f'{in_words(unsaid)}; what the settings say of it is kept'))
-    C = found.covariance[np.ix_(at, at)]
     sources = _sources(found.used[at] * found.factor, C)
     return MethodResult('smoother', (*_disputed(found, names), *why), estimates, PARAMETERS,
-                        sources, _details(found, found.value[at], C, sources, len(legs)))
+                        sources, _details(found, found.value[at], C, sources, len(legs))
+                        | {'beside': beside(found.value[at], C, grade_of(config.imu))})
 
 
 def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
@@ -84,15 +86,13 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
 
 def _sources(used, C) -> tuple[Source, ...]:
     """Return the budget: what is believed of the vehicle, and what is the legs' own."""
-    at: dict[str, list[int]] = {}
-    for i, name in enumerate(CONSTANTS[P:], P):
-        stem, _, axis = name.rpartition('_')
-        at.setdefault(stem if axis in AXES else CALLED.get(name, name), []).append(i)
     alike = np.abs(C[:P] / np.sqrt(np.outer(np.diag(C)[:P], np.diag(C)))).max(axis=0)
-    shared = [Source(name, C[:P, i] / used[i], True) for name, i in at.items()
+    shared = [Source(name, C[:P, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > ROUNDING]
-    size, V = np.linalg.eigh(C[:P, :P] - sum(s.effects @ s.effects.T for s in shared))
-    return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))))
+    apart = np.diag(FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    size, V = np.linalg.eigh(C[:P, :P] - apart)
+    return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
+            Source('model', np.diag(FLOOR)))
 
 
 def _details(found: Joint, value, C, sources, legs):

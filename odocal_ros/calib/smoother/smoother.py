@@ -58,7 +58,7 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 def best_fit(problem, config, trace=None):
     """Return the likeliest fit, the Imu's own errors judged."""
-    return judge_imperfect(problem, likeliest_fit(problem, config, trace), config, trace)
+    return judge_imperfect(problem, likeliest_fit(problem, config, trace), trace)
 
 
 def likeliest_fit(problem, config, trace=None):
