@@ -52,7 +52,7 @@ def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_b
 GRADES: dict[str, Grade] = {
     'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01, 0.5, 0.06),
     'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3, 0.1, 0.01),
-    'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4, 3e-4, 5e-4, 0.02,
+    'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4, 3e-4, 5e-4, 0.05,
                                  4e-4),
     'navigation': _from_data_sheet(0.001, 0.01, 0.003, 0.005, 5e-4, 5e-5, 1e-5, 1e-4,
                                    2e-3, 1e-5),

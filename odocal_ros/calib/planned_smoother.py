@@ -97,4 +97,4 @@ def _fit(problem, made: Ideal, levels, priors) -> Fit:
     state = made.state
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), weighted,
-               solve(weighted.normal()), True, 0)
+               solve(weighted.normal()), True, False, 0)

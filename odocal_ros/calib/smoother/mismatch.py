@@ -31,7 +31,7 @@ def mismatch(problem, fit, neighbours, config):
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
                               f'({", ".join(worse)}); estimated from the drive instead'))
-    widen, odd = 1.0, []
+    widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
     if shaken:      # what shakes a vehicle is not white, and how it is coloured is not known
         odd.append('the Imu errs more than its grade, in ways that are not white noise')
     share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())

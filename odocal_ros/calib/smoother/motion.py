@@ -16,10 +16,11 @@ from odocal_ros.calib.smoother.state import (
     ACCEL_SIGNAL,
     BA,
     BG,
+    BY_FORCE,
     BY_SPEED,
-    BY_TIME,
     C_bv_gradient,
     E,
+    FAST,
     GYRO,
     GYRO_AXIS,
     GYRO_SIGNAL,
@@ -116,8 +117,9 @@ class Motion:
         way = np.linalg.norm(self.sums.S @ self.f, axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         total = max(way.sum(), 1e-9)
-        self.from_mean = np.stack([x - (x @ way) / total for x in (way / T[:, 0], t)], -1)
-        self.varied = 1 + self.from_mean @ c[[BY_SPEED, BY_TIME], None]
+        self.from_mean = np.stack([x - (x @ way) / total for x in (
+            (way / T[:, 0])**2 / (2 * FAST), t, self.accel_v[:, 0])], -1)
+        self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1, None]
         self.leaned = state.scale * (
             np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
             + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
@@ -161,8 +163,8 @@ class Motion:
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
         c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
-        c[:, D, BY_SPEED], c[:, D, BY_TIME] = (
-            c[:, D, LN_K] * x[:, None] / self.varied for x in self.from_mean.T)
+        c[:, D, BY_SPEED:BY_FORCE + 1] = (c[:, D, LN_K] / self.varied)[:, :, None] \
+            * self.from_mean[:, None]
         for column, gradient, lean, accel in ((YAW, self.by_yaw, SIDESLIP, self.accel_v[:, 1]),
                                               (PITCH, self.by_pitch, SQUAT, self.accel_v[:, 0])):
             turned = -(C @ s.S @ (state.scale * gradient[:, 0]))

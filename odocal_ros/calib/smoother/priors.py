@@ -7,8 +7,8 @@ from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
     BG,
+    BY_FORCE,
     BY_SPEED,
-    BY_TIME,
     FIX_LAG2,
     GNSS_ARM,
     GNSS_DELAY,
@@ -34,7 +34,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'accelerometer_scale': slice(ACCEL.start, ACCEL.start + 3),
           'accelerometer_axes': slice(ACCEL.start + 3, ACCEL.stop),
           'receiver_smoothing': slice(FIX_LAG2, FIX_LAG2 + 1),
-          'tyre_changes': slice(BY_SPEED, BY_TIME + 1),
+          'tyre_changes': slice(BY_SPEED, BY_FORCE + 1),
           'body_lean': slice(SQUAT, SIDESLIP + 1),
           'heading': slice(HEADING, HEADING + 1)}
 

@@ -158,13 +158,14 @@ def imperfect_sigmas(grade, duration):
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
     Those of the Imu by its grade. A receiver that smooths does so over a second.
-    Tyres change by 0.2 % from 5 to 25 m/s, and by 0.25 % as they warm within ten minutes or so;
+    Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
+    slip by 0.3 % for each m/s^2;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     imu = np.repeat([grade.gyro_scale_error, grade.gyro_by_force, grade.accel_scale_error, axes],
                     [2, 6, 3, 2])
-    return np.r_[imu, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 5e-3]
+    return np.r_[imu, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 3e-3, 5e-3]
 
 
 def _priors(config, grade, leg) -> Priors:

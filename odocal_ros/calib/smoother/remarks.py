@@ -40,6 +40,7 @@ def beside(value, covariance, grade) -> dict:
     value, covariance : (M,), (M, M) of the constants.   grade : Grade that the Imu is taken for.
     """
     sigma = np.sqrt(np.diag(covariance))
+    # scale_by_speed: the slope at FAST
     out: dict = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
                  for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
                                        ('scale_by_time', BY_TIME, '1/s'))}

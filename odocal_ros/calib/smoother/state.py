@@ -30,7 +30,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'gyro_y_by_force_x', 'gyro_y_by_force_y', 'gyro_z_by_force_x', 'gyro_z_by_force_y',
              'accelerometer_scale_x', 'accelerometer_scale_y', 'accelerometer_scale_z',
              'accelerometer_axis_xy', 'accelerometer_axis_zx', 'fix_lag_square',
-             'scale_by_speed', 'scale_by_time', 'squat', 'sideslip')
+             'scale_by_speed', 'scale_by_time', 'scale_by_acceleration', 'squat', 'sideslip')
 LN_K, YAW, PITCH = 0, 1, 2
 ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY = 9, 10
@@ -45,14 +45,16 @@ GYRO_AXIS, GYRO_SIGNAL = (2, 0, 1, 0, 0, 1, 1, 2, 2), (2, 0, 1, 3, 4, 3, 4, 3, 4
 ACCEL = slice(21, 26)
 ACCEL_AXIS, ACCEL_SIGNAL = (0, 1, 2, 0, 2), (0, 1, 2, 1, 0)
 FIX_LAG2 = 26                # s^2, square of the time constant by which a receiver smooths
-# relative change of the scale with speed, 1 / (m/s), and time, 1 / s, from their means by travel
-BY_SPEED, BY_TIME = 27, 28
-SQUAT, SIDESLIP = 29, 30     # rad per m/s^2: the forward axis by forward and by left acceleration
+# relative change of the scale with the square of the speed (as its slope at FAST, 1 / (m/s)), with
+# time, 1 / s, and forward acceleration, 1 / (m/s^2), from their means by travel
+BY_SPEED, BY_TIME, BY_FORCE = 27, 28, 29
+FAST = 20.0                  # m/s
+SQUAT, SIDESLIP = 30, 31     # rad per m/s^2: the forward axis by forward and by left acceleration
 # what a good vehicle has not: all from here on, but for the gyro's scale, which every turn tells
-IMPERFECT = slice(13, 31)
+IMPERFECT = slice(13, 32)
 # kinds of these, each there or not: gyro scales, gyro by force, accelerometer scales, axes, ...
 KINDS = (slice(0, 2), slice(2, 8), slice(8, 11), slice(11, 13),
-         *(slice(i, i + 1) for i in range(13, 18)))
+         *(slice(i, i + 1) for i in range(13, 19)))
 M = len(CONSTANTS)
 
 
