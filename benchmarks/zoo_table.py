@@ -16,20 +16,21 @@ HONEST = {'PARAMETER_NOT_DETERMINED', 'SCALE_SIGMA_TOO_LARGE', 'YAW_SIGMA_TOO_LA
 BY_KIND = {'yard': {'SPEED_TOO_LOW', 'LEG_TOO_SHORT'}}
 GENERAL = {'MODEL_MISMATCH', 'METHODS_DISAGREE'}     # something is wrong, and not what
 FIXES = {'FIXES_NOISIER_THAN_SAID', 'PLANES_DISAGREE', *GENERAL}
-IMU = {'IMU_WORSE_THAN_GRADE', *GENERAL}
+IMU = {'IMU_WORSE_THAN_GRADE', 'IMU_AXES_SKEW', *GENERAL}
+TYRES = {'SCALE_VARIES'}
 WHEELS = {'WHEEL_SLIP', *GENERAL}
 EXPLAINS = {
     'triads': IMU, 'g_sensitivity': IMU, 'bias': {'TRACK_MISMATCH', *IMU},
     'temperature': {'TRACK_MISMATCH', *IMU},      # what the standstill told no longer holds
     'vibration': IMU | WHEELS, 'grade': IMU,
     'imu_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *IMU},
-    'coarse_speed': WHEELS, 'coarse_pulses': GENERAL,
+    'coarse_speed': {'SPEED_COARSE', *WHEELS}, 'coarse_pulses': {'COUNTER_COARSE', *GENERAL},
     'odometer_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', *WHEELS},
-    'speed_law': WHEELS, 'warming': WHEELS, 'slip': WHEELS,
+    'speed_law': WHEELS | TYRES, 'warming': WHEELS | TYRES, 'slip': WHEELS | TYRES,
     'sideslip': GENERAL,
     'squat': WHEELS,
-    'lever_arms': FIXES,
-    'receiver_lag': {'DELAY_SEEN', *GENERAL},
+    'lever_arms': {'LEVER_ARM_OFF', *FIXES},
+    'receiver_lag': {'DELAY_SEEN', 'FIXES_SMOOTHED', *GENERAL},
     'fix_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *GENERAL},
     'slow_errors': FIXES, 'multipath': {'TRACK_MISMATCH', 'FIXES_UNUSABLE', *FIXES},
     'covariance': {'FIXES_UNUSABLE', *FIXES}, 'outages': {'TOPIC_GAP', 'STAMPS_NOT_RISING'}}

@@ -1,12 +1,19 @@
 """The Imu's own errors: judged from the drive, held by the sigma."""
 
+from dataclasses import replace
+import re
+
 import numpy as np
 import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.imperfect import believed, weigh_kinds
-from odocal_ros.config import with_settings
+from odocal_ros.calib.smoother.state import FAST
+from odocal_ros.config import Config, with_settings
+from odocal_ros.grades import grade_as_seen, GRADES
+from odocal_ros.reasons import Code
+from odocal_ros.sim.real import Real
 
 GRADE, BELIEF = 3e-3, 0.8
 TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
@@ -91,3 +98,76 @@ def test_the_sigma_of_the_scale_holds_it(noise):
     # of an Imu said to have none, the error is many sigmas: what this is for
     wrong = smooth(leg, config).estimates['scale_factor']
     assert abs(wrong.value - drive.truth.scale) > 4.0 * wrong.sigma
+
+
+SKEW = np.deg2rad(0.5)
+# gyro: z into x; accelerometer: x into y and into z
+GYRO = (0.0, 0.0, SKEW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+ACCEL = (0.0, 0.0, 0.0, SKEW, 0.0, 0.0, SKEW, 0.0, 0.0)
+
+
+@pytest.mark.parametrize('noise', ['white', 'rtk'])
+def test_angles_are_those_of_the_axes_that_the_imu_measures_in(noise):
+    drive, config, leg = made(scenario='town', duration=400.0, imu_grade='consumer', seed=4,
+                              fix_noise=noise, yaw=0.02, pitch=0.01,
+                              real=Real(gyro_matrix=GYRO, accel_matrix=ACCEL))
+    graded = with_settings(config, {'imu.misalignment_sigma': np.nan})
+    truth, found = drive.truth, smooth(leg, graded)
+    assert abs(truth.yaw - truth.yaw_housing) == pytest.approx(SKEW, rel=0.05)
+    for name, true, housing in (('yaw', truth.yaw, truth.yaw_housing),
+                                ('pitch', truth.pitch, truth.pitch_housing)):
+        e = found.estimates[f'{name}_mounting_angle']
+        assert abs(e.value - true) < 3.0 * e.sigma
+        assert abs(e.value - housing) > 5.0 * e.sigma        # 20 to 50 mdeg for 500
+        beside = found.details['beside'][f'{name}_mounting_angle_housing_sigma']['value']
+        assert abs(e.value - housing) < 3.0 * beside
+    # a fit that knows of no such axes is wrong: what this is for
+    blind = smooth(leg, config).estimates['pitch_mounting_angle']
+    assert abs(blind.value - truth.pitch) > 5.0 * blind.sigma
+
+
+def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
+    # with derivatives by the force as measured, its noise: 0.15 +- 0.22 deg, 1.7 is true
+    drive, config, leg = made(scenario='straight', duration=600.0, imu_grade='consumer', seed=4,
+                              yaw=np.deg2rad(1.7))
+    graded = with_settings(config, {'imu.accel_scale_sigma': np.nan,
+                                    'imu.misalignment_sigma': np.nan})
+    found = smooth(leg, graded)
+    e = found.estimates['yaw_mounting_angle']
+    assert abs(e.value - drive.truth.yaw) < 3.0 * e.sigma
+    assert abs(found.details['accelerometer_scale_y']['value']) < 0.005     # nothing tells it
+
+
+def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_one():
+    imu = Config().imu
+    grade = GRADES['tactical']
+    tactical = {'gyro': grade.gyro_noise**2, 'accel': grade.accel_noise**2}
+    for told, seen in (('navigation', 'tactical'), ('tactical', 'tactical'),
+                       ('consumer', 'consumer')):
+        assert grade_as_seen(replace(imu, grade=told), tactical) == GRADES[seen]
+    shaken = {name: 100.0 * value for name, value in tactical.items()}
+    assert grade_as_seen(replace(imu, grade='tactical'), shaken) == GRADES['consumer']
+    assert grade_as_seen(replace(imu, grade='navigation'), {}) == GRADES['navigation']
+
+
+def test_what_a_vehicle_shows_beside_its_values_is_said():
+    real = Real(receiver_lag=0.3, speed_law=0.006)
+    drive, config, leg = made(scenario='town', duration=400.0, imu_grade='industrial', seed=4,
+                              fix_noise='rtk', real=real, antenna_lever_arm=(0.8, 0.0, 1.0))
+    off = with_settings(config, {'gnss.lever_arm': (0.0, 0.0, 1.0)})
+    leg = replace(leg, antenna_arm=np.array([0.0, 0.0, 1.0]))
+    found = smooth(leg, off)
+    said = {r.code: r.text for r in found.reasons}
+    tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
+    assert tau == pytest.approx(real.receiver_lag, rel=0.1)      # by a series: jerk is left out
+    assert 'gnss.lever_arm x by +0.8' in said[Code.LEVER_ARM_OFF]
+    assert 'from slow to fast' in said[Code.SCALE_VARIES]
+    slope = found.details['beside']['scale_by_speed']
+    true = 2 * real.speed_law / 36.0**2 * FAST
+    assert abs(slope['slope'] - true) < 3.0 * slope['sigma']
+    e = found.estimates['scale_factor']
+    assert abs(e.value - drive.truth.scale) < 3.0 * e.sigma
+    # and of a vehicle that has none of it nothing
+    clean = {r.code for r in smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config).reasons}
+    assert not clean & {Code.FIXES_SMOOTHED, Code.LEVER_ARM_OFF, Code.SCALE_VARIES,
+                        Code.IMU_AXES_SKEW}
