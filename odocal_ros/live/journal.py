@@ -12,7 +12,8 @@ from rclpy.clock_type import ClockType
 from rclpy.serialization import serialize_message
 
 from odocal_ros.config import Config
-from odocal_ros.live.inputs import Input, message_class
+from odocal_ros.live.definitions import message_class
+from odocal_ros.live.inputs import Input
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import Heard, JournalWriter

@@ -21,12 +21,13 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live import params
-from odocal_ros.live.answers import one_line
+from odocal_ros.live import answers, params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.recording import Recording
+from odocal_ros.outside import one_line, said_by
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
@@ -62,8 +63,7 @@ class Calibrator(Node):
             self._build()
         except (ParameterException, InvalidQosOverridesError) as error:
             self.destroy_node()
-            text = ' '.join(str(error).split())
-            raise BadConfig(f'{text}; correct the parameter and start again') from None
+            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
         except Exception:
             self.destroy_node()
             raise
@@ -95,6 +95,10 @@ class Calibrator(Node):
             if hasattr(self, part):
                 getattr(self, part).close()
         super().destroy_node()
+
+    def get_logger(self) -> PlainLog:     # type: ignore[override]
+        """Return the node's log."""
+        return PlainLog(super().get_logger())
 
     # parameters
 
@@ -175,7 +179,7 @@ def main(args=None) -> int:
                              'written after --ros-args (see calibrator --help)')
         _init(args)
     except Exception as error:
-        text = ' '.join(str(error).split()).split(', at /')[0]
+        text = said_by(error).split(', at /')[0]
         return _complain(f'{text}; write parameters as --ros-args -p name:=value, remaps as -r '
                          'from:=to')
     executor, node, code = SingleThreadedExecutor(), None, 0
@@ -189,7 +193,7 @@ def main(args=None) -> int:
         code = _complain(str(error))
     except Exception as error:
         # a callback caught in the middle of a shutdown may find its publisher gone
-        code = _complain(one_line(error)) if rclpy.ok() else 0
+        code = _complain(answers.one_line(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
         if node is not None:
@@ -214,7 +218,7 @@ def _init(args) -> None:
 
 
 def _complain(text: str) -> int:
-    print(f'calibrator: {text}', file=sys.stderr)
+    print(one_line(f'calibrator: {text}'), file=sys.stderr)
     return 1
 
 

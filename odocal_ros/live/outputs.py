@@ -10,7 +10,7 @@ import numpy as np
 from std_msgs.msg import Header
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config, with_settings
+from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.shelf import Shelf
 
@@ -63,8 +63,8 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
 
     """
     from odocal_ros.output.files import write_results
-    if not config.frames.imu and imu_frame:
-        config = with_settings(config, {'frames.imu': imu_frame})
+    from odocal_ros.output.frames import framed
+    calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config)
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:

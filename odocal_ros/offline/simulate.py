@@ -3,10 +3,11 @@
 import argparse
 import math
 from pathlib import Path
-import shlex
 import sys
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.say import say
+from odocal_ros.outside import for_shell
 
 HELP = 'write a bag with known truth'
 TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
@@ -148,9 +149,9 @@ def run(args) -> int:
     if not args.quiet:
         replay = ['odocal', 'replay', str(out), '--config', str(beside[1]),
                   *topic_arguments(drive)]
-        print(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
-              f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
-              f'{shlex.join(replay)}')
+        say(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
+            f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
+            f'{for_shell(replay)}')
     return 0
 
 
