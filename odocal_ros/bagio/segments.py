@@ -11,9 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from odocal_ros.bagio.chunks import Chunk, read_chunks, whole_file, write_file
+from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
 from odocal_ros.bagio.recover import Channel
+from odocal_ros.whole import write_text
 
 TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
 
@@ -137,12 +138,6 @@ class _Tally:
 def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
     for segment in segments:
         yield from read_chunks(segment.path)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, safe on the disk when this returns."""
-    with whole_file(path) as file:
-        file.write(text.encode())
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:

@@ -8,8 +8,9 @@ from typing import TextIO
 from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.recover import Channel
-from odocal_ros.bagio.segments import SegmentedBag, write_text
+from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.live.journal_space import claim, make_room
+from odocal_ros.whole import write_text
 
 MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
 MARGIN = 2**20                # for metadata and file heads

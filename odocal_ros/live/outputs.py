@@ -1,5 +1,6 @@
 """What leaves the node besides status and parameters: paths and result files."""
 
+from contextlib import suppress
 from datetime import datetime, UTC
 import os
 from pathlib import Path
@@ -69,7 +70,12 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:
         folder = _free(root, name)
-        write_results(calibration, config, folder, inputs, iso(now_ns))
+        try:
+            write_results(calibration, config, folder, inputs, iso(now_ns))
+        except OdocalError:
+            with suppress(OSError):
+                folder.rmdir()      # empty: its name was only reserved
+            raise
         stays = shelf.file(folder, marks(calibration.legs), force)
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '

@@ -67,8 +67,8 @@ def main(argv=None) -> int:
     except OdocalError as error:
         warn(str(error) if isinstance(error, _Usage) else f'odocal: {error}')
         return WRONG_USE
-    except KeyboardInterrupt:
-        warn('odocal: interrupted, nothing written')
+    except KeyboardInterrupt as stopped:
+        warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

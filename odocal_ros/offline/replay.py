@@ -52,7 +52,7 @@ def run(args) -> int:
     asked = [text if text == EACH_STOP else parse_leg(text) for text in args.leg]
     output = Path(args.output) if args.output else Path(
         f'odocal_{one_line(Path(args.bags[0]).stem)}')
-    if (output / 'calibration.json').exists() and not args.force:
+    if (output / 'calibration.json').exists() and not args.force:     # said before the work
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
     from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
@@ -221,9 +221,7 @@ def _size(stream) -> tuple[int, int | None]:
 def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.output.files import as_json, write_results
-    from odocal_ros.output.report import NAME as REPORT
-    from odocal_ros.output.summary import screen
+    from odocal_ros.output.files import as_json, said_when_interrupted, write_results
     from odocal_ros.output.worse import replacing, stored_in
     from odocal_ros.reasons import Verdict
     created = datetime.now(UTC).isoformat(timespec='seconds')
@@ -232,23 +230,32 @@ def _report(calibration, config, inputs, output, args) -> int:
     with Phase('writing the results', args.quiet or args.json):
         written = write_results(calibration, config, output, inputs, created, force=args.force,
                                 tell=troubles.append)
-    for trouble in troubles if not args.quiet else ():
-        warn(f'odocal: {trouble}')
-    worse = replacing(old, output)
-    if worse and not args.quiet:
-        warn(f'odocal: {output}: a better calibration was replaced, as --force asks: {worse}')
-    if args.json:
-        json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
-        say('')
-    elif not args.quiet:
-        columns, rows = _size(sys.stdout)
-        say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
-        if args.holdout:
-            say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
-        others = ', '.join(p.name for p in written if p.name != REPORT)
-        text = f'written: {output}/ ({others})'
-        say('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
-                         break_on_hyphens=False) if rows else text))
-        if output / REPORT in written and not troubles:
-            say(f'report:  {output / REPORT}')
+    try:
+        for trouble in troubles:
+            _tell(args, trouble)
+        if worse := replacing(old, output):
+            _tell(args, f'{output}: a better calibration was replaced, as --force asks: {worse}')
+        if args.json:
+            json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
+            say('')
+        elif not args.quiet:
+            _show(calibration, output, written, args, drawn=not troubles)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(said_when_interrupted(output)) from None
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK
+
+
+def _show(calibration, output, written, args, drawn) -> None:
+    """Print the result and where it is."""
+    from odocal_ros.output.report import NAME as REPORT
+    from odocal_ros.output.summary import screen
+    columns, rows = _size(sys.stdout)
+    say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
+    if args.holdout:
+        say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
+    others = ', '.join(p.name for p in written if p.name != REPORT)
+    text = f'written: {output}/ ({others})'
+    say('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
+                     break_on_hyphens=False) if rows else text))
+    if output / REPORT in written and drawn:
+        say(f'report:  {output / REPORT}')

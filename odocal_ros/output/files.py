@@ -1,15 +1,9 @@
-"""
-Result files: calibration.json (schema 1) and what other programs load.
-
-A file is written whole or not at all: into a temporary one beside it, then renamed.
-"""
+"""Result files: calibration.json (schema 1) and what other programs load."""
 
 from collections.abc import Callable
 import json
 import math
-import os
 from pathlib import Path
-import uuid
 
 import numpy as np
 
@@ -18,6 +12,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
+from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
 from odocal_ros.output.track_table import overall
 
@@ -116,48 +111,41 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
     """
     Write the result files and return their paths, calibration.json first, the report last.
 
-    Files of formats that this result does not give are removed, so that a folder never holds
-    parts of two calibrations. ``tell`` is given a sentence when the report cannot be drawn.
+    The folder is exchanged as a whole, the report added when it is drawn: the numbers do not
+    wait for it. ``tell`` is given a sentence when it cannot be drawn.
 
     Raises
     ------
     BadUsage
         There is a calibration.json and no ``force``, or the folder cannot be written.
+    KeyboardInterrupt
+        Saying what was written, where something was.
 
     """
     directory = Path(directory)
-    if (directory / MAIN).exists() and not force:
-        raise BadUsage(f'{directory / MAIN} exists; give another folder with --output, or '
-                       '--force to replace it')
     content = as_json(calibration, config, inputs, created)
     texts = {MAIN: json.dumps(content, indent=2, allow_nan=False) + '\n'}
     texts |= ros_files.texts(calibration, config, content)
-    wanted = {REPORT} if 'report' in config.output.formats else set()
+    names = list(texts)
+    folder = ResultFolder(directory, MAIN, frozenset(ros_files.NAMES | {MAIN, REPORT}))
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for name in (ros_files.NAMES | {REPORT}) - set(texts):
-            (directory / name).unlink(missing_ok=True)
-        for name in sorted(texts, key=MAIN.__eq__):     # the main file last: it vouches for all
-            write_whole(directory / name, texts[name])
-        if wanted:      # it takes a second to draw: the numbers are safe by then
+        folder.put(texts, force)
+        if 'report' in config.output.formats:      # it takes a second to draw
             page, why = report_or_why(calibration, config, content)
-            write_whole(directory / REPORT, page)
+            if folder.add(REPORT, page):
+                names.append(REPORT)
             if why:
                 tell(f'{directory / REPORT}: not drawn: {why}')
     except OSError as error:
         raise BadUsage(f'{directory}: results cannot be written ({error.strerror}); choose a '
                        'folder that can (--output, or output.directory of the node)') from None
-    return [directory / name for name in [*texts, *wanted]]
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(said_when_interrupted(directory) if folder.written
+                                else '') from None
+    return [directory / name for name in names]
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f'.{path.name}.{uuid.uuid4().hex}')
-    try:
-        with temporary.open('x', encoding='utf-8') as f:
-            f.write(text)
-            f.flush()
-            os.fsync(f.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def said_when_interrupted(directory: Path) -> str:
+    """Return what an interrupted command has left where it had written its result."""
+    report = (directory / REPORT).exists()
+    return f'the results are in {directory}/' + ('' if report else f', {REPORT} is not')

@@ -42,7 +42,7 @@ def test_replay_of_a_bag_of_evil_names_writes_and_says_nothing_that_acts(
 
 
 def test_what_is_said_of_it_is_one_line(bag, tmp_path, capsys):
-    for argv in (['replay', str(bag), '--imu-topic', '/no\x1b[2J', '--output', str(tmp_path / 'o')],
+    for argv in (['replay', str(bag), '--imu-topic', '/no\x1b[2J'],
                  ['replay', str(bag.parent / 'no\nsuch\x1b[2J')], ['inspect', str(bag / 'x\ny')]):
         assert main(argv) == 2
         out, err = capsys.readouterr()
