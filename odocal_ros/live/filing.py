@@ -24,6 +24,7 @@ class Filing:
         self._worker, self._log, self._show = worker, log, show
         self._shelf = Shelf()
         self._warned: Calibration | None = None    # the operator was told that latest stays
+        self._under_way = 0
 
     def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
              imu_frame: str, now_ns: int, asked: bool) -> Future:
@@ -33,8 +34,10 @@ class Filing:
         asked : by the operator. ``latest`` does not go to a worse result, unless he asks again.
         """
         future = Future()
+        self._under_way += 1
 
         def then(outcome, error):
+            self._under_way -= 1
             if error is None:
                 folder, stays = outcome
                 self.saved, self.trouble = str(folder), ''
@@ -54,6 +57,11 @@ class Filing:
             outputs.save, calibration, config, [{'bag': '', 'sha256': None, 'topics': topics}],
             imu_frame, now_ns, self._shelf, asked and calibration is self._warned), then)
         return future
+
+    @property
+    def busy(self) -> bool:
+        """Return whether files are being written."""
+        return self._under_way > 0
 
     def withdraw(self, left) -> None:
         """Let ``latest`` and ``saved`` go back to what holds only the legs left."""

@@ -150,8 +150,8 @@ class Journal:
         self._batch = {}
         self._writer.submit(self._writer.start_anew)
 
-    def close(self) -> None:
-        """Write what is left; a long leg's files may stay apart."""
+    def close(self) -> bool:
+        """Write what is left; a long leg's files may stay apart; return whether all is done."""
         self._hand_over()
         self._writer.submit(self._writer.finish)
-        self._writer.close(GRACE_S)
+        return self._writer.close(GRACE_S)

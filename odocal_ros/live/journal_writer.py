@@ -80,10 +80,11 @@ class JournalWriter:
         """Have the thread call one of the methods below."""
         self._jobs.put((job, values))
 
-    def close(self, grace_s: float) -> None:
-        """Let the thread end after the jobs it was given, waiting a moment for them."""
+    def close(self, grace_s: float) -> bool:
+        """Let the thread end after the jobs it was given; return whether it has, in that time."""
         self._jobs.put(None)
         self._thread.join(grace_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:

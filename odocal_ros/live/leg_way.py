@@ -24,7 +24,7 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.watch import Watch
-from odocal_ros.live.worker import Worker
+from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
@@ -71,10 +71,10 @@ class LegWay:
         """Decode what has arrived."""
         self._recording.pump(self._config(), self._outlets.scale_factor())
 
-    def close(self) -> None:
-        """Let the worker end."""
+    def close(self) -> bool:
+        """Let the worker end; return whether it has."""
         self._watch.end()
-        self._worker.close()
+        return self._worker.close(FILES_S if self._filing.busy else GRACE_S)
 
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""

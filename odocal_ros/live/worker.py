@@ -4,7 +4,7 @@ from collections.abc import Callable
 import queue
 import threading
 
-GRACE_S = 2.0      # files take some 20 ms
+GRACE_S, FILES_S = 1.0, 4.0      # launch asks a second time, and harder, after 5 s
 
 
 class Worker:
@@ -12,8 +12,8 @@ class Worker:
     Runs jobs one after the other in a thread of its own.
 
     ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
-    the job itself ever runs beside the callbacks. A node told to end waits a moment for it, so
-    that result files just asked for are written, but not for a long computation.
+    the job itself ever runs beside the callbacks. A node told to end waits for result files just
+    asked for, report included, but not for a long computation.
     """
 
     def __init__(self) -> None:
@@ -33,10 +33,11 @@ class Worker:
             then, result, error = self._done.get()
             then(result, error)
 
-    def close(self) -> None:
-        """Let the thread end after the jobs it was given, waiting a moment for them."""
+    def close(self, grace_s: float = GRACE_S) -> bool:
+        """Let the thread end after the jobs it was given; return whether it has, in that time."""
         self._jobs.put(None)
-        self._thread.join(GRACE_S)
+        self._thread.join(grace_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:

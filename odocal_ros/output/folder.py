@@ -22,6 +22,7 @@ from odocal_ros.whole import disk, locked, PART, sync_folder, uninterrupted, wri
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 NOT_BY_RENAME = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
 ASIDE = '.old'
+LEFT = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?')
 
 
 class ResultFolder:
@@ -95,11 +96,11 @@ class ResultFolder:
 
     def _clear(self, parent: Path) -> None:
         """Clear away what others were killed at; those at work hold theirs."""
-        left = re.compile(rf'\.{re.escape(self.place.name)}\.[0-9a-f]{{32}}\.part({ASIDE})?')
-        for one in [p for p in parent.iterdir() if left.fullmatch(p.name)]:
+        found = [(parent / name, LEFT.fullmatch(name)) for name in os.listdir(parent)]
+        for one, left in ((one, left) for one, left in found if left):
             with suppress(OSError), locked(one, wait=False) as held:
-                if one.name.endswith(ASIDE) and not self.place.exists():
-                    one.rename(self.place)
+                if left['aside'] and not (parent / left['place']).exists():
+                    one.rename(parent / left['place'])
                 elif held:
                     shutil.rmtree(one, ignore_errors=True)
 
