@@ -1,7 +1,10 @@
 """The settings of a leg beside its journal: a parameter file that says what it is."""
 
+from datetime import datetime, UTC
+
 from odocal_ros import __version__
 from odocal_ros.config import Config, flat
+from odocal_ros.outside import for_shell
 from odocal_ros.yaml_text import parameters
 
 HEAD = """\
@@ -16,3 +19,10 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
     about = {'software': f'odocal_ros {__version__}', 'leg_id': leg_id, 'leg_start_ns': start_ns}
     about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
     return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
+
+
+def replay_command(folder: str, start_ns: int) -> str:
+    """Return what computes a cancelled leg from its journal, from its mark to its last sample."""
+    seconds, nanoseconds = divmod(start_ns, 10**9)
+    start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
+    return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])

@@ -17,6 +17,7 @@ from odocal_ros.live.computing import Computing
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.guidance import after_result, quantities_ok
 from odocal_ros.live.journal import Journal
+from odocal_ros.live.journal_text import replay_command
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.quantities import words
@@ -79,9 +80,9 @@ class LegWay:
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
-            text = f'time jumped: leg {self.session.leg_id} is cancelled; start it again'
-            self._log.warning(text)
-            self._drop_leg(text)
+            self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
+            self._drop_leg(lost='time jumped back')
+            self._log.warning(self._lost_leg())
         else:
             self._log.warning('time jumped: the samples so far are dropped')
         self._recording.start_anew()
@@ -98,7 +99,7 @@ class LegWay:
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
-            config=session.config if session.busy else self._config(),
+            config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
             outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
@@ -178,14 +179,25 @@ class LegWay:
         self._computing.answer(success, text)
         return success, text
 
-    def _drop_leg(self, text: str) -> None:
-        self.session.cancel()
+    def _lost_leg(self) -> str:
+        """Return what became of a leg that was dropped by nobody's wish, empty without one."""
+        session = self.session
+        if not session.lost:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {replay_command(folder, session.start_ns)} '
+                'computes it' if folder else 'no journal was kept of it')
+        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; ~/start_leg starts '
+                'another')
+
+    def _drop_leg(self, text: str = '', lost: str = '') -> None:
+        self.session.cancel(lost)
         self._watch.end()
         self._close_by_ns = self._snapshot = None
         self._computing.drop()
         self.show_status()
         self._journal.end()
-        self._computing.answer(False, text)
+        self._computing.answer(False, text or self._lost_leg())
 
     def _save(self, calibration: Calibration, asked: bool = False) -> Future:
         """Write the result files in the worker; the future has the answer."""
