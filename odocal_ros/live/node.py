@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live import answers, params
+from odocal_ros.live.inputs import TOPICS
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
@@ -61,19 +62,20 @@ class Calibrator(Node):
     at_work = False
 
     def __init__(self, node_name: str = 'calibrator', **kwargs) -> None:
-        super().__init__(node_name, **kwargs)
         try:
-            self._build()
+            super().__init__(node_name, **kwargs)
+            try:
+                self._build()
+            except Exception:
+                self.destroy_node()
+                raise
         except (ParameterException, InvalidQosOverridesError) as error:
-            self.destroy_node()
             raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
-        except Exception:
-            self.destroy_node()
-            raise
 
     def _build(self) -> None:
         self.config = params.declare(self)
         params.declare_results(self)
+        params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
         self.outlets = Outlets(self)
         self.journal = Journal(self, self.outlets.status_topic)
         self.recording = Recording(self, self.config, self.journal.remember)
