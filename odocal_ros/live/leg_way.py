@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from math import nan
+import time
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -59,6 +60,7 @@ class LegWay:
     def tick(self) -> None:
         """Take over what the worker has done and what time has brought."""
         self._worker.poll()
+        self._filing.poll()
         self.pump()
         if self._recording.time_jumped:
             self._start_time_anew()
@@ -75,7 +77,9 @@ class LegWay:
     def close(self) -> bool:
         """Let the worker end; return whether it has."""
         self._watch.end()
-        return self._worker.close(FILES_S if self._filing.busy else GRACE_S)
+        until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
+        done = self._worker.close(until - time.monotonic())
+        return self._filing.close(max(0.0, until - time.monotonic())) and done
 
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""

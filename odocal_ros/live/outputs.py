@@ -1,5 +1,6 @@
 """What leaves the node besides status and parameters: paths and result files."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime, UTC
 import os
@@ -50,12 +51,13 @@ def output_root(config: Config) -> Path:
 
 
 def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
-         now_ns: int, shelf: Shelf, force: bool) -> tuple[Path, str]:
+         now_ns: int, shelf: Shelf, force: bool) -> tuple[Path, str, Callable[[], str] | None]:
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
     ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty. Returns the
-    folder, and why ``latest`` stays where it was, empty when it does not; ``force`` moves it.
+    folder, why ``latest`` stays where it was, empty when it does not (``force`` moves it), and
+    what adds the report, which takes long to draw.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
         The folder cannot be written.
 
     """
-    from odocal_ros.output.files import write_results
+    from odocal_ros.output.files import Results
     from odocal_ros.output.frames import framed
     calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config)
@@ -71,7 +73,8 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     try:
         folder = _free(root, name)
         try:
-            write_results(calibration, config, folder, inputs, iso(now_ns))
+            results = Results(calibration, config, folder, inputs, iso(now_ns))
+            results.write()
         except OdocalError:
             with suppress(OSError):
                 folder.rmdir()      # empty: its name was only reserved
@@ -80,7 +83,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                           'output.directory to a folder that can') from None
-    return folder, stays
+    return folder, stays, results.draw if results.has_report else None
 
 
 def marks(legs) -> frozenset[int]:

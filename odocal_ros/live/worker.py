@@ -19,8 +19,14 @@ class Worker:
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
+        self._at_work = False
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Return whether a job is under way or waits."""
+        return self._at_work or not self._jobs.empty()
 
     def submit(self, job: Callable[[], object],
                then: Callable[[object, Exception | None], None]) -> None:
@@ -42,7 +48,9 @@ class Worker:
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
             job, then = entry
+            self._at_work = True
             try:
                 self._done.put((then, job(), None))
             except Exception as error:  # every failure of a job is an answer to the operator
                 self._done.put((then, None, error))
+            self._at_work = False

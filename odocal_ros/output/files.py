@@ -1,6 +1,7 @@
 """Result files: calibration.json (schema 1) and what other programs load."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import json
 import math
 from pathlib import Path
@@ -111,8 +112,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
     """
     Write the result files and return their paths, calibration.json first, the report last.
 
-    The folder is exchanged as a whole, the report added when it is drawn: the numbers do not
-    wait for it. ``tell`` is given a sentence when it cannot be drawn.
+    ``tell`` is given a sentence when the report cannot be drawn.
 
     Raises
     ------
@@ -122,27 +122,57 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
         Saying what was written, where something was.
 
     """
-    directory = Path(directory)
-    content = as_json(calibration, config, inputs, created)
-    texts = {MAIN: json.dumps(content, indent=2, allow_nan=False) + '\n'}
-    texts |= ros_files.texts(calibration, config, content)
-    names = list(texts)
-    folder = ResultFolder(directory, MAIN, frozenset(ros_files.NAMES | {MAIN, REPORT}))
+    results = Results(calibration, config, directory, inputs, created)
     try:
-        folder.put(texts, force)
-        if 'report' in config.output.formats:      # it takes a second to draw
-            page, why = report_or_why(calibration, config, content)
-            if folder.add(REPORT, page):
-                names.append(REPORT)
-            if why:
-                tell(f'{directory / REPORT}: not drawn: {why}')
-    except OSError as error:
-        raise BadUsage(f'{directory}: results cannot be written ({error.strerror}); choose a '
-                       'folder that can (--output, or output.directory of the node)') from None
+        written = results.write(force)
+        if results.has_report:
+            if why := results.draw():
+                tell(f'{results.directory / REPORT}: not drawn: {why}')
+            written.append(results.directory / REPORT)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(said_when_interrupted(directory) if folder.written
+        raise KeyboardInterrupt(said_when_interrupted(results.directory) if results.folder.written
                                 else '') from None
-    return [directory / name for name in names]
+    return written
+
+
+class Results:
+    """
+    The files of a calibration on their way to a folder, which is exchanged as a whole.
+
+    The report takes seconds to draw: it is added, and the numbers do not wait for it.
+    """
+
+    def __init__(self, calibration: Calibration, config: Config, directory: Path,
+                 inputs: list[dict], created: str) -> None:
+        self.directory = Path(directory)
+        self.has_report = 'report' in config.output.formats
+        self.folder = ResultFolder(self.directory, MAIN,
+                                   frozenset(ros_files.NAMES | {MAIN, REPORT}))
+        self._of = calibration, config, as_json(calibration, config, inputs, created)
+
+    def write(self, force: bool = False) -> list[Path]:
+        """Write all but the report; return the paths."""
+        texts = {MAIN: json.dumps(self._of[2], indent=2, allow_nan=False) + '\n'}
+        texts |= ros_files.texts(*self._of)
+        with self._said():
+            self.folder.put(texts, force)
+        return [self.directory / name for name in texts]
+
+    def draw(self) -> str:
+        """Add the report; return why it could not be drawn, which it then says itself."""
+        page, why = report_or_why(*self._of)
+        with self._said():
+            self.folder.add(REPORT, page)
+        return why
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise BadUsage(
+                f'{self.directory}: results cannot be written ({error.strerror}); choose a folder '
+                'that can (--output, or output.directory of the node)') from None
 
 
 def said_when_interrupted(directory: Path) -> str:

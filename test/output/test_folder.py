@@ -9,6 +9,7 @@ from pathlib import Path
 import signal
 import threading
 
+from faults import Refusing
 import pytest
 
 from odocal_ros import whole
@@ -33,28 +34,11 @@ def held(place):
     return {p.name: p.read_text() for p in Path(place).iterdir()}
 
 
-class Refusing:
-    """A disk that refuses one step, and counts."""
-
-    def __init__(self, at, code):
-        self.at, self.code, self.count, self.steps = at, code, 0, []
-
-    def __call__(self, step, *values):
-        self.count += 1
-        self.steps.append(getattr(step, '__name__', str(step)))
-        if self.count == self.at:
-            raise OSError(self.code, os.strerror(self.code), 'refused')
-        return step(*values)
-
-
 @pytest.fixture
 def refuse(monkeypatch):
     """Return a function that makes the disk refuse the n-th step."""
     def at(step, code=errno.ENOSPC):
-        disk = Refusing(step, code)
-        for one in (whole, module):
-            monkeypatch.setattr(one, 'disk', disk)
-        return disk
+        return Refusing(step, code).put_in(monkeypatch)
     return at
 
 
@@ -130,7 +114,7 @@ def test_a_disk_that_refuses_any_one_step_leaves_all_as_it_was(tmp_path, refuse,
         with suppress(OSError):
             put(place, 'two')
         refuse(0)
-        if disk.count < steps:
+        if len(disk.steps) < steps:
             break
         after = held(place) if place.exists() else None
         mine = {'mine': 'keep'} if old == 'foreign' else {}
