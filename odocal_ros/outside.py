@@ -46,6 +46,11 @@ def for_comment(text: str) -> str:
     return ''.join(f'# {one_line(line)}\n' for line in text.split('\n'))
 
 
+def for_table(text: str) -> str:
+    """Return text as a cell that no spreadsheet takes for a formula."""
+    return f"'{text}" if text.startswith(('=', '+', '-', '@')) else text
+
+
 def for_xml_comment(text: str) -> str:
     """Return lines for the inside of an XML comment, which no ``--`` may be in."""
     return re.sub('-(?=-)', '- ', '\n'.join(map(one_line, text.split('\n'))))

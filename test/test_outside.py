@@ -1,5 +1,6 @@
 """Names from outside in every format: what was sent is shown, nothing of it is acted on."""
 
+from dataclasses import replace
 from pathlib import Path
 import shlex
 import subprocess
@@ -15,6 +16,7 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
 from odocal_ros.output.frames import framed
+from odocal_ros.output.leg_table import leg_table, LEGS
 from odocal_ros.reasons import Code
 from odocal_ros.yaml_text import parameters, value_text
 
@@ -138,6 +140,14 @@ def test_all_commands_print_through_one_door():
     users = {path.name for path in folder.glob('*.py') if 'print(' in path.read_text()}
     # simulate: the share of its own work, which overwrites itself
     assert users == {'say.py', 'simulate.py'}
+
+
+def test_no_cell_of_a_spreadsheet_is_a_formula():
+    made = calibration()
+    legs = (replace(made.legs[0], bag='=cmd|x!A1'), *made.legs)
+    rows = leg_table(replace(made, legs=legs), Config(), {})[LEGS].splitlines()
+    assert rows[1].startswith("1,'=cmd")
+    assert rows[2].startswith('2,drive,')
 
 
 def test_a_frame_that_nobody_names_leaves_all_as_it_is():

@@ -16,16 +16,21 @@ def message_class(msgtype: str):
     """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
     match = MESSAGE_TYPE.fullmatch(msgtype)     # somebody on the net may have chosen it
     try:
-        # a package is imported for its messages only: its name must not run anything else
-        places = PathFinder.find_spec(match['package']).submodule_search_locations
-        if not any(Path(place, 'msg').is_dir() for place in places):
+        if match is None or not _has_messages(match['package']):
             raise ImportError
         return getattr(importlib.import_module(f'{match["package"]}.msg'), match['name'])
-    except (TypeError, ImportError, AttributeError):
+    except (ImportError, AttributeError):
         raise BadConfig(
             f'message type {msgtype!r} cannot be imported here: install its package or source '
             f"its workspace ('ros2 interface show {msgtype}' must work), or correct the type"
         ) from None
+
+
+def _has_messages(package: str) -> bool:
+    """Return whether a package has messages, without running anything of it."""
+    found = PathFinder.find_spec(package)
+    places = found and found.submodule_search_locations or ()
+    return any(Path(place, 'msg').is_dir() for place in places)
 
 
 def definition_of(kind: type) -> str:

@@ -101,7 +101,7 @@ class Calibrator(Node):
                 self.at_work = True
         super().destroy_node()
 
-    def get_logger(self) -> PlainLog:     # type: ignore[override]
+    def get_logger(self) -> PlainLog:
         """Return the node's log."""
         return PlainLog(super().get_logger())
 

@@ -48,7 +48,7 @@ def texts(calibration: Calibration, config: Config, content: dict) -> dict[str, 
 
 def _params(calibration, content) -> str:
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
-    result = {}
+    result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
         if name != 'imu_rotation':
             result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}

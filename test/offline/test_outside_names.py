@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import ros_bags
 import yaml
 
 from odocal_ros.bagio import encode
@@ -39,6 +40,17 @@ def test_replay_of_a_bag_of_evil_names_writes_and_says_nothing_that_acts(
         assert not [x for x in text.splitlines() if x.startswith('touch')]
     result = yaml.safe_load((folder / 'calibration.yaml').read_text())
     assert list(result) == ['/**']
+
+
+def test_a_topic_that_is_two_lines_is_one_of_the_list(tmp_path, capsys):
+    rows = [('/a\ntouch ran\x1b[2J' if topic == '/odometer' else topic, time_ns, message)
+            for topic, time_ns, message in ros_bags.drive()]
+    bag = ros_bags.write(tmp_path / 'bag', rows)
+    assert main(['inspect', str(bag)]) == 0
+    out, _ = capsys.readouterr()
+    assert out.replace('\n', '').isprintable()
+    assert not [line for line in out.splitlines() if line.startswith('touch')]
+    assert '/a\\ntouch ran' in out
 
 
 def test_what_is_said_of_it_is_one_line(bag, tmp_path, capsys):
