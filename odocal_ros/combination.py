@@ -6,12 +6,16 @@ from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.one_vehicle import unlike_legs
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import Calibration, MethodResult
+from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.config import Config
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
 from odocal_ros.reasons import Code, Reason, Verdict
 
 PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
+# the same of legs that are combined on their border: all of them may tell what none does
+ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
+             Code.YAW_FAR_FROM_NOMINAL}
 
 
 def combine(legs, config: Config) -> Calibration:
@@ -36,8 +40,9 @@ def combine(legs, config: Config) -> Calibration:
     good = [leg for leg in good if leg not in twice]
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
-    methods = {n: _combined(n, [leg.methods[n] for leg in used if n in leg.methods])
-               for n in names}
+    methods = {n: _combined(n, [(leg.methods[n], leg.start_ns, i) for i, leg in enumerate(legs, 1)
+                                if leg in used and n in leg.methods], config) for n in names}
+    on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
     estimates, giving = choose(methods, config.method)
     reasons = _leg_reasons(legs, good, twice, giving, estimates)
     if giving:
@@ -45,7 +50,8 @@ def combine(legs, config: Config) -> Calibration:
         rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
         own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
-               if len(legs) == 1 or r.code is Code.LEGS_DISAGREE]
+               if len(legs) == 1 or r.code is Code.LEGS_DISAGREE
+               or n in on_border and r.code in ON_BORDER]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
         reasons = list(dict.fromkeys(reasons))
@@ -71,10 +77,26 @@ def driven_twice(legs):
     return twice
 
 
-def _combined(name, results):
-    """Return a method's combination of the legs where it is not rejected, of all if of none."""
-    good = [r for r in results if r.verdict is not Verdict.REJECTED]
-    whole = combine_method(name, good or results)
+def together(name, results, times_ns, config, numbers=None) -> MethodResult:
+    """
+    Return what a method says of several legs.
+
+    results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
+    """
+    if len(results) > 1 and all(r.border for r in results):
+        return combine_legs(results, times_ns, config, numbers)
+    return combine_method(name, results)
+
+
+def _combined(name, driven, config):
+    """
+    Return a method's combination of the legs where it is not rejected, of all if of none.
+
+    driven : list of (MethodResult, start_ns, number).
+    """
+    good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
+    results, times_ns, numbers = zip(*(good or driven), strict=True)
+    whole = together(name, list(results), times_ns, config, numbers)
     if good or len(results) == 1:
         return whole
     why = dict.fromkeys(r for one in results for r in one.reasons
@@ -90,7 +112,8 @@ def _leg_reasons(legs, good, twice, giving, estimates):
         methods = [leg.methods[n] for n in giving if n in leg.methods]
         own = [*leg.reasons, *(r for m in methods
                                for r in worth_saying(_further(m, leg), m.name, estimates)
-                               if len(legs) == 1 or r.code not in PER_LEG)]
+                               if len(legs) == 1 or r.code not in PER_LEG
+                               and not (m.border and r.code in ON_BORDER))]
         if leg in twice:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
                                   'covers; not used'))

@@ -72,6 +72,12 @@ class ImuConfig:
                                       "relative, 1 sigma; NaN: the grade's.")
     accel_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the accelerometer '
                                        "scale, relative, 1 sigma; NaN: the grade's.")
+    misalignment_sigma: float = setting(NAN, 'rad', 0.0, 0.1, about='By how much each axis of '
+                                        'gyro and accelerometer is off a right angle, 1 sigma; '
+                                        "NaN: the grade's.")
+    gyro_by_force_sigma: float = setting(NAN, 'rad/s/(m/s^2)', 0.0, 0.01, about='What a force '
+                                         'makes the gyro show (g-sensitivity), 1 sigma; NaN: '
+                                         "the grade's.")
     gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on turn rates as sent: '
                                 '0.017453292519943295 for an Imu that sends deg/s.')
     accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on specific force as sent: '
@@ -176,6 +182,8 @@ class VerdictConfig:
     max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw '
                                    'mounting angle.')
     min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='How far the scale '
+                                         'factor walks between legs, relative, 1 sigma (tyres).')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 import math
 
+G = 9.80665          # m/s^2
+
 
 @dataclass(frozen=True)
 class Grade:
@@ -17,11 +19,18 @@ class Grade:
     accel_bias_walk: float  # m/s^2/sqrt(s)
     gyro_scale_error: float = 0.0    # relative
     accel_scale_error: float = 0.0   # relative
+    misalignment: float = 0.0        # rad, of each axis from where it should point
+    gyro_by_force: float = 0.0       # rad/s per m/s^2, what a force makes a gyro show
 
 
 def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_bias,
-                     accel_bias_walk, gyro_scale_error, accel_scale_error) -> Grade:
-    """Take deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h); relative: 2."""
+                     accel_bias_walk, gyro_scale_error, accel_scale_error,
+                     misalignment, gyro_by_force) -> Grade:
+    """
+    Take the units of data sheets.
+
+    deg/sqrt(h), deg/h, deg/h/sqrt(h); m/s/sqrt(h), m/s^2, m/s^2/sqrt(h); 1 twice; deg; deg/s/g.
+    """
     hour, root_hour = 3600.0, 60.0
     return Grade(
         gyro_noise=math.radians(gyro_noise) / root_hour,
@@ -30,7 +39,9 @@ def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_b
         accel_noise=accel_noise / root_hour,
         accel_bias=accel_bias,
         accel_bias_walk=accel_bias_walk / root_hour,
-        gyro_scale_error=gyro_scale_error, accel_scale_error=accel_scale_error)
+        gyro_scale_error=gyro_scale_error, accel_scale_error=accel_scale_error,
+        misalignment=math.radians(misalignment),
+        gyro_by_force=math.radians(gyro_by_force) / G)
 
 
 # Gyro scale: data sheets of consumer MEMS give limits of 3 % for a new chip (MPU-6050: +-3 % at
@@ -39,15 +50,36 @@ def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_b
 # Accelerometer scale: 3 % at most for a new consumer chip (MPU-6050 again); calibrated 0.3 %;
 # those beside fibre gyros some hundred ppm, beside ring lasers a hundred.
 GRADES: dict[str, Grade] = {
-    'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01),
-    'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3),
-    'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4, 3e-4, 5e-4),
-    'navigation': _from_data_sheet(0.001, 0.01, 0.003, 0.005, 5e-4, 5e-5, 1e-5, 1e-4),
+    'consumer': _from_data_sheet(0.3, 100.0, 10.0, 0.1, 0.05, 5e-3, 0.01, 0.01, 0.5, 0.06),
+    'industrial': _from_data_sheet(0.15, 20.0, 5.0, 0.03, 0.02, 1e-3, 3e-3, 3e-3, 0.1, 0.01),
+    'tactical': _from_data_sheet(0.012, 1.0, 0.5, 0.02, 5e-3, 3e-4, 3e-4, 5e-4, 0.05,
+                                 4e-4),
+    'navigation': _from_data_sheet(0.001, 0.01, 0.003, 0.005, 5e-4, 5e-5, 1e-5, 1e-4,
+                                   2e-3, 1e-5),
 }
 
 
 SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
-            'accel_scale_error': 'accel_scale_sigma'}     # named otherwise than the figure
+            'accel_scale_error': 'accel_scale_sigma',
+            'misalignment': 'misalignment_sigma',
+            'gyro_by_force': 'gyro_by_force_sigma'}     # named otherwise than the figure
+
+
+def grade_as_seen(imu, variance) -> Grade:
+    """
+    Return the grade of the imu settings, or a worse one that its noise at rest is nearer to.
+
+    One taken for better than it is would have its bias and its scale held to what they are not.
+
+    variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
+    """
+    grades = [grade_of(dataclasses.replace(imu, grade=name)) for name in GRADES]
+    told = list(GRADES).index(imu.grade)
+    if not variance:
+        return grades[told]
+    return min(reversed(grades[:told + 1]), key=lambda grade: sum(
+        abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
+        for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))))
 
 
 def grade_of(imu) -> Grade:

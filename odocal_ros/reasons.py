@@ -56,6 +56,10 @@ class Code(Enum):
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the like, to what '
                                      'the Imu is; a gyro that sends deg/s looks so too: '
                                      'imu.gyro_scale.')
+    IMU_AXES_SKEW = NOTE, ('Nothing: the angles are those of the axes that the Imu measures in; '
+                           'set imu.misalignment_sigma to what the Imu has.')
+    LEVER_ARM_OFF = CAUTION, ('Measure that lever arm again and set it: from base_link, x '
+                              'forward, y left, z up.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg; what was driven '
@@ -77,6 +81,10 @@ class Code(Enum):
                                'fixes; drive again on a firm straight road with open sky.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '
                            'the sigma was widened by the slip seen.')
+    SCALE_VARIES = NOTE, ('Nothing; for one number that holds longer, drive with warm tyres at '
+                          'the speeds that matter, and combine legs.')
+    FIXES_SMOOTHED = NOTE, ("Switch off the receiver's smoothing (position filter, static hold) "
+                            'if you can: accelerations then tell more.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
                                   'alignment.heading with its sigma, a dual-antenna heading '

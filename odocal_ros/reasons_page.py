@@ -69,6 +69,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'side: the body frame is not forward-left-up.',
         Code.IMU_WORSE_THAN_GRADE: 'At rest the gyro is ten times noisier than its grade, or '
         'more. Sigmas that come from the grade are then too small.',
+        Code.IMU_AXES_SKEW: 'Axes of the Imu are farther from right angles than its grade has '
+        'it. The fit holds that; a drawing of the housing is worth the less.',
+        Code.LEVER_ARM_OFF: 'Where the vehicle turns and leans, a sensor moves as if it sat '
+        'decimetres from where the settings have it.',
         Code.GYRO_SIGN: 'Where the fixes turn left the gyro turns right.',
         Code.BAG_TRUNCATED: 'A recording was not ended properly. What the file holds was read.',
         Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '
@@ -98,6 +102,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'than noise, drift and 0.2 % of the distance explain. Something else is wrong.',
         Code.WHEEL_SLIP: 'Over a few seconds the wheel turned farther, or less far, than the '
         'vehicle accelerated, or the two wheels do not fit the turn.',
+        Code.SCALE_VARIES: 'Tyres grow with speed and as they warm: the scale is not one number '
+        'in this leg. What is given is its mean over the way driven; `scale_by_speed` and '
+        '`scale_by_time` are its slopes.',
+        Code.FIXES_SMOOTHED: 'Positions follow accelerations as a filter does, later and rounder '
+        'than a delay alone would have them.',
     },
     'The estimate': {
         Code.YAW_NOT_SEPARABLE: 'End points see the sum of initial heading and yaw mounting '
@@ -159,8 +168,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'three sigmas of their difference.',
     },
     'Several legs': {
-        Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow. The sigma of the '
-        'combination holds that.',
+        Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow; in what, and of the '
+        'smoother which leg most, is said. The sigma of the combination holds that.',
         Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
         'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
         'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '

@@ -47,6 +47,7 @@ def held(method, run):
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(NAME, effects)),
         details=method.details | {'budget': method.details.get('budget', {}) | {NAME: row}},
+        border=method.border and method.border.loosened({'scale_factor': mean}),
         reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
                  *judged))
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, total_covariance
+from odocal_ros.calib.joint import deviate, Z95
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
 DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
-Z95 = 1.6449       # one-sided 95 % point of the normal law
 
 
 def combine_method(name, results) -> MethodResult:
@@ -49,13 +49,13 @@ def combine_method(name, results) -> MethodResult:
         estimates[parameter] = Estimate(value, sigma, unit)
         for source, effect in (shared | {'legs': np.array([np.sqrt(own)])}).items():
             sources.setdefault(source, []).append((i, effect))
-    estimates |= _ratio(results, estimates) | _newest(results, estimates)
+    estimates |= _ratio(results, estimates) | newest(results, estimates)
     stacked = _stacked(sources, len(parameters))
     return MethodResult(name, reasons, estimates, parameters, stacked,
                         {'legs_used': len(results)} | _details(stacked, parameters, estimates))
 
 
-def _newest(results, estimates):
+def newest(results, estimates):
     """
     Return what belongs to a leg alone (gyro bias) from the last leg that knows it.
 
@@ -104,7 +104,7 @@ def _combine(parameter, i, have):
     freedom = len(y) - 1
     chi2 = float(((y - mean)**2 / apart).sum()) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
-    if freedom and chi2 > _chi2_95(freedom):
+    if freedom and deviate(chi2, freedom) > Z95:
         factor = np.sqrt(chi2 / freedom)
         variance *= factor**2
         reasons = (Reason(Code.LEGS_DISAGREE, f'{parameter} differs between the {len(y)} legs '
@@ -117,12 +117,6 @@ def _effect(result, name, i):
     source = next((s for s in result.sources if s.shared and s.name == name), None)
     width = max((s.effects.shape[1] for s in result.sources if s.name == name), default=1)
     return np.zeros(width) if source is None else source.effects[i]
-
-
-def _chi2_95(freedom):
-    """Return the 95 % point of chi-square (Wilson and Hilferty 1931; within 1 % from 2 on)."""
-    a = 2 / (9 * freedom)
-    return freedom * (1 - a + Z95 * np.sqrt(a))**3
 
 
 def _ratio(results, estimates):

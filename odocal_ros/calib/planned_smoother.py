@@ -6,13 +6,14 @@ from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.calib.planned_samples import Ideal, ideal
 from odocal_ros.calib.predict import Sigmas
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.accel_scale import scale_priors
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
+from odocal_ros.calib.smoother.imperfect import judged_priors
+from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
-from odocal_ros.calib.smoother.problem import Problem, sensor_noise, SPACING
+from odocal_ros.calib.smoother.problem import Problem, SPACING
 from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
@@ -53,7 +54,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
         fit = _fit(problem, made, levels, problem.priors)
-        priors, _ = scale_priors(fit, None, sigmas.config)
+        priors = judged_priors(fit, problem.grade, found=False)
         if priors is not fit.priors:
             fit = _fit(problem, made, levels, priors)
     except (NotPositive, np.linalg.LinAlgError) as error:
@@ -96,4 +97,4 @@ def _fit(problem, made: Ideal, levels, priors) -> Fit:
     state = made.state
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), weighted,
-               solve(weighted.normal()), True, 0)
+               solve(weighted.normal()), True, False, 0)

@@ -5,8 +5,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Reason, Verdict, verdict_of
+
+# what stands in a result beside its estimates (calibration.json)
+BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
+                    'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',
+                    'pitch_mounting_angle_housing_sigma'})
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,7 @@ class MethodResult:
     parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
     sources: tuple[Source, ...] = ()
     details: dict = field(default_factory=dict)
+    border: Border | None = None        # of one leg, None where the method has none
 
     @property
     def verdict(self) -> Verdict:

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.accel_scale import with_scales
-from odocal_ros.calib.smoother.equations import Priors
+from odocal_ros.calib.smoother.imperfect import with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import ImuRows, preintegrate
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL_SCALE, GYRO_SCALE, ODO_DELAY, State
+from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, Priors, State
 from odocal_ros.nav.strapdown import rotation_increments
 
 SPEED_WINDOW = 0.4          # s each side, over which a speed is taken
@@ -73,7 +72,7 @@ def carried(last: Footing, problem: Problem) -> Footing | None:
     spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
     levels = Levels(problem.first_levels.values | last.levels.values,
                     last.levels.correlation_time)
-    first = with_scales(problem.priors, last.first.constants[ACCEL_SCALE])
+    first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
     return Footing(_reckoned(state, problem) if n < len(t) else state, levels, last.priors, first,
                    spread)
 
@@ -92,8 +91,8 @@ def _reckoned(state: State, problem: Problem) -> State:
 
     def travel(t):
         return leg.travel.at(t + c[ODO_DELAY])
-    sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], c[GYRO_SCALE], travel,
-                           f, np.empty(0), c[ACCEL_SCALE], derivatives=False)
+    sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
+                           f, np.empty(0), c, derivatives=False)
     for k in range(K):
         on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
     C = on['C_nb']

@@ -18,14 +18,14 @@ from odocal_ros.calib.facing import axes_reasons, facing
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.calib.smoother import smoother_leg
-from odocal_ros.calib.smoother.accel_scale import judge_running, judge_scale, with_scales
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit, too_little
-from odocal_ros.calib.smoother.state import ACCEL_SCALE, LN_K, PITCH, YAW
+from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, YAW
 from odocal_ros.config import Config
 from odocal_ros.errors import BadData
 from odocal_ros.leg import Leg
@@ -160,7 +160,7 @@ class SmootherSoFar:
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
-        best = judge_running(best, config)      # more of a drive tells more of it
+        best = judge_running(best, problem.grade)      # more of a drive tells more of it
         best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
         if not best.settled:
             best = fit(problem, best.state, best.levels, MORE, about=best, trace=trace)
@@ -186,7 +186,7 @@ class SmootherSoFar:
 def _decided_anew(best, anew, problem, config, trace):
     """Return a fit with the fix errors of another, and judged as one from nothing is."""
     slow = anew.levels.correlation_time or best.levels.correlation_time
-    none = with_scales(best.first, problem.priors.constants[ACCEL_SCALE])
+    none = with_imperfect(best.first, problem.priors.constants[IMPERFECT])
     unjudged = (none.constants == best.first.constants).all()
     state, levels = best.state, best.levels
     if slow:
@@ -195,14 +195,14 @@ def _decided_anew(best, anew, problem, config, trace):
     if not levels.correlation_time:
         state = replace(state, slow_n=np.zeros_like(state.slow_n))
     if slow or not unjudged:
-        about = replace(best, first=none, priors=with_scales(
-            best.priors, problem.priors.constants[ACCEL_SCALE]))
+        about = replace(best, first=none, priors=with_imperfect(
+            best.priors, problem.priors.constants[IMPERFECT]))
         best = fit(problem, state, levels, MORE, about=about, trace=trace)
     sigma = np.sqrt(np.diag(anew.solved.covariance))
     apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
     if apart.max() > AGREE:
         return best_fit(problem, config, trace)
-    return judge_scale(problem, best, config, trace)
+    return judge_imperfect(problem, best, trace)
 
 
 def _refuse_unusable(found):

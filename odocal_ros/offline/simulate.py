@@ -60,7 +60,7 @@ def add_arguments(parser) -> None:
     """Declare the options; the simulator checks their values."""
     add = parser.add_argument
     add('--scenario', required=True, metavar='NAME',
-        help='paper, straight, out_and_back or town')
+        help='paper, straight, out_and_back, town, motorway or yard')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
         'calibrator.yaml go beside it')
     add('--seed', type=int, metavar='N', help='of all random numbers (default 1); each is '
@@ -84,6 +84,12 @@ def add_arguments(parser) -> None:
             help='m forward, left, up of the rear axle')
     add('--mounting-rpy-deg', type=float, nargs=3, metavar=('R', 'P', 'Y'),
         help='nominal rotation from the Imu frame to forward-left-up')
+    add('--vehicle', choices=('real', 'clean'), help='draw a vehicle by seed and Imu grade: with '
+        'all that real sensors do (docs/zoo.md), or with none of it')
+    add('--effect', action='append', metavar='NAME', dest='effects',
+        help='draw a vehicle with this effect alone; repeatable')
+    add('--real', action='append', default=[], metavar='NAME=VALUE', dest='figures',
+        help='a single figure of a real sensor, SI and radians; repeatable')
     add('--known-heading-sigma-deg', type=float, metavar='DEG',
         help='put a heading of this accuracy into calibrator.yaml')
     add('--storage', default='mcap', metavar='KIND', help='mcap (default), sqlite3 or rosbag1')
@@ -124,7 +130,28 @@ def options_of(args):
         given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
     if args.outages:
         given['outages'] = tuple(args.outages)
-    return SimOptions(**given)
+    return _with_figures(args, given)
+
+
+def _with_figures(args, given):
+    """Return SimOptions of what was given, with the vehicle drawn and the figures asked for."""
+    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.options import DEFAULTS
+    from odocal_ros.sim.real import parsed, Real
+    from odocal_ros.sim.scenarios import SimOptions
+    figures = dict(parsed(text) for text in args.figures)
+    if not (args.vehicle or args.effects):
+        return SimOptions(**given, real=Real(**figures))
+    if 'odometer' in given:
+        raise BadUsage(f'--odometer {given["odometer"]}: a drawn vehicle has an odometer of its '
+                       'own; leave it away, or take --effect coarse_speed')
+    if args.vehicle == 'clean' and args.effects:
+        raise BadUsage('--vehicle clean has no --effect; leave one of them away')
+    effects = () if args.vehicle == 'clean' else args.effects
+    seed = given.pop('seed', SimOptions.seed)
+    grade = given.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
+    kind = given.pop('scenario')
+    return drawn(seed, kind, grade, effects, **given, real=figures)[0]
 
 
 def run(args) -> int:

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.planned_drive import AT_REST, PlannedDrive
 from odocal_ros.calib.planned_manoeuvres import stop_and_start, town_driving, turns_both_ways
 from odocal_ros.calib.planned_methods import Plan, plan_methods
 from odocal_ros.calib.planned_smoother import spacing_for
 from odocal_ros.calib.predict import predict, Sigmas
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.combination import together
 from odocal_ros.config import GRADES, with_settings
 from odocal_ros.output.figures import length, time_span
 
@@ -117,7 +117,8 @@ def _second_leg(drive, sigmas, before):
             continue
         one = before.methods[name]
         # all that the smoother knows is in body axes: the way it goes is the same to it
-        both = combine_method(name, [_whole(one), _whole(other.get(name, one))])
+        both = together(name, [_whole(one), _whole(other.get(name, one))],
+                        (0, round(drive.duration * 1e9)), sigmas.config)
         left[parameter] = both.estimates[parameter].sigma
     return [Change('a second leg in the other direction', left[SCALE], left[YAW])]
 

@@ -48,6 +48,8 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
                     for name, unit in ALWAYS.items()}
     result |= {name: e.as_dict() | {'method': e.method or None}
                for name, e in calibration.estimates.items()}
+    giving = calibration.methods.get(result['scale_factor']['method'])
+    result |= giving.details.get('beside', {}) if giving else {}
     result['imu_rotation'] = {'quaternion_xyzw': calibration.imu_rotation_xyzw,
                               'rpy': calibration.imu_rotation_rpy}
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])

@@ -3,7 +3,9 @@
 from collections import Counter
 import math
 
-from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
+import numpy as np
+
+from odocal_ros.calib.result import BESIDE, Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.config import Config, flat, SETTINGS
 from odocal_ros.output.budget_table import LABELS as SOURCES
 from odocal_ros.output.figures import beyond_one, length, share, two_digits, with_sigma
@@ -186,10 +188,10 @@ def full_digits(content: dict) -> list[tuple[str, str, str, str, str]]:
     """Return each number of the result as calibration.json has it: name, value, sigma, ..."""
     rows = []
     for name, entry in content['result'].items():
-        if name == 'imu_rotation':
-            rows += [(f'imu rotation, {key.replace("_", " ")}',
-                      LOST if numbers is None else ', '.join(map(repr, numbers)), '', '', '')
-                     for key, numbers in entry.items()]
+        if name in BESIDE:
+            rows += [(f'{name.replace("_", " ")}, {key.replace("_", " ")}',
+                      LOST if x is None else ', '.join(map(repr, np.atleast_1d(x).tolist())),
+                      '', '', '') for key, x in entry.items() if key != 'unit']
         else:
             rows.append((name, *(LOST if entry[k] is None else repr(entry[k])
                                  for k in ('value', 'sigma')),

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.config import Config
 from odocal_ros.output.controller_files import CONTROLLERS, controllers
 from odocal_ros.output.device_files import DEVICES, devices
@@ -50,7 +50,7 @@ def _params(calibration, content) -> str:
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
-        if name != 'imu_rotation':
+        if name not in BESIDE:
             result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}
     result |= {'legs': len(calibration.legs),
                'valid': calibration.verdict is not Verdict.REJECTED, 'stamp': content['created']}

@@ -5,7 +5,7 @@ import json
 import math
 from pathlib import Path
 
-from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.result import BESIDE, Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, SCHEMA
 from odocal_ros.reasons import Verdict
@@ -91,13 +91,13 @@ def _stored(content, name) -> Stored:
     return Stored(
         name, _part(content, 'created', str), Verdict(verdict),
         tuple(str(r.get('code')) for r in _part(content, 'reasons', list) if isinstance(r, dict)),
-        {key: _estimate(entry, key) for key, entry in result.items() if key != 'imu_rotation'},
+        {key: _estimate(entry, key) for key, entry in result.items() if key not in BESIDE},
         frozenset((leg['start_ns'], leg['stop_ns']) for leg in legs
                   if all(type(leg.get(k)) is int for k in ('start_ns', 'stop_ns'))),
         frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
         _part(content, 'config', dict),
         {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
-         if key != 'imu_rotation'})
+         if key not in BESIDE})
 
 
 def _part(content, key, kind):

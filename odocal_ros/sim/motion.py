@@ -79,12 +79,14 @@ class Motion:
     The true drive: ``at(t)`` gives its state at any times between 0 and ``duration``.
 
     sway : velocities along v's y and z axes (m/s), of a vehicle that slides and heaves.
+    tilt : roll and pitch (rad) of the body on it; empty: the body is stiff.
     """
 
     def __init__(self, speed: Profile, yaw_rate: Profile, start: Start,
-                 hills: Hills | None = None, sway: tuple[Profile, ...] = (STEADY, STEADY)) -> None:
+                 hills: Hills | None = None, sway: tuple[Profile, ...] = (STEADY, STEADY),
+                 tilt: tuple[Profile, ...] = ()) -> None:
         self.speed, self.yaw_rate, self.start = speed, yaw_rate, start
-        self.hills, self.sway = hills or Hills(), sway
+        self.hills, self.sway, self.tilt = hills or Hills(), sway, tilt
         self._jolt = [profile.derivative() for profile in sway]
         self._acceleration, self._travel = speed.derivative(), speed.integral()
         self._yaw_acceleration, self._turn = yaw_rate.derivative(), yaw_rate.integral()
@@ -237,9 +239,14 @@ def _gravity_change(state, d_n, gamma):
     return np.stack([-there * tilt_e, -there * tilt_n, gamma - there], -1)
 
 
-def point(state: State, lever_arm_v):
-    """Return latitude, longitude (rad), height (m) of a point fixed to the vehicle: (n,) each."""
+def point(state: State, lever_arm_v, tilt=None):
+    """
+    Return latitude, longitude (rad), height (m) of a point fixed to the vehicle: (n,) each.
+
+    tilt : (n, 3, 3), takes the body, which the point is fixed to, to the vehicle.
+    """
     C = C_en(state.latitude, state.longitude) @ attitude(state)
+    C = C if tilt is None else C @ tilt
     r_e = ecef_from_geodetic(state.latitude, state.longitude, state.height)
     return geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
 

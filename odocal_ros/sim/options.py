@@ -6,6 +6,7 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.grades import Grade, GRADES
+from odocal_ros.sim.real import Real
 
 PERFECT = Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SIM_GRADES = GRADES | {'perfect': PERFECT}
@@ -77,6 +78,8 @@ class SimOptions:
     heading_sigma: float | None = None     # rad; None: no heading topic
     heading_rate: float = 10.0             # Hz
 
+    real: Real = Real()                    # what real sensors do beyond this
+
 
 # what differs by scenario
 DEFAULTS = {
@@ -84,6 +87,8 @@ DEFAULTS = {
     'straight': {'duration': 720.0, 'imu_grade': 'industrial'},
     'out_and_back': {'duration': 600.0, 'imu_grade': 'industrial'},
     'town': {'duration': 600.0, 'imu_grade': 'consumer'},
+    'motorway': {'duration': 600.0, 'imu_grade': 'industrial'},
+    'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
 }
 EVERYWHERE = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4)}
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
@@ -127,6 +132,8 @@ def resolved(options: SimOptions) -> SimOptions:
                  'fix_sigma': 0.02 if options.fix_noise == 'rtk' else 1.5}
     filled = replace(options, **{name: value for name, value in defaults.items()
                                  if getattr(options, name) is None})
+    if isinstance(options.real, dict):      # as truth.yaml holds it
+        filled = replace(filled, real=Real(**options.real))
     _check(filled)
     return filled
 

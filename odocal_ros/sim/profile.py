@@ -74,6 +74,14 @@ def smooth(duration: float, start: float, end: float):
     return duration, (start, 0.0, 3 * rise / duration**2, -2 * rise / duration**3)
 
 
+def hermite(breaks, values, slopes) -> Profile:
+    """Return the cubics that have these values and slopes at the breaks."""
+    h, rise = np.diff(breaks), np.diff(values)
+    first, last = slopes[:-1] * h, slopes[1:] * h
+    square, cube = (3 * rise - 2 * first - last) / h**2, (first + last - 2 * rise) / h**3
+    return Profile(breaks, np.stack([values[:-1], slopes[:-1], square, cube], -1))
+
+
 def chain(pieces: Iterable[tuple]) -> Profile:
     """Join pieces end to end from time 0; pieces of no duration vanish."""
     kept = [(d, p) for d, p in pieces if d > 0]

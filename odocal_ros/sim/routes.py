@@ -72,6 +72,58 @@ def town(duration: float, rng) -> Route:
     return _route(stretches)
 
 
+def motorway(duration: float, rng) -> Route:
+    """
+    Return a ramp, a long way at 25 to 36 m/s with gentle curves and changes of speed, a ramp.
+
+    Still for 40 s, up in 25 to 40 s with a curve at about 6 deg/s on the way; then stretches of
+    15 to 45 s that change the speed by up to 6 m/s or turn at 0.2 to 1.2 deg/s; 30 s down, still.
+    """
+    up, down = _tenth(rng.uniform(25, 40)), _tenth(rng.uniform(25, 40))
+    ramp_top, fast = 12.0, rng.uniform(25, 36)
+    slip_road = ramp(10, ramp_top, BLEND) + hold(12)
+    bend = turn(10, rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 60)), 2.0)
+    left = _rest('motorway', duration, 40 + 22 + up + down + 30)
+    stretches = [(hold(40), hold(40)),
+                 (slip_road + ramp(up, fast - ramp_top, BLEND),
+                  hold(11) + bend + hold(1 + up))]
+    while left >= 60:
+        length = _tenth(rng.uniform(15, 45))
+        to = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
+        angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(0.2, 1.2)) * (length - 6)
+        change = _tenth(rng.uniform(8, 14))
+        stretches.append((ramp(change, to - fast, BLEND) + hold(length - change),
+                          turn(length, angle, 6.0)))
+        fast, left = to, round(left - length, 9)
+    stretches.append((hold(left) + ramp(down, -fast, BLEND) + hold(30),
+                      hold(left + down + 30)))
+    return _route(stretches)
+
+
+def yard(duration: float, rng) -> Route:
+    """
+    Return slow work in a yard: moves of 5 to 20 s at 0.6 to 2.2 m/s, turns, a fifth backwards.
+
+    In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
+    """
+    left = _rest('yard', duration, 20 + 15)
+    stretches = [(hold(20), hold(20))]
+    while left >= 40:
+        top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
+        up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
+            (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4)))
+        angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(20, 120))
+        turning = _tenth(abs(angle) / math.radians(rng.uniform(10, 40)) + 1.0)
+        stop = _tenth(rng.uniform(3, 9))
+        cruise = before + turning + after
+        stretches.append((ramp(up, top, 0.5) + hold(cruise) + ramp(down, -top, 0.5) + hold(stop),
+                          hold(up + before) + turn(turning, angle, 0.5)
+                          + hold(after + down + stop)))
+        left = round(left - up - cruise - down - stop, 9)
+    stretches.append((hold(15 + left), hold(15 + left)))
+    return _route(stretches)
+
+
 def _town_cycle(rng, off):
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
     before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
@@ -115,4 +167,5 @@ def _clean(speed: Profile) -> Profile:
     return Profile(speed.breaks, powers)
 
 
-ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town}
+ROUTES = {'paper': paper, 'straight': straight, 'out_and_back': out_and_back, 'town': town,
+          'motorway': motorway, 'yard': yard}

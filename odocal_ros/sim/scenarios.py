@@ -16,17 +16,19 @@ from odocal_ros.samples import (
     OdometerForm,
     OdometerSamples,
 )
-from odocal_ros.sim import sensors
+from odocal_ros.sim import body, real_wheels, sensors
+from odocal_ros.sim.housing import own_angles
 from odocal_ros.sim.motion import attitude, Hills, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
-from odocal_ros.sim.profile import Profile
+from odocal_ros.sim.profile import hermite, Profile
 from odocal_ros.sim.routes import ROUTES
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
 SCENARIOS = tuple(DEFAULTS)
 SWAY_STEP = 0.1      # s between draws of the sway
+FINE_STEP = 0.02     # s of the sum that is the true scale of growing tyres
 FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
          'speed': OdometerForm('rate', 0, '1'),
          'angle': OdometerForm('cumulative', 0, 'm/rad')}
@@ -34,7 +36,14 @@ FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a calibration of the drive should find."""
+    """
+    What a calibration of the drive should find.
+
+    The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
+    between the marks over the change of the count there, before anything made it coarse; so are
+    its ratio and the wheels' own. Yaw and pitch are those of the Imu's own axes (turn-and-push
+    frame, ``housing.py``), which are its housing's where the triads are square.
+    """
 
     scale: float                 # m/pulse, 1 or m/rad; of two wheels that of their mean count
     scale_ratio: float           # K / K0
@@ -47,6 +56,8 @@ class Truth:
     stop_ns: int                 # stop mark: the last Imu sample
     gyro_bias: np.ndarray        # (3,) rad/s at turn-on, frame i
     accel_bias: np.ndarray       # (3,) m/s^2 at turn-on, frame i
+    yaw_housing: float           # rad, mounting of the Imu's housing
+    pitch_housing: float         # rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +86,25 @@ def motion_of(options: SimOptions) -> Motion:
     route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
-    sway = {'sway': _sway(route.speed, options)} if options.sway else {}
-    return Motion(route.speed, route.yaw_rate, start, Hills(options.slope), **sway)
+    real, more = options.real, {}
+    if options.sway or real.sideslip:
+        more['sway'] = _sway(route, options)
+    if real.squat or real.body_roll:
+        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll)
+    return Motion(route.speed, route.yaw_rate, start, Hills(options.slope), **more)
 
 
-def _sway(speed, options):
+def _sway(route, options):
     """Return velocities to the side and up: straight lines between draws, less below 1 m/s."""
-    breaks = np.round(np.arange(0.0, speed.end + SWAY_STEP, SWAY_STEP), 9)
-    size = options.sway * np.clip(np.abs(speed(breaks)), 0.0, 1.0)
+    breaks = np.round(np.arange(0.0, route.speed.end + SWAY_STEP, SWAY_STEP), 9)
+    size = options.sway * np.clip(np.abs(route.speed(breaks)), 0.0, 1.0)
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
-    return tuple(Profile(breaks, np.stack([x[:-1], np.diff(x) / SWAY_STEP], -1)) for x in draws)
+    side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / SWAY_STEP], -1)) for x in draws)
+    if options.real.sideslip:
+        v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
+        drift = hermite(breaks, v, np.gradient(v, SWAY_STEP))
+        side = Profile(breaks, drift.powers + np.pad(side.powers, ((0, 0), (0, 2))))
+    return side, up
 
 
 def simulate(options: SimOptions | None = None) -> Drive:
@@ -112,16 +132,32 @@ def simulate(options: SimOptions | None = None) -> Drive:
 
 def _truth(motion, options, imu) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
-    t = (imu.stamp_ns - options.start_ns) * 1e-9
+    _, t = sensors.stamps(motion.duration, options.imu_rate)    # true, however late the stamps
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
+    factor = real_wheels.leg_factor(motion.at(np.arange(0.0, motion.duration, FINE_STEP)),
+                                    options.real)
+    scale = options.scale * factor
+    yaw, pitch, yaw_housing, pitch_housing = _angles(options)
     return Truth(
-        scale=options.scale, scale_ratio=options.scale / options.nominal_scale,
-        wheel_scales=tuple(sensors.wheel_scales(options)), yaw=options.yaw, pitch=options.pitch,
+        scale=scale, scale_ratio=scale / options.nominal_scale,
+        wheel_scales=tuple(factor * x for x in sensors.wheel_scales(options)),
+        yaw=yaw, pitch=pitch, yaw_housing=yaw_housing, pitch_housing=pitch_housing,
         heading=float(heading_from_yaw(np.arctan2(x_n[1], x_n[0]))), distance=motion.distance,
         start_ns=int(imu.stamp_ns[start]), stop_ns=int(imu.stamp_ns[-1]),
         gyro_bias=gyro_bias, accel_bias=accel_bias)
+
+
+def _angles(options):
+    """Return yaw and pitch by the Imu's own axes, then by its housing, rad."""
+    real = options.real
+    gyro, accel = real.matrix('gyro_matrix'), real.matrix('accel_matrix')
+    if not (options.roll or gyro.any() or accel.any()):
+        return (options.yaw, options.pitch) * 2
+    # with a roll the angles are those that tell forward: docs/conventions.md
+    return own_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
+                      matrix_from_rpy(options.mounting_rpy), gyro, accel)
 
 
 def _first_move(motion) -> float:

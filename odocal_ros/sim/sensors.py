@@ -19,14 +19,8 @@ from odocal_ros.nav.rotations import (
     quat_multiply,
 )
 from odocal_ros.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
-from odocal_ros.sim.motion import (
-    attitude,
-    contact_speed,
-    contact_travel,
-    inertial_v,
-    Motion,
-    point,
-)
+from odocal_ros.sim import body, real_fixes, real_imu, real_wheels
+from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import ORIGIN, SIM_GRADES, SimOptions
 
@@ -57,9 +51,11 @@ def imu_rotation(options: SimOptions):
 
 def turn_on_biases(options: SimOptions):
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
-    grade, seed = SIM_GRADES[options.imu_grade], options.seed
-    return (grade.gyro_bias * stream(seed, 'gyro bias').standard_normal(3),
-            grade.accel_bias * stream(seed, 'accelerometer bias').standard_normal(3))
+    grade, seed, real = SIM_GRADES[options.imu_grade], options.seed, options.real
+    return tuple(
+        sigma * stream(seed, f'{name} bias').standard_normal(3) if own is None else np.array(own)
+        for name, sigma, own in (('gyro', grade.gyro_bias, real.gyro_bias),
+                                 ('accelerometer', grade.accel_bias, real.accel_bias)))
 
 
 def imu_errors(options: SimOptions, n: int):
@@ -78,17 +74,27 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
     ns, t = stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
     C_vi = imu_rotation(options)
-    w_v, f_v = inertial_v(state, options.imu_lever_arm)
-    w_i = w_v @ C_vi * (1 + options.gyro_scale_error)
+    w_v, f_v = body.felt(motion, state, options.imu_lever_arm)
+    w_i, f_i = real_imu.crooked(w_v @ C_vi * (1 + options.gyro_scale_error),
+                                f_v @ C_vi * (1 + options.accel_scale_error), options.real)
     gyro, accel = imu_errors(options, len(t))
+    gyro_drift, accel_drift = real_imu.drifts(t, state.speed, options)
     q_ni = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     variance = np.full(len(t), np.nan)
     if options.orientation_sigma is not None:
         q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
         variance = np.full(len(t), options.orientation_sigma**2)
-    stamp = options.start_ns + ns
-    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_i + gyro,
-                      f_v @ C_vi * (1 + options.accel_scale_error) + accel, q_ni, variance)
+    stamp = options.start_ns + _imu_stamps(ns, options)
+    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_i + gyro + gyro_drift,
+                      f_i + accel + accel_drift, q_ni, variance)
+
+
+def _imu_stamps(ns, options):
+    real = options.real
+    if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
+        return ns
+    return real_imu.stamped(ns, stream(options.seed, 'real imu stamps'), real.imu_latency,
+                            real.imu_jitter, real.imu_batch)
 
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
@@ -131,18 +137,35 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
     """Return the samples of each wheel; pulses are whole counts, so late by up to one."""
     ns, t = stamps(motion.duration, options.odometer_rate, ODOMETER_PHASE)
     state = motion.at(t)
-    stamp = options.start_ns + ns + round(options.odometer_delay * 1e9)
+    stamp = options.start_ns + _late(ns, options, 'odometer')
     wheels = zip('LR', wheel_arms(options), wheel_scales(options), strict=False)
     return [OdometerSamples(stamp, stamp, _reading(state, options, side, arm, scale))
             for side, arm, scale in wheels]
 
 
+def _late(ns, options, name):
+    """Return stamps that are late by a topic's delay, and by its jitter where it has one."""
+    delay, jitter = (getattr(owner, f'{name}_{what}') for owner, what in (
+        (options, 'delay'), (options.real, 'jitter')))
+    if not jitter:
+        return ns + round(delay * 1e9)
+    return real_imu.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
+
+
 def _reading(state, options, side, arm, scale):
-    spun = slip(state, options, side)
+    real, spun = options.real, slip(state, options, side)
+    if real.tyre_slip:
+        spun = spun + real_wheels.tyre_slip(state, real)
+    grown = 1 + real_wheels.growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
-        return (contact_speed(state, arm) + np.gradient(spun, state.t) + noise) / scale
-    rolled = (contact_travel(state, arm) + spun) / scale
+        rate = (contact_speed(state, arm) + np.gradient(spun, state.t)) / grown
+        return real_wheels.coarse((rate + noise) / scale, real)
+    rolled = contact_travel(state, arm) + spun
+    if np.ndim(grown):
+        between = (grown + np.roll(grown, 1)) / 2
+        rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
+    rolled = rolled / scale
     phase = stream(options.seed, f'pulse phase {side}').uniform()   # where the disc stands
     if options.odometer == 'angle':
         return rolled + phase
@@ -181,15 +204,16 @@ def _way_after_starts(state, moving, seconds):
 def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
     ns, t = stamps(motion.duration, options.fix_rate, FIX_PHASE)
-    state = motion.at(t)
-    latitude, longitude, height = point(state, options.antenna_lever_arm)
-    error = fix_errors(t, options)
+    real = options.real
+    latitude, longitude, height = real_fixes.places(motion, t, options)
+    error = fix_errors(t, options) + real_fixes.errors(t, options)
     meridian, normal = radii(latitude)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))
-    variance = np.maximum(_axes(options) ** 2 * _power(options), SIGMA_FLOOR**2)
+    variance = real_fixes.true_variance(_axes(options) ** 2 * _power(options), options)
+    variance = np.maximum(variance * real.stated_factor**2, SIGMA_FLOOR**2)
     n = len(t)
-    stamp = options.start_ns + ns + round(options.fix_delay * 1e9)
+    stamp = options.start_ns + _late(ns, options, 'fix')
     samples = FixSamples(
         stamp, stamp + round(FIX_TRANSPORT * 1e9), latitude, longitude, height + error[:, 2],
         np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
@@ -197,6 +221,8 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     seen = np.ones(n, dtype=bool)
     for begin, end in options.outages:
         seen &= (t < begin) | (t >= end)
+    if real.drops:
+        seen &= stream(options.seed, 'real drops').uniform(size=n) >= real.drops
     return FixSamples(*(getattr(samples, name)[seen] for name in (
         'stamp_ns', 'received_ns', 'latitude', 'longitude', 'height', 'covariance_n',
         'covariance_type', 'status')))

@@ -22,6 +22,9 @@ def truth_entries(drive: Drive, bag: str) -> dict:
                   'wheels': list(truth.wheel_scales)},
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
+        # above by the Imu's own axes, here by its housing: alike where the triads are square
+        'yaw_mounting_housing_deg': {'value': math.degrees(truth.yaw_housing)},
+        'pitch_mounting_housing_deg': {'value': math.degrees(truth.pitch_housing)},
         'roll_mounting_deg': {'value': math.degrees(options.roll)},
         'nominal_rpy_deg': [math.degrees(a) for a in options.mounting_rpy],
         # of the body frame's x axis, clockwise from north, at the start mark
@@ -56,6 +59,12 @@ def _plain(value):
     return [_plain(v) for v in value] if isinstance(value, tuple) else value
 
 
+def _told_arm(options, name):
+    """Return a lever arm as configured: the true one and the error of whoever measured it."""
+    true, error = getattr(options, f'{name}_lever_arm'), getattr(options.real, f'{name}_arm_error')
+    return [float(x + e) for x, e in zip(true, error, strict=True)]
+
+
 def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
     """
     Return the settings an operator of this vehicle would give, by group.
@@ -64,9 +73,9 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
     of that size.
     """
     options = drive.options
-    grade = options.imu_grade
+    grade = options.real.told_grade or options.imu_grade
     odometer: dict = {'nominal_scale': float(options.nominal_scale),
-                      'lever_arm': [float(x) for x in options.odometer_lever_arm]}
+                      'lever_arm': _told_arm(options, 'odometer')}
     if options.two_wheels:
         left, right = (('left_wheel_joint', 'right_wheel_joint')
                        if options.odometer == 'angle' else ('topic', 'topic'))
@@ -75,8 +84,8 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
         'odometer': odometer,
         'imu': {'grade': STANDS_FOR_PERFECT if grade == 'perfect' else grade,
                 'mounting_rpy': [float(x) for x in options.mounting_rpy],
-                'lever_arm': [float(x) for x in options.imu_lever_arm]},
-        'gnss': {'lever_arm': [float(x) for x in options.antenna_lever_arm]},
+                'lever_arm': _told_arm(options, 'imu')},
+        'gnss': {'lever_arm': _told_arm(options, 'antenna')},
     }
     if known_heading_sigma is not None:
         error = known_heading_sigma * stream(options.seed, 'known heading').standard_normal()

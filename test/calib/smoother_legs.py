@@ -1,5 +1,6 @@
 """Simulated legs as the smoother sees them, and their truth at its keyframes."""
 
+from dataclasses import replace
 from functools import cache
 
 from drives import settings
@@ -10,11 +11,14 @@ from odocal_ros.calib.smoother.state import C_bv, GNSS_DELAY, LN_K, M, ODO_DELAY
 from odocal_ros.leg_run import LegRun
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.standstill import standstills
+from odocal_ros.samples import VelocitySamples
 from odocal_ros.screen import screen
 from odocal_ros.sim import motion, sensors
 from odocal_ros.sim.noise import random_walk, stream
 from odocal_ros.sim.options import SIM_GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
+
+VELOCITY_SIGMA = 0.05      # m/s
 
 
 @cache
@@ -22,7 +26,8 @@ def made(**options):
     """Return a drive, its settings and its leg for the smoother."""
     drive = simulate(SimOptions(**({'scenario': 'town', 'imu_rate': 50.0} | options)))
     # of an accelerometer without scale error, as it is simulated unless asked for
-    config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0)
+    config = settings(drive, None, verdict__max_yaw_sigma=0.0087, imu__accel_scale_sigma=0.0,
+                      imu__misalignment_sigma=0.0, imu__gyro_by_force_sigma=0.0)
     return drive, config, leg_of(drive.leg(), config)
 
 
@@ -32,6 +37,19 @@ def leg_of(leg, config):
     run = LegRun(leg, inputs, config, [], None)
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, run.rough, config.leg.standstill)
     return smoother_leg(inputs, config, run.origin, run.fixes_n, spans, run.rough)
+
+
+def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
+    """Return the drive's leg with a GNSS velocity at 5 Hz; errors: (n, 3) draws to m/s."""
+    o = drive.options
+    ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.FIX_PHASE)
+    state = drive.motion.at(t)
+    swing = np.cross(np.stack([0 * t, 0 * t, state.yaw_rate], -1), o.antenna_lever_arm)
+    v = motion.velocity_n(state) + np.einsum('kij,kj->ki', motion.attitude(state), swing)
+    v = v + errors(np.random.default_rng(7).standard_normal(v.shape))
+    stamp = o.start_ns + ns
+    return replace(drive.leg(), fix_velocity=VelocitySamples(
+        stamp, stamp, v, np.full(v.shape, stated)))
 
 
 def truth(drive, config, leg) -> State:

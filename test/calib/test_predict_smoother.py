@@ -17,7 +17,7 @@ from odocal_ros.calib.planned_smoother import (
     WIDEST,
 )
 from odocal_ros.calib.predict import Sigmas
-from odocal_ros.calib.smoother import bound, smooth
+from odocal_ros.calib.smoother import bound, imperfect, problem, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.config import Config, with_settings
@@ -27,6 +27,7 @@ from odocal_ros.reasons import Code
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}
+USUAL = problem.imperfect_sigmas(Config(), 600.0)
 
 
 def sigmas_of(method):
@@ -102,12 +103,15 @@ def paper():
     (stop_and_go, 'consumer', 128, 93), (stop_and_go, 'industrial', 110, 70),
     (stop_and_go, 'tactical', 85, 21), (straight, 'industrial', 57, 11),
     (paper, 'navigation', 35, 5.7)])
-def test_the_scale_bounds_of_method_md_come_out(drive, grade, white, pulses):
+def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white, pulses):
     # an independent program made the table: lever arms and delays known, fixes white, no slip of
-    # the pulses; its filter knows no rests but by the odometer, hence not to the last digit
+    # the pulses, a perfect vehicle; its filter knows no rests but by the odometer, hence not to
+    # the last digit
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
         'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})
+    for module in (problem, imperfect):
+        monkeypatch.setattr(module, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(table, rel=0.10)
@@ -148,11 +152,11 @@ def test_samples_and_states_agree_wherever_the_sensors_sit(town_sigmas):
     sigmas = replace(town_sigmas, config=config, fix=0.02)
     one = ideal(drive, sigmas, 1.0)
     problem = Problem.of(one.leg, config, one.imu)
-    equations = Equations(problem, one.state, problem.sums(one.state))
+    parts = Equations(problem, one.state, problem.sums(one.state)).parts
     # a turn sets in within a sample of 0.05 s: 0.2 rad/s and 3 m/s^2 then are 5 mrad, 4 cm/s at
     # most, beside what a planned drive's own steps of 0.1 s leave
-    assert np.abs(equations.fixes.raw).max() < 0.03
-    r = equations.motion.residual
+    assert np.abs(parts['fixes'].raw).max() < 0.03
+    r = parts['motion'].raw
     assert np.abs(r[:, 3:6]).max() < 0.1        # velocity
     assert np.abs(r[:, 6:9]).max() < 0.01       # attitude
     assert np.median(np.abs(r[:, 15:18]), axis=0).max() < 1e-3      # way by odometer, m

@@ -7,15 +7,10 @@ import pytest
 from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother import bound
-from odocal_ros.calib.smoother.equations import (
-    ANY_SPEED,
-    ANY_WAY,
-    ANYWHERE,
-    Equations,
-    STILL_SPEED,
-    STILL_TURN,
-)
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.priors import ANY_SPEED, ANY_WAY, ANYWHERE
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.rests import STILL_SPEED, STILL_TURN
 from odocal_ros.calib.smoother.state import BARE, E, M, SLOW, WITH_SLOW
 
 
@@ -26,7 +21,8 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     problem = Problem.of(leg, config)
     levels = problem.first_levels.but(correlation_time=correlation_time, fix=0.5)
     state = truth(drive, config, leg)
-    equations = Equations(problem, state, problem.sums(state))
+    parts = Equations(problem, state, problem.sums(state), fitted=True).parts
+    motion, fixes = parts['motion'], parts['fixes']
     n, N = (WITH_SLOW if correlation_time else BARE), len(state.t)
     size = N * n + M
     rows = []
@@ -42,31 +38,31 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
         return np.arange(k * n, (k + 1) * n)
 
     border = np.arange(N * n, size)
-    a, b, c = equations.motion.jacobians(n)
-    Q = equations.noise.covariance(levels)
+    a, b, c = motion.jacobians(n)
+    Q = motion.noise.covariance(levels)
     for k in range(N - 1):
         s = 1 / np.sqrt(np.diag(Q[k]))
         root = np.linalg.inv(np.linalg.cholesky(Q[k] * np.outer(s, s))) * s
         add(np.concatenate([a[k], b[k], c[k]], axis=1), (block(k), block(k + 1), border), root)
-    J, Jc = equations.fixes.jacobians(n)
+    J, Jc = fixes.jacobians(n)
     covariance = leg.covariance_n[problem.use]
-    white = np.hypot(*np.einsum('kij,kj->ki', problem.root, equations.fixes.raw)[:, :2].T)
+    white = np.hypot(*np.einsum('kij,kj->ki', problem.root, fixes.raw)[:, :2].T)
     factor = np.array([np.sqrt(0.5), np.sqrt(0.5), 1.0])
-    for i, k in enumerate(equations.fixes.k):
+    for i, k in enumerate(fixes.k):
         C = covariance[i] * np.outer(factor, factor)
         root = np.linalg.inv(np.linalg.cholesky(C))
-        u = root @ equations.fixes.raw[i]
+        u = root @ fixes.raw[i]
         weight = np.array([min(1.0, 3 / np.hypot(u[0], u[1]))] * 2 + [min(1.0, 3 / abs(u[2]))])
         end = np.zeros((3, n))
         if n == WITH_SLOW:
-            end[:, SLOW] = -np.eye(3) * equations.fixes.share[i]
+            end[:, SLOW] = -np.eye(3) * fixes.share[i]
         add(np.concatenate([J[i], end, Jc[i]], axis=1), (block(k), block(k + 1), border),
             np.diag(weight) @ root)
     assert white.max() > 0.0
     single = np.eye(n)
     for k in range(N):
         add(single[[E]], (block(k),),
-            np.eye(1) * np.sqrt(equations.travel_weight[k] / problem.travel_floor))
+            np.eye(1) * np.sqrt(parts['travel'].weight[k] / problem.least['travel']))
         if problem.still[k]:
             add(single[3:6], (block(k),), np.eye(3) / STILL_SPEED)
     for k in range(N - 1):

@@ -5,7 +5,8 @@ import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.noise import AT_REST, once_a_rest, rest_noise
+from odocal_ros.calib.smoother.noise import AT_REST, rest_noise
+from odocal_ros.calib.smoother.travel_error import once_a_rest
 
 SWAY = {'sway': 0.05, 'odometer': 'speed', 'odometer_rate': 10.0, 'speed_noise': 0.05}
 

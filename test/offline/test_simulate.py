@@ -159,3 +159,44 @@ def test_a_terminal_gets_a_bar_that_goes_away(tmp_path, capsys, monkeypatch):
     bar = capsys.readouterr().err
     assert '100%' in bar
     assert bar.endswith('\r\x1b[K')
+
+
+def test_a_vehicle_is_drawn_and_what_is_given_goes_before(tmp_path):
+    out = tmp_path / 'drive'
+    assert odocal(*SHORT, '--out', out, '--vehicle', 'real', '--seed', 5, '--yaw-deg', 2,
+                  '--roll-deg', 0, '--real', 'vibration=0.25', '--quiet') == 0
+    truth = load(tmp_path / 'truth.yaml')
+    assert truth['yaw_mounting_housing_deg']['value'] == pytest.approx(2)
+    assert truth['yaw_mounting_deg']['value'] != truth['yaw_mounting_housing_deg']['value']
+    real = truth['options']['real']
+    assert real['vibration'] == 0.25
+    assert real['squat'] > 0
+    again = simulate(SimOptions(**{k: tuple(v) if isinstance(v, list) else v
+                                   for k, v in truth['options'].items()}))
+    assert math.degrees(again.truth.yaw) == truth['yaw_mounting_deg']['value']
+    arm = load(tmp_path / 'calibrator.yaml')['/**/calibrator']['ros__parameters']['gnss'][
+        'lever_arm']
+    assert arm == pytest.approx([a + b for a, b in zip(
+        truth['options']['antenna_lever_arm'], real['antenna_arm_error'], strict=True)])
+
+
+def test_one_effect_or_one_figure_comes_alone(tmp_path):
+    from odocal_ros.sim.real import Real
+    for name, words in (('effect', ['--effect', 'squat']), ('figure', ['--real', 'squat=0.002'])):
+        assert odocal(*SHORT, '--out', tmp_path / name / 'drive', *words, '--quiet') == 0
+        real = Real(**load(tmp_path / name / 'truth.yaml')['options']['real'])
+        assert real.squat > 0
+        assert real.vibration == 0
+        assert (real.body_roll > 0) == (name == 'effect')
+
+
+@pytest.mark.parametrize(('words', 'told'), [
+    (['--real', 'squad=1'], 'no such figure; near: squat'),
+    (['--real', 'squat'], 'want finite numbers'),
+    (['--effect', 'rust'], '--effect rust: want one of triads'),
+    (['--vehicle', 'real', '--odometer', 'speed'], 'has an odometer of its own'),
+    (['--vehicle', 'clean', '--effect', 'squat'], 'leave one of them away'),
+    (['--vehicle', 'real', '--imu-grade', 'navigation'], 'want one of consumer')])
+def test_a_vehicle_that_cannot_be_drawn_is_said(tmp_path, capsys, words, told):
+    assert odocal(*SHORT, '--out', tmp_path / 'drive', *words) == 2
+    assert told in capsys.readouterr().err

@@ -150,3 +150,30 @@ def test_sway_is_as_large_as_said_and_no_wheel_rolls_it():
     # a tenth of a second each: 0.05 m/s sqrt(0.1 s t) of random walk, here with 5 sigma
     aside = (state.latitude - plain.latitude) * 6.36e6
     assert 0.0 < np.abs(aside).max() < 5 * 0.05 * np.sqrt(0.1 * motion.duration)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_motorway_is_fast_long_and_gentle(seed):
+    motion, state = states('motorway', seed=seed)
+    assert motion.duration == pytest.approx(600)
+    assert state.speed[[0, -1]] == pytest.approx([0, 0], abs=1e-11)
+    fast = state.speed > 24.9
+    assert fast.mean() > 0.6
+    assert state.speed.max() <= 36 + 1e-9
+    assert np.degrees(np.abs(state.yaw_rate[fast])).max() < 1.5
+    assert np.degrees(np.abs(state.yaw_rate)).max() > 3            # the slip road
+    assert np.abs(state.acceleration).max() < 1.8
+    assert np.abs(state.speed * state.yaw_rate).max() < 3
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_yard_is_slow_and_winding_and_goes_backwards_too(seed):
+    motion, state = states('yard', seed=seed)
+    assert motion.duration == pytest.approx(600)
+    assert np.abs(state.speed).max() < 2.3
+    still = np.abs(state.speed) < 1e-9
+    assert 0.2 < still.mean() < 0.5
+    assert (state.speed < -0.3).any()
+    assert np.degrees(np.abs(state.yaw_rate)).max() > 15
+    moves = ~still
+    assert np.count_nonzero(moves[1:] & ~moves[:-1]) > 20

@@ -46,6 +46,8 @@ class Solved:
     step_border: Floats       # (m,)
     covariance: Floats        # (m, m) of the border
     log_determinant: float    # of H
+    reduced: Floats           # (m, m) of the border, all blocks eliminated
+    g_reduced: Floats         # (m,)
     _back: Floats             # (N, n, n + m)
     _own: Floats              # (N, n, n)
     _scale: Floats            # (N, n)
@@ -136,6 +138,7 @@ def solve(normal: Normal) -> Solved:
     if info:
         raise NotPositive('the constants are not determined')
     logdet += 2 * np.log(root.diagonal()).sum()
+    reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
     x = np.empty((N, n))
@@ -144,4 +147,4 @@ def solve(normal: Normal) -> Solved:
     for k in range(N - 2, -1, -1):
         x[k] = fixed[k] - back[k][:, :n] @ x[k + 1]
     return Solved(x * s, c * s_c, covariance * np.multiply.outer(s_c, s_c), float(logdet),
-                  back, own, s, s_c)
+                  reduced, corner[:m, m] / s_c, back, own, s, s_c)

@@ -12,30 +12,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import solve, Solved
-from odocal_ros.calib.smoother.components import components, road_noise
-from odocal_ros.calib.smoother.equations import Equations, Priors, Weighted
+from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.problem import NO_SCALE, Problem
-from odocal_ros.calib.smoother.state import ACCEL_SCALE, M, PITCH, State, YAW
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, Priors, State, YAW
 
-MOST = 25            # iterations
+MOST = 40            # iterations
+NEAR = 1.0           # sigmas of a step from which residuals are noise
 SETTLED = 0.03       # sigmas that the constants may still move
+CREEPS = 0.5         # the same: values that are worth having, with wider sigmas
 NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
 SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant is held to that
 # rad: an angle known no better drifts where the cost is flat, and is refused (lever arms: m)
 UNKNOWN = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
-FIRST_TAILS, LAST_TAILS = 3, 12     # iterations in which heavy tails are looked for
+FIRST_TAILS, LAST_TAILS = 3, 15     # iterations in which heavy tails are looked for
 QUIET = 0.01         # relative change of the sigmas of scale and mounting, the same
 # pseudo-observations that a level is as first believed (Imu), or as it is (the others: more of
 # them end the way to a small noise too early)
 SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 INERTIA = 1.0
-HASTE = 1.6          # power on the steps of levels: the fixed point is slow where a noise is small
-CALM, PART = 0.6, 0.5    # power and share of a step later on: what still moves goes to and fro
+# power on the steps of a level: at first (the fixed point is slow where a noise is small), more
+# with each step the same way, less with each that turns back
+HASTE, SPEED_UP, SLOW_DOWN, MOST_HASTE = 1.6, 1.25, 0.5, 3.0
 ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
 OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
 GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
 MOST_WIDE = 30.0     # times its own sigma
+SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there or is not
+KNOWN = 0.5          # of the prior's variance: what is left where the data know as much
 
 
 @dataclass(eq=False)
@@ -50,6 +54,7 @@ class Fit:
     weighted: Weighted
     solved: Solved
     settled: bool
+    creeping: bool           # near enough, but its noise levels still move
     iterations: int
 
     @property
@@ -78,21 +83,22 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         Called with each pass, for benchmarks.
 
     """
-    before, settled = np.ones(3), False
+    before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
-    tails = 1 if about else FIRST_TAILS
+    tails, pace = 1 if about else FIRST_TAILS, {}
     for count in range(1, most + 1):
         sums = problem.sums_near(state)
-        weighted = Equations(problem, state, sums, priors, spread).at(levels)
+        weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
         sigma = np.sqrt(np.diag(solved.covariance))
         move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(move < SETTLED and (frozen or change < QUIET and count > tails + 2))
-        part = PART if count > LAST_TAILS and not settled else 1.0
-        state = state.moved(part * solved.step, part * solved.step_border)
+        settled = bool(fitted and move < SETTLED
+                       and (frozen or change < QUIET and count > tails + 2))
+        fitted = fitted or move < NEAR
+        state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved)
@@ -102,31 +108,46 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             break
         if not frozen:
             near = solved.neighbours()
-            haste = HASTE if count <= LAST_TAILS else CALM
-            levels = update(weighted, near, levels, problem, haste)
-            if tails <= count <= LAST_TAILS:
+            tail = tails <= count <= LAST_TAILS
+            # slips and the road's levels are factors on the same rows: never both in one pass
+            slipping = tail and (count - tails) % 2 == 0
+            levels = update(weighted, near, levels, problem, pace, slipping)
+            if slipping:
                 spread = slips(weighted, near, spread)
+            if tail:
                 priors = beliefs(first, priors, state, solved, near)
-    return Fit(state, levels, priors, first, spread, weighted, solved, settled, count)
+    creeping = not settled and bool(still < CREEPS and change < CREEPS)
+    return Fit(state, levels, priors, first, spread, weighted, solved, settled or creeping,
+               creeping, count)
 
 
-def update(weighted, neighbours, levels, problem, haste=HASTE) -> Levels:
-    """Return levels moved towards the maximum of the restricted likelihood."""
+def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Levels:
+    """
+    Return levels moved towards the maximum of the restricted likelihood.
+
+    pace : power and last step of each level, kept up to date.   slipping : leave the road alone.
+    """
     new = {}
-    for name, (quadratic, expected) in components(weighted, neighbours).items():
+    for name, (quadratic, expected) in weighted.components(neighbours).items():
+        if slipping and name in ROAD_NOISE:
+            continue
         level = levels[name]
         belief = SENSOR.get(name, INERTIA)
         pull = belief * (problem.first_levels[name] / level if name in SENSOR else 1.0)
-        factor = (quadratic + pull) / (max(expected, 0.0) + belief)
-        if name in ROAD_NOISE or name in SENSOR:
-            factor = factor**haste
-        new[name] = max(level * float(np.clip(factor, 0.03, 30.0)), problem.least[name])
+        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + belief),
+                                    0.03, 30.0)))
+        first = HASTE if name in ROAD_NOISE or name in SENSOR else 1.0
+        haste, last = pace.get(name, (first, 0.0))
+        haste = haste * (SLOW_DOWN if step * last < 0 else SPEED_UP if last else 1.0)
+        pace[name] = min(haste, MOST_HASTE), step
+        move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
+        new[name] = max(level * float(np.exp(move)), problem.least[name])
     return levels.but(**new)
 
 
 def slips(weighted, neighbours, spread):
     """Return factors on the odometer's variances where an interval lies far out: (K, 3)."""
-    noise, found = road_noise(weighted, neighbours)
+    noise, found = weighted['motion'].road_noise(neighbours)
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
@@ -137,15 +158,15 @@ def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
     """
     Return priors widened where the data are far from their centre.
 
-    That the accelerometer has no scale error does not give way by steps: it is weighed as a whole
-    against its having one (accel_scale), from the data as they are under that belief.
+    Those of what is small give way only where the data know more than they do: nothing would
+    gainsay a wide one.
     """
     n = solved.step.shape[1]
     P0 = np.diagonal(neighbours[0])[:n]
-    constants = _wider(first.constants, now.constants, state.constants - first.centre,
-                       np.diag(solved.covariance))
-    if (first.constants[ACCEL_SCALE] <= NO_SCALE).all():
-        constants[ACCEL_SCALE] = first.constants[ACCEL_SCALE]
+    variance = np.diag(solved.covariance)
+    constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
+    untold = SMALL & (variance > KNOWN * now.constants**2)
+    constants[untold] = now.constants[untold]
     return replace(
         now,
         gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),

@@ -3,13 +3,15 @@
 import numpy as np
 
 from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BA,
     BARE,
     BG,
     C_bv_gradient,
+    FIX_LAG2,
     GNSS_ARM,
     GNSS_DELAY,
     M,
@@ -23,19 +25,19 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import skew
 
-FAR = 3.0             # sigmas beyond which a fix loses weight as a heavy tail has it
 NO_HEIGHT = 1e6       # m, sigma of a height that is not there
+LEAST_FIX = 0.005     # m
 
 
-class Fixes:
-    """
-    Residuals (fix less prediction) and their derivatives at one state.
+class Fixes(PointRows):
+    """Residuals (fix less prediction) and their derivatives at one state."""
 
-    later : s by which the delay of the fixes exceeds that of the points.
-    """
+    name, source = 'fixes', 'fixes'
+    levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
 
-    def __init__(self, leg, state, points, intervals, use, later=0.0):
-        self.state, self.points = state, points
+    def __init__(self, problem, here):
+        leg, state, points = problem.leg, here.state, here.points['fixes']
+        self.state, self.points, self.root = state, points, problem.root
         k, tau = points.interval, points.tau[:, None]
         self.k = k
         self.C = state.C_nb[k]
@@ -53,10 +55,13 @@ class Fixes:
             + state.slow_n[k + 1] * self.share[:, None]
         self.dp = dp
         self.v_n = v + turn(self.C, points.dv) + g * tau + turn(
-            self.C_t, np.cross(intervals.mean_rate[k], arm_b))
+            self.C_t, np.cross(here.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
-        raw = leg.fixes_n[use] - place - self.arm_n - slow
-        self.raw = np.nan_to_num(raw) + self.v_n * later
+        raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
+        # of a receiver that smooths, the place is v tau late as for a delay, and a tau^2 / 2 more
+        self.accel_n = (np.diff(state.v_n, axis=0) / np.diff(state.t)[:, None])[k]
+        lag = state.constants[FIX_LAG2] / 2 * self.accel_n
+        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - lag
 
     def jacobians(self, n):
         """
@@ -80,8 +85,30 @@ class Fixes:
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
-        c[:, :, ACCEL_SCALE] = self.C @ self.points.FF
+        c[:, :, FIX_LAG2] = -self.accel_n / 2
+        c[:, :, ACCEL] = self.C @ self.points.FF
         return J, c
+
+    @classmethod
+    def first_levels(cls, problem):
+        """Return first levels, factors on the stated variance, and their least."""
+        least = (LEAST_FIX / problem.fix_sigma)**2
+        return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
+
+    @classmethod
+    def times(cls, problem, constants):
+        """Return when the fixes that are used were true, s."""
+        return problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
+
+    def stated(self, rows):
+        """Return rows in the sigmas that the receiver states."""
+        return self.root @ rows
+
+    def known(self):
+        """Tell which components there are: (m, 3), fixes without height are level ones."""
+        known = np.ones((len(self.k), 3), bool)
+        known[:, 2] = self.root[:, 2, 2] > 1e-5
+        return known
 
 
 def whitener(covariance_n, no_height):
@@ -90,22 +117,3 @@ def whitener(covariance_n, no_height):
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
     C[no_height, 2, 2] = NO_HEIGHT**2
     return np.linalg.inv(np.linalg.cholesky(C))
-
-
-def weights(white):
-    """Return weights of level and height of (m, 3) whitened residuals: (m, 3), heavy tails."""
-    level = np.hypot(white[:, 0], white[:, 1])
-    up = np.abs(white[:, 2])
-    w = np.ones_like(white)
-    w[:, 0] = w[:, 1] = np.minimum(1.0, FAR / np.maximum(level, 1e-12))**2
-    w[:, 2] = np.minimum(1.0, FAR / np.maximum(up, 1e-12))**2
-    return w
-
-
-def heavy(white) -> float:
-    """Return the sum of the losses that ``weights`` belong to: squares, logarithms beyond FAR."""
-    total = 0.0
-    for d in (np.hypot(white[:, 0], white[:, 1]), np.abs(white[:, 2])):
-        far = np.maximum(d / FAR, 1.0)
-        total += float((np.minimum(d, FAR)**2 + 2 * FAR**2 * np.log(far)).sum())
-    return total

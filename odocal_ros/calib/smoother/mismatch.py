@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.problem import sensor_noise
+from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
@@ -18,22 +18,23 @@ WIDEN = 2.0            # factor on the sigmas where the model does not hold
 def mismatch(problem, fit, neighbours, config):
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
-    own = sensor_noise(grade_of(config.imu))
+    told, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     level = fit.levels.roots()
-    worse = [f'{what} {level[name] / own[name]:.1f} times' for name, what in (
+    shaken = [name for name in ('gyro', 'accel') if level[name] > WORSE * own[name]]
+    worse = [f'{what} {level[name] / told[name]:.1f} times' for name, what in (
         ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
-        if level[name] > WORSE * own[name]]
-    worse += [f'{what} {np.max(now / own):.1f} times' for now, own, what in (
-        (np.abs(fit.state.gyro_bias[0]), problem.priors.gyro_bias, 'gyro bias'),
-        (np.abs(fit.state.accel_bias[0]), problem.priors.accel_bias, 'accelerometer bias'))
-        if np.max(now / own) > 2 * WORSE]
+        if level[name] > WORSE * told[name]]
+    worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, what in (
+        (fit.state.gyro_bias, problem.priors.gyro_bias, 'gyro bias'),
+        (fit.state.accel_bias, problem.priors.accel_bias, 'accelerometer bias'))
+        if np.max(np.abs(now[0]) / sigma) > 2 * WORSE]
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
                               f'({", ".join(worse)}); estimated from the drive instead'))
-    widen, odd = 1.0, []
-    if worse:       # what shakes a vehicle is not white, and how it is coloured is not known
+    widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
+    if shaken:      # what shakes a vehicle is not white, and how it is coloured is not known
         odd.append('the Imu errs more than its grade, in ways that are not white noise')
-    share = float((fit.weighted.fix_weight[:, 0] < 0.5).mean())
+    share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
     share = float((fit.spread[:, 0] > 1.5).mean())

@@ -11,12 +11,19 @@ import numpy as np
 
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
     BA,
     BG,
+    BY_FORCE,
+    BY_SPEED,
     C_bv_gradient,
     E,
-    GYRO_SCALE,
+    FAST,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
     LN_K,
     M,
     ODO_ARM,
@@ -24,6 +31,8 @@ from odocal_ros.calib.smoother.state import (
     P,
     PHI,
     PITCH,
+    SIDESLIP,
+    SQUAT,
     V,
     YAW,
 )
@@ -32,6 +41,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 D = slice(15, 18)       # rows of the odometer
 ROWS = 18
+SPRUNG = 0.07       # s, 2 z / w of a body on springs: 1.3 Hz, damped by 0.3
 
 
 def rotvec(C):
@@ -54,24 +64,29 @@ class Motion:
     """
     The interval equations at one state.
 
-    change : (K, 3), s: by what the gyro bias and the odometer's delay differ from those that the
-    sums were made with (for the others the sums have been shifted).
+    change : (K, 3 + g), s: by what gyro bias and constants and the odometer's delay differ from
+        those that the sums were made with (for the others the sums have been shifted).
+    fitted : the state is so near that residuals are noise: derivatives by what multiplies a
+        signal go by the signal as fitted. Those by the signal as measured hold its noise, which
+        the fit then takes for information, and a smaller signal for a better one.
     """
 
-    def __init__(self, leg, state, intervals, change=(0.0, 0.0)):
-        self.state, self.sums = state, intervals
+    def __init__(self, leg, state, intervals, change=(0.0, 0.0), fitted=False):
+        self.state, self.sums, self.fitted = state, intervals, fitted
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
         self.f = state.scale * state.forward
+        self.by_yaw, self.by_pitch = C_bv_gradient(state.constants[YAW], state.constants[PITCH])
         w = earth_rate_n(leg.origin.latitude)
         W = skew(w)
         self.f_n, self.f_n_end = self.C @ self.f, self.C_end @ self.f
         dv, dp = turn(self.C, intervals.dv), turn(self.C, intervals.dp)
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
-        way = intervals.S @ self.f
+        self._vary()
+        way = turn(intervals.S, self.f + self.leaned) * self.varied
         if np.any(change[0]):
-            way = way + turn(intervals.S_bg, change[0])
+            way = way + turn(intervals.S_by, change[0])
         self.way = turn(half @ self.C, way) + self._faster() * change[1]
         self.dv, self.dp = dv, dp
         p, v = state.p_n, state.v_n
@@ -86,10 +101,28 @@ class Motion:
         f_n, f_n_end = self.f_n, self.f_n_end
         swing = turn(self.C_end - self.C,
                      np.broadcast_to(state.C_bv @ self.arm_v, dv.shape))
-        r_d = moved + swing - (self.way - f_n_end * e[1:, None] + f_n * e[:-1, None])
+        self.travelled = moved + swing
+        r_d = self.travelled - (self.way - f_n_end * e[1:, None] + f_n * e[:-1, None])
         self.residual = np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
+
+    def _vary(self):
+        """Work out how scale and forward axis change with speed, time and acceleration."""
+        state, T, c = self.state, self.T, self.state.constants
+        gained = np.diff(state.v_n, axis=0) / T
+        self.accel_v = turn(np.swapaxes(self.C @ state.C_bv, 1, 2), gained)
+        if len(T) > 1:       # a body answers to what accelerates it a moment later
+            self.accel_v -= SPRUNG * np.gradient(self.accel_v, axis=0) / T
+        way = np.linalg.norm(self.sums.S @ self.f, axis=1)
+        t = (state.t[1:] + state.t[:-1]) / 2
+        total = max(way.sum(), 1e-9)
+        self.from_mean = np.stack([x - (x @ way) / total for x in (
+            (way / T[:, 0])**2 / (2 * FAST), t, self.accel_v[:, 0])], -1)
+        self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1, None]
+        self.leaned = state.scale * (
+            np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
+            + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
 
     def _faster(self):
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
@@ -105,32 +138,58 @@ class Motion:
         a, b = np.zeros((K, ROWS, n)), np.zeros((K, ROWS, n))
         arm_b = state.C_bv @ self.arm_v
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
-        a[:, P, BG], a[:, P, BA] = -C @ s.dp_bg, C @ s.AA
+        gyro = self._by_gyro()
+        a[:, :, BG] = gyro[:, :, :3]
+        a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
-        a[:, V, BG], a[:, V, BA] = -C @ s.dv_bg, C @ s.A
-        a[:, PHI, PHI], a[:, PHI, BG] = -one, C @ s.A
+        a[:, PHI, PHI] = -one
         a[:, BG, BG] = a[:, BA, BA] = -one
         a[:, D, P], a[:, D, PHI] = -one, skew(C @ arm_b + self.way)
-        a[:, D, BG], a[:, D, E] = -C @ s.S_bg, -self.f_n
+        a[:, D, E] = -self.f_n
         b[:, P, P] = b[:, V, V] = b[:, PHI, PHI] = b[:, BG, BG] = b[:, BA, BA] = one
         b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
-        return a, b, self._by_constants(a)
+        return a, b, self._by_constants(gyro)
 
-    def _by_constants(self, a):
+    def _by_gyro(self):
+        """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
+        s, C = self.sums, self.C
+        out = np.zeros((len(C), ROWS, s.turned.shape[2]))
+        out[:, PHI], out[:, V], out[:, P] = C @ s.turned, -C @ s.dv_by, -C @ s.dp_by
+        out[:, D] = -C @ s.S_by
+        return out
+
+    def _by_constants(self, gyro):
         s, C, state = self.sums, self.C, self.state
         c = np.zeros((len(self.T), ROWS, M))
-        yaw, pitch = state.constants[YAW], state.constants[PITCH]
-        by_yaw, by_pitch = C_bv_gradient(yaw, pitch)
         swing = self.C_end - C
-        c[:, D, LN_K] = -self.way
-        for column, gradient in ((YAW, by_yaw), (PITCH, by_pitch)):
-            c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
-                + swing @ gradient @ self.arm_v
+        c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
+        c[:, D, BY_SPEED:BY_FORCE + 1] = (c[:, D, LN_K] / self.varied)[:, :, None] \
+            * self.from_mean[:, None]
+        for column, gradient, lean, accel in ((YAW, self.by_yaw, SIDESLIP, self.accel_v[:, 1]),
+                                              (PITCH, self.by_pitch, SQUAT, self.accel_v[:, 0])):
+            turned = -(C @ s.S @ (state.scale * gradient[:, 0]))
+            c[:, D, column] = turned + swing @ gradient @ self.arm_v
+            c[:, D, lean] = turned * accel[:, None]
         c[:, D, ODO_ARM] = swing @ state.C_bv
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self._faster()
-        # a gyro's scale error is a bias in proportion to the turn rate
-        c[:, :, GYRO_SCALE] = a[:, :, BG.start + 2] * s.mean_rate[:, 2:]
-        c[:, BG, GYRO_SCALE] = 0.0
-        c[:, V, ACCEL_SCALE], c[:, P, ACCEL_SCALE] = C @ s.F, C @ s.FF
+        c[:, :, GYRO] = gyro[:, :, 3:]
+        c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
+        if self.fitted:
+            self._fit_signals(c, gyro)
         return c
+
+    def _fit_signals(self, c, gyro):
+        """
+        Take the noise, which the residuals are, out of the signals in c.
+
+        The noises of two sensors are independent, so the forces that act on the gyro are left.
+        """
+        axis, signal = list(ACCEL_AXIS), list(ACCEL_SIGNAL)
+        for rows in (V, P):
+            noise = turn(transpose(self.C), self.residual[:, rows])
+            c[:, rows, ACCEL] += self.C[:, :, axis] * noise[:, None, signal]
+        rate = turn(transpose(self.C), self.residual[:, PHI]) / self.T
+        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
+            if by < 3:
+                c[:, :, GYRO.start + i] += gyro[:, :, into] * rate[:, by, None]

@@ -126,20 +126,6 @@ def rest_noise(speed, rest):
     return max(measured, AT_REST**2)
 
 
-def once_a_rest(still):
-    """
-    Return the weight of what is believed of the rounding at each keyframe, (N,).
-
-    A counter that stands errs by the same all the time: its keyframes together count as one.
-    """
-    starts = np.flatnonzero(np.diff(still, prepend=False) & still)
-    stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
-    weight = np.ones(len(still))
-    for first, last in zip(starts, stops, strict=True):
-        weight[first:last] = 1 / (last - first)
-    return weight
-
-
 def hard_and_turning(motion):
     """Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each."""
     T = motion.T[:, 0]

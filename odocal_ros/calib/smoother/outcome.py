@@ -4,20 +4,23 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.mismatch import mismatch
+from odocal_ros.calib.smoother.remarks import beside, FLOOR, level_pitch, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
-    ACCEL_SCALE,
+    ACCEL,
     BG,
     CONSTANTS,
     GNSS_ARM,
-    GYRO_SCALE,
+    GYRO,
     HEADING,
     LN_K,
+    M,
     ODO_ARM,
     PITCH,
     YAW,
@@ -35,7 +38,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = (GYRO_SCALE, *range(ACCEL_SCALE.start, ACCEL_SCALE.stop))     # errors of the Imu
+SCALES = range(GYRO.start, ACCEL.stop)     # errors of the Imu
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
 
@@ -73,28 +76,15 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     widen, reasons = mismatch(problem, fit, near, config)
     slips = find_slips(fit, near)
     reasons += slip_reasons(fit, slips)
-    sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
     state, c = fit.state, fit.state.constants
-    K, yaw, pitch = state.scale, float(wrap(c[YAW])), float(c[PITCH])
-    found = _unknown(leg.scale_unit)
-    if sigma[LN_K] <= SCALE_LIMIT:
-        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), leg.scale_unit)
-        if leg.nominal_scale:
-            ratio = K / leg.nominal_scale
-            found['scale_ratio'] = Estimate(ratio, float(ratio * sigma[LN_K]), '1')
-    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
-    for name, i, value in (('yaw_mounting_angle', YAW, yaw),
-                           ('pitch_mounting_angle', PITCH, pitch)):
-        if sigma[i] <= limit:
-            found[name] = Estimate(value, float(sigma[i]), 'rad')
-    reasons += _undetermined(sigma, limit, config, yaw)
+    covariance = floored(fit.solved.covariance * widen**2)
+    sigma = np.sqrt(np.diag(covariance))
+    reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
-    for i in OPTIONAL:
-        name = CONSTANTS[i]
-        if ratio[name] < INFORMED:
-            value = c[i] + _configured(leg, i)
-            found[name] = Estimate(float(value), float(sigma[i]), UNITS[name])
+    found, undetermined = told(c + configured(leg), sigma, after, leg.scale_unit,
+                               leg.nominal_scale, config)
+    reasons += undetermined
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
@@ -107,10 +97,60 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                               f'{in_words(unsaid)}; what the settings say of it is kept'))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
-    sources = [_widened(s, widen) for s in shares(fit, near)]
+    sources = [*(_widened(s, widen) for s in shares(fit, near)), Source('model', np.diag(FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
-                        | {'slips': [vars(s) for s in slips]})
+                        | {'slips': [vars(s) for s in slips],
+                           'beside': beside(c, covariance, problem.grade),
+                           'level_pitch_angle': level_pitch(fit, near, widen)},
+                        border_of(fit, configured(leg)).widened(widen))
+
+
+def floored(covariance):
+    """Return the covariance of the constants with what the model does not hold."""
+    covariance = covariance.copy()
+    covariance[range(len(FLOOR)), range(len(FLOOR))] += FLOOR**2
+    return covariance
+
+
+def told(value, sigma, ratio, scale_unit, nominal, config):
+    """
+    Return the estimates of the constants as far as the data tell them, and why not further.
+
+    Parameters
+    ----------
+    value, sigma : (M,) arrays
+        Of the constants, ln K first, whole lever arms.
+    ratio : (M,) array
+        Sigma by that believed beforehand.
+    scale_unit, nominal : str, float
+        Of the scale; K0, 0 unknown.
+    config : Config
+        Limits.
+
+    """
+    K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
+    found = _unknown(scale_unit)
+    if sigma[LN_K] <= SCALE_LIMIT:
+        found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
+        if nominal:
+            found['scale_ratio'] = Estimate(K / nominal, float(K / nominal * sigma[LN_K]), '1')
+    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
+    for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
+                           ('pitch_mounting_angle', PITCH, pitch)):
+        if sigma[i] <= limit:
+            found[name] = Estimate(angle, float(sigma[i]), 'rad')
+    for i in OPTIONAL:
+        if ratio[i] < INFORMED:
+            found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
+    return found, _undetermined(sigma, limit, config, yaw)
+
+
+def configured(leg):
+    """Return the values of the settings that constants are corrections to: (M,)."""
+    value = np.zeros(M)
+    value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
+    return value
 
 
 def in_words(names):
@@ -129,13 +169,6 @@ def in_words(names):
 
 def _widened(source, widen):
     return type(source)(source.name, source.effects * widen, source.shared)
-
-
-def _configured(leg, i):
-    """Return the configured value that a constant is a correction to, 0 for delays."""
-    if ODO_ARM.start <= i < ODO_ARM.stop:
-        return leg.odometer_arm[i - ODO_ARM.start]
-    return leg.antenna_arm[i - GNSS_ARM.start] if GNSS_ARM.start <= i < GNSS_ARM.stop else 0.0
 
 
 def _undetermined(sigma, limit, config, yaw):
@@ -164,13 +197,12 @@ def _undetermined(sigma, limit, config, yaw):
 
 
 def _details(leg, problem, fit, sources, ratio, widen, sigma):
-    state, w = fit.state, fit.weighted
+    state, motion, fixes = fit.state, fit.weighted['motion'].motion, fit.weighted['fixes']
     K = state.scale
-    arm = state.C_bv @ w.eq.motion.arm_v
+    arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // TRACK_ROWS)
     t_fix = leg.t_fix[problem.use]
-    alike, _ = correlation(t_fix, w.fix_r[:, :2])
-    motion = w.eq.motion
+    alike, _ = correlation(t_fix, fixes.r[:, :2])
     speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)
                     * motion.T[:, 0]).sum()
@@ -184,9 +216,9 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'posterior_to_prior': ratio,
         **{CONSTANTS[i]: {'value': float(state.constants[i]), 'sigma': float(sigma[i])}
            for i in SCALES},
-        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((w.fix_r[:, :2]**2).mean())),
+        'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
-                      'fixes_downweighted': int((w.fix_weight[:, 0] < 0.5).sum()),
+                      'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix),
                       'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
@@ -203,8 +235,8 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
 def _outside(leg, problem, fit, sigma):
     """Return what the drive says of velocity and heading from outside."""
     out = {}
-    for rows in fit.weighted.outside:
-        out[rows.name] = {'messages': len(rows.k), 'alike': problem.thin.get(rows.name, 1.0)}
+    for name in problem.outside:
+        out[name] = {'messages': len(fit.weighted[name].k), 'alike': problem.thin.get(name, 1.0)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
                            'error': float(fit.state.constants[HEADING]),

@@ -13,6 +13,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+)
 from odocal_ros.nav.rotations import (
     exp_so3,
     matrix_from_quat,
@@ -20,7 +28,6 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
     skew,
-    transpose,
 )
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
 
@@ -36,29 +43,32 @@ class Intervals:
     R: Floats        # (K, 3, 3) attitude at the end
     dv: Floats       # (K, 3) m/s
     dp: Floats       # (K, 3) m
-    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba, and the end turns by -A d bg
+    A: Floats        # (K, 3, 3) integral of R, s: d dv = -A d ba
     AA: Floats       # (K, 3, 3) its integral: d dp = -AA d ba
-    dv_bg: Floats    # (K, 3, 3) derivative of dv by the gyro bias
-    dp_bg: Floats    # (K, 3, 3)
-    F: Floats        # (K, 3, 2) integral of R's x and y columns times their force as measured:
-    #                  d dv = -F d accelerometer scale; not A times the mean force, which may be
+    F: Floats        # (K, 3, a) integral of R's columns ACCEL_AXIS times the forces ACCEL_SIGNAL
+    #                  as measured: d dv = -F d constants; not A times the mean force, which may be
     #                  millimetres off and would tell a scale that nothing tells
-    FF: Floats       # (K, 3, 2) its integral: d dp = -FF d accelerometer scale
+    FF: Floats       # (K, 3, a) its integral: d dp = -FF d constants
+    # by the gyro bias (3) and by the constants of GYRO (g)
+    turned: Floats   # (K, 3, 3 + g) the end turns by -turned d; the first three are A
+    dv_by: Floats    # (K, 3, 3 + g) derivative of dv
+    dp_by: Floats    # (K, 3, 3 + g)
     S: Floats        # (K, 3, 3) sum of R over travel, scale units
-    S_bg: Floats     # (K, 3, 3) derivative of S @ forward by the gyro bias
+    S_by: Floats     # (K, 3, 3 + g) derivative of S @ forward
     mean_rate: Floats   # (K, 3) mean turn rate as measured, bias and all, rad/s
     mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
-    def shifted(self, gyro_bias, accel_bias, accel_scale) -> 'Intervals':
-        """Return the sums for biases, (K, 3), and scales, (2,), that differ a little."""
-        turned = -turn(self.A, gyro_bias)
+    def shifted(self, gyro, accel_bias, accel) -> 'Intervals':
+        """
+        Return the sums for errors of the Imu that differ a little.
+
+        gyro : (K, 3 + g) biases and constants.   accel_bias : (K, 3).   accel : (a,) constants.
+        """
         return replace(
-            self, R=exp_so3(turned) @ self.R,
-            dv=self.dv + turn(self.dv_bg, gyro_bias) - turn(self.A, accel_bias)
-            - self.F @ accel_scale,
-            dp=self.dp + turn(self.dp_bg, gyro_bias) - turn(self.AA, accel_bias)
-            - self.FF @ accel_scale)
+            self, R=exp_so3(-turn(self.turned, gyro)) @ self.R,
+            dv=self.dv + turn(self.dv_by, gyro) - turn(self.A, accel_bias) - self.F @ accel,
+            dp=self.dp + turn(self.dp_by, gyro) - turn(self.AA, accel_bias) - self.FF @ accel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +80,8 @@ class Points:
     dv: Floats       # (m, 3)
     dp: Floats       # (m, 3)
     R: Floats        # (m, 3, 3)
-    F: Floats        # (m, 3, 2)
-    FF: Floats       # (m, 3, 2)
+    F: Floats        # (m, 3, a)
+    FF: Floats       # (m, 3, a)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
 
@@ -114,8 +124,8 @@ class ImuRows:
         return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
 
 
-def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forward, t_points,
-                 accel_scale=(0.0, 0.0), derivatives=True):
+def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
+                 constants=None, derivatives=True):
     """
     Sum up all intervals.
 
@@ -125,18 +135,16 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forwar
         Samples.
     gyro_bias, accel_bias : (K, 3) arrays
         Taken out, one for each interval.
-    gyro_scale : float
-        Relative scale error of the gyro's z axis, taken out.
     travel : callable
         (m,) times, s, to travel, scale units.
     forward : (3,) array
-        Scale times forward axis, for S_bg.
+        Scale times forward axis, for S_by.
     t_points : (m,) array
         Times of fixes, rising, within the keyframes.
-    accel_scale : (2,) array
-        Scale errors of the accelerometer's x and y axes, of what is measured, taken out.
+    constants : (M,) array, optional
+        Of which GYRO and ACCEL are taken out.
     derivatives : bool
-        False: zeros stand in for those that cost most (AA, dv_bg, dp_bg, F, FF, S_bg).
+        False: zeros stand in for those that cost most (AA, F, FF, turned, dv_by, dp_by, S_by).
 
     Returns
     -------
@@ -144,19 +152,36 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, gyro_scale, travel, forwar
 
     """
     key, out, points = imu.key, [], []
-    unscaled = np.array([1.0, 1.0, 1 / (1 + gyro_scale)])
+    turn_b, f_b = mended(imu, constants)
     owner = np.clip(np.searchsorted(imu.t[key], t_points, side='right') - 1, 0, len(key) - 2)
     per = max(1, int(CHUNK * (len(key) - 1) / max(len(imu.t), 1)))
     for first in range(0, len(key) - 1, per):
         last = min(first + per, len(key) - 1)
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
         rows = slice(key[first], key[last] + 1)
-        part = _Chunk(imu.t[rows], imu.f_b[rows], imu.turn[key[first]:key[last]] * unscaled,
+        steps = slice(key[first], key[last])
+        part = _Chunk(imu.t[rows], (imu.f_b[rows], imu.turn[steps]), (f_b[rows], turn_b[steps]),
                       key[first:last + 1] - key[first], gyro_bias[first:last],
-                      accel_bias[first:last], np.append(accel_scale, 0.0), derivatives)
+                      accel_bias[first:last], derivatives)
         out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], owner[mine] - first, first))
     return _joined(Intervals, out), _joined(Points, points)
+
+
+def mended(imu, constants):
+    """Return rotation vectors (n - 1, 3) and forces (n, 3) without the Imu's own errors."""
+    if constants is None or not (constants[GYRO].any() or constants[ACCEL].any()):
+        return imu.turn, imu.f_b
+    gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
+    gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
+    accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
+    return imu.turn - _signals(imu) @ gyro.T, imu.f_b - imu.f_b @ accel.T
+
+
+def _signals(imu):
+    """Return what the gyro's errors go by over each step: turns, rad, and forces times s."""
+    dt = np.diff(imu.t)[:, None]
+    return np.concatenate([imu.turn, (imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt], axis=1)
 
 
 def _joined(cls, parts):
@@ -185,8 +210,9 @@ def _cross(a, M):
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
-    def __init__(self, t, f_b, turn, key, gyro_bias, accel_bias, accel_scale, derivatives):
-        self.t, self.key, self.turn, self.f_b = t, key, turn, f_b
+    def __init__(self, t, measured, mended, key, gyro_bias, accel_bias, derivatives):
+        self.t, self.key, (self.f_b, self.turn) = t, key, measured
+        f, turn = mended
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         dt = self.dt = np.diff(t)
         q = np.empty((len(t), 4))
@@ -197,16 +223,16 @@ class _Chunk:
         back = quat_conjugate(q[key[:-1]])[self.own]
         self.Rs = matrix_from_quat(quat_multiply(back, q[:-1]))
         self.Re = matrix_from_quat(quat_multiply(back, q[1:]))
-        bias, f = accel_bias[self.own], f_b * (1 - accel_scale)
+        bias = accel_bias[self.own]
         self.a_s = np.einsum('nij,nj->ni', self.Rs, f[:-1] - bias)
         self.a_e = np.einsum('nij,nj->ni', self.Re, f[1:] - bias)
         self.v, self.dv = self._sums(self.a_s, self.a_e)
         self.p, self.dp = self._twice(self.v, self.a_s, self.a_e)
-        self.A_before, self.A = self._sums(self.Rs, self.Re)
         self.derivatives = derivatives
         if derivatives:
-            ends = self.F_s, self.F_e = (self.Rs[:, :, :2] * f_b[:-1, None, :2],
-                                         self.Re[:, :, :2] * f_b[1:, None, :2])
+            axis, signal = list(ACCEL_AXIS), list(ACCEL_SIGNAL)
+            ends = self.F_s, self.F_e = (self.Rs[:, :, axis] * self.f_b[:-1, None, signal],
+                                         self.Re[:, :, axis] * self.f_b[1:, None, signal])
             self.F_before, self.F = self._sums(*ends)
             self.FF_before, self.FF = self._twice(self.F_before, *ends)
 
@@ -234,20 +260,32 @@ class _Chunk:
         _, S = self._running((self.Rs + self.Re) * self._widen(ds, self.Rs))
         T = np.diff(self.t[self.key])
         _, turn = self._running(self.turn)
-        AA = dv_bg = dp_bg = S_bg = np.zeros_like(S)
-        F = FF = np.zeros_like(S[:, :, :2])
+        A_before, A = self._sums(self.Rs, self.Re)
+        AA, F = np.zeros_like(S), np.zeros((len(T), 3, len(ACCEL_AXIS)))
+        by = np.zeros((len(T), 3, 3 + len(GYRO_AXIS)))
+        FF, turned, dv_by, dp_by, S_by = F, by, by, by, by
         if self.derivatives:
             F, FF = self.F, self.FF
-            A_after = self.A_before + (self.Rs + self.Re) * self._widen(self.dt / 2, self.Rs)
-            _, AA = self._twice(self.A_before, self.Rs, self.Re)
-            x_s, x_e = _cross(self.a_s, self.A_before), _cross(self.a_e, A_after)
-            before, dv_bg = self._sums(x_s, x_e)
-            _, dp_bg = self._twice(before, x_s, x_e)
-            turned = _cross(self.Rs @ forward, self.A_before) + _cross(self.Re @ forward, A_after)
-            _, S_bg = self._running(turned * self._widen(ds, turned))
-        return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, self.A, AA, dv_bg, dp_bg,
-                         F, FF, S, S_bg, turn / T[:, None], _mean(self.t, self.f_b, self.key),
+            _, AA = self._twice(A_before, self.Rs, self.Re)
+            before, step, turned = self._turned()
+            after = before + step
+            x_s, x_e = _cross(self.a_s, before), _cross(self.a_e, after)
+            dv_before, dv_by = self._sums(x_s, x_e)
+            _, dp_by = self._twice(dv_before, x_s, x_e)
+            x = _cross(self.Rs @ forward, before) + _cross(self.Re @ forward, after)
+            _, S_by = self._running(x * self._widen(ds, x))
+        return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, A, AA, F, FF, turned,
+                         dv_by, dp_by, S, S_by, turn / T[:, None],
+                         _mean(self.t, self.f_b, self.key),
                          np.maximum.reduceat(self.dt, self.key[:-1]))
+
+    def _turned(self):
+        """Return what gyro bias and constants turn: before each step, in it, in all."""
+        x = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
+                            _signals(self)[:, GYRO_SIGNAL]], axis=1) / 2
+        step = (self.Rs + self.Re)[:, :, [0, 1, 2, *GYRO_AXIS]] * x[:, None, :]
+        before, total = self._running(step)
+        return before, step, total
 
     def points(self, t, interval, first) -> Points:
         """Return the sums up to times within given intervals of the chunk."""
@@ -261,7 +299,7 @@ class _Chunk:
         dv = self.v[j] + (self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 2)[:, None]) * h1
         R = self.Rs[j] + self.Rs[j] @ skew(self.rate_turn[j] * share[:, None])
         force = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * share[:, None]
-        F = FF = np.zeros((len(t), 3, 2))
+        F = FF = np.zeros((len(t), 3, len(ACCEL_AXIS)))
         if self.derivatives:
             h2, change = h[:, None, None], self.F_e[j] - self.F_s[j]
             half, third = share[:, None, None] / 2, share[:, None, None] / 3
@@ -270,8 +308,3 @@ class _Chunk:
                 self.F_s[j] + change * third) * h2**2 / 2
         return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, F, FF, force,
                       self.rate_turn[j] / self.dt[j, None])
-
-
-def orthonormal(C):
-    """Return the rotation nearest to C, (..., 3, 3), that is a rotation but for rounding."""
-    return C @ (1.5 * np.eye(3) - 0.5 * transpose(C) @ C)

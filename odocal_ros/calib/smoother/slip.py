@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.components import road_noise
-from odocal_ros.calib.smoother.noise import INTERVAL
+from odocal_ros.calib.smoother.motion import D
+from odocal_ros.calib.smoother.motion_rows import ALONG
 from odocal_ros.reasons import Code, Reason
 
 FAR_OUT = 1.5           # factor on the variance of an interval from which it is a slip
@@ -28,12 +28,10 @@ class Slip:
 
 def along(fit, neighbours):
     """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
-    w = fit.weighted
-    own = [INTERVAL.index('along'), INTERVAL.index('along_hard')]
-    estimate, _ = road_noise(w, neighbours)
-    pick = np.isin(w.eq.noise.component, own)
-    root = np.sqrt([w.levels[INTERVAL[i]] for i in w.eq.noise.component[pick]])
-    size = np.linalg.norm(w.eq.noise.columns[:, -3:, pick] * root, axis=1).sum(axis=1)
+    rows = fit.weighted['motion']
+    estimate, _ = rows.road_noise(neighbours)
+    pick = rows.of(*ALONG)
+    size = np.linalg.norm(rows.noise.columns[:, D, pick] * rows.roots()[pick], axis=1).sum(axis=1)
     return -estimate[:, 0] * size
 
 

@@ -53,7 +53,7 @@ def are_slow(problem, first: Fit, asked: float) -> bool:
     if first.levels['fix'] < SMOOTHED**2:
         return True
     t = problem.leg.t_fix[problem.use]
-    alike, sigma = correlation(t, first.weighted.fix_r[:, :2])
+    alike, sigma = correlation(t, first.weighted['fixes'].r[:, :2])
     return alike > max(ALIKE, SURE * sigma) or _hidden(t, first.levels['fix'])
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.accel_scale import judge_scale
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.imperfect import judge_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
-from odocal_ros.calib.smoother.outside_rows import alike
+from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
 from odocal_ros.calib.smoother.start import first_state
@@ -57,8 +57,8 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 
 def best_fit(problem, config, trace=None):
-    """Return the likeliest fit, the accelerometer's scale error judged."""
-    return judge_scale(problem, likeliest_fit(problem, config, trace), config, trace)
+    """Return the likeliest fit, the Imu's own errors judged."""
+    return judge_imperfect(problem, likeliest_fit(problem, config, trace), trace)
 
 
 def likeliest_fit(problem, config, trace=None):
@@ -76,7 +76,7 @@ def likeliest_fit(problem, config, trace=None):
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
         fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.thin = {rows.name: alike(rows) for rows in best.weighted.outside}
+    problem.thin = {name: alike(best.weighted[name]) for name in problem.outside}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
         return with_slow_errors(problem, best, asked, trace)
@@ -111,7 +111,7 @@ def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
 
     """
     problem = Problem.of(leg, config)
-    equations = Equations(problem, truth, problem.sums(truth))
+    equations = Equations(problem, truth, problem.sums(truth), fitted=True)
     return solve(equations.at(levels).normal()).covariance
 
 

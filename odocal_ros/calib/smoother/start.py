@@ -98,7 +98,7 @@ def first_state(leg, imu, priors, yaw=None) -> Start:
 
 def _sums(leg, imu, bias):
     K = len(imu.key) - 1
-    sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), 0.0, leg.travel.at,
+    sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                            np.array([1.0, 0.0, 0.0]), np.empty(0), derivatives=False)
     C = np.empty((K + 1, 3, 3))
     C[0] = np.eye(3)

@@ -1,12 +1,11 @@
-"""The accelerometer's scale error: judged from the drive, held by the sigma."""
+"""The Imu's own errors: judged from the drive, held by the sigma."""
 
 import numpy as np
 import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.accel_scale import believed
-from odocal_ros.calib.smoother.problem import NO_SCALE
+from odocal_ros.calib.smoother.imperfect import believed, weigh_kinds
 from odocal_ros.config import with_settings
 
 GRADE, BELIEF = 3e-3, 0.8
@@ -14,43 +13,48 @@ TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway'
 
 
 def seen(sigma, error):
-    """Return covariance and values under the belief of none, of data that tell both so well."""
-    data = 1 / sigma**2
-    both = data + 1 / NO_SCALE**2
-    return np.eye(2) / both, np.full(2, data * error / both)
+    """Return information and gradient, in units of GRADE, of data that tell two errors so well."""
+    data = (GRADE / sigma)**2
+    return data * np.eye(2), data * np.full(2, error / GRADE)
 
 
 def test_weights_are_the_evidence_written_out():
-    prior, weight = believed(*seen(1e-3, 2e-3), GRADE, BELIEF)
-    # each axis: the value seen is N(0, s^2) without a scale error, N(0, s^2 + grade^2) with one
+    data, gradient = seen(1e-3, 2e-3)
+    prior, weight = believed(data, np.outer(gradient, gradient), BELIEF)
+    # each error: the value seen is N(0, s^2) where there is none, N(0, s^2 + grade^2) else
     total = 1e-3**2 + GRADE**2
     odds = BELIEF / (1 - BELIEF) * (1e-6 / total * np.exp(4e-6 * (1 / 1e-6 - 1 / total)))
-    assert weight == pytest.approx(odds / (1 + odds), rel=2e-3)      # NO_SCALE and 1e-3 of belief
-    # the posterior of that prior has the mean square of both beliefs: w var + w (1 - w) mean^2
+    assert weight == pytest.approx(odds / (1 + odds))
+    # the posterior of that prior has the mean square of both: w var + w (1 - w) mean^2
     var, mean = 1 / (1e6 + GRADE**-2), 2e-3 * GRADE**2 / total
     square = weight * var + weight * (1 - weight) * mean**2
     expected = min(1 / (1 / square - 1e6), GRADE**2) if square < 1e-6 else GRADE**2
-    assert prior**2 == pytest.approx(expected, rel=5e-3)
-
-
-@pytest.mark.parametrize('held', [1e-4, GRADE])
-def test_what_was_believed_before_does_not_weigh_twice(held):
-    data, error = 1 / 1e-3**2, 2e-3
-    both = data + 1 / held**2
-    again = believed(np.eye(2) / both, np.full(2, data * error / both), GRADE, BELIEF, held)
-    for now, first in zip(again, believed(*seen(1e-3, error), GRADE, BELIEF), strict=True):
-        # differences of 1e10 leave 1e-6 of 1e6 by rounding
-        np.testing.assert_allclose(now, first, rtol=1e-4)
+    assert prior * GRADE**2 == pytest.approx(expected)
 
 
 def test_a_drive_that_tells_there_is_none_is_believed():
-    prior, weight = believed(*seen(1e-4, 0.0), GRADE, BELIEF)
+    data, gradient = seen(1e-4, 0.0)
+    prior, weight = believed(data, np.outer(gradient, gradient), BELIEF)
     assert weight < 0.01
-    assert prior.max() < 2e-5
+    assert np.sqrt(prior.max()) * GRADE < 2e-5
     # and one that tells nothing is not
-    blind, weight = believed(*seen(0.1, 0.0), GRADE, BELIEF)
+    data, gradient = seen(0.1, 0.0)
+    blind, weight = believed(data, np.outer(gradient, gradient), BELIEF)
     assert weight == pytest.approx(BELIEF, rel=2e-3)
-    assert blind.max() > 0.8 * GRADE
+    assert np.sqrt(blind.max()) > 0.8
+
+
+def test_of_two_kinds_one_is_there_and_the_other_is_not():
+    # alike to 0.7 in what they do: alone, either would be taken for what the other does
+    data = 400.0 * np.array([[1.0, 0.7], [0.7, 1.0]])
+    kinds = (slice(0, 1), slice(1, 2))
+    there, absent = weigh_kinds(data, data @ [1.0, 0.0], kinds)
+    assert there == 1.0
+    assert absent < 0.05**2
+    np.testing.assert_allclose(weigh_kinds(data, data @ [0.0, 1.0], kinds), [absent, there],
+                               rtol=0.1)
+    # where none is there, it is as for gradients that scatter so
+    assert weigh_kinds(data, None, kinds).max() < 0.05**2
 
 
 def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():

@@ -1,0 +1,133 @@
+"""
+Legs of a vehicle combined on their border: what is stated, and how far it is off.
+
+    python benchmarks/border_legs.py [--vehicles 4] [--legs 6] [--grade consumer]
+                                     [--fixes correlated|white|rtk] [--file F]
+
+A vehicle has one scale, one mounting and one Imu, whose scale errors are drawn as its grade has
+them (accelerometer by grades.GRADES, gyro by a third of that); biases, road, wheels and fixes are
+each leg's own. The accelerometer's scale error is alike on all axes; the upward one turns the
+pitch by itself times the pitch, and no constant holds that. Legs are town drives of 10 minutes, a
+quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
+
+Printed for scale, yaw and pitch: median stated sigma and RMS of error over sigma of one leg, of
+all legs on their border and, for comparison, of the mean of the same legs weighted by variances
+(as ``two_point`` is combined); chi-square of the legs over its freedom; what they disagree on.
+Rows are kept in the file: an interrupted run goes on where it stopped.
+"""
+
+import argparse
+import json
+import os
+from pathlib import Path
+import sys
+import time
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
+sys.path.insert(0, str(Path(__file__).parents[1] / 'test' / 'calib'))
+
+import numpy as np
+from resumed import read_rows
+from smoother_cells import simulated
+
+FIRST_SEED, APART = 61_000_000, 15 * 60 * 10**9       # ns
+NAMES = {'scale_factor': ('scale, ppm', 1e6), 'yaw_mounting_angle': ('yaw, mdeg', 1e3 * 57.29578),
+         'pitch_mounting_angle': ('pitch, mdeg', 1e3 * 57.29578)}
+
+
+def driven(vehicle, legs, grade, fixes):
+    """Return the results of a vehicle's legs, when they were driven, settings and truth."""
+    from smoother_legs import leg_of
+
+    from odocal_ros.calib.smoother import smooth
+    from odocal_ros.grades import GRADES
+    from odocal_ros.sim.noise import stream
+    seed = FIRST_SEED + 100 * vehicle
+    rng, of_grade = stream(seed, 'what the vehicle is'), GRADES[grade]
+    own = {'accel_scale_error': float(of_grade.accel_scale_error * rng.standard_normal()),
+           'gyro_scale_error': float(of_grade.gyro_scale_error / 3 * rng.standard_normal()),
+           'scale': float(0.0213 * np.exp(0.01 * rng.standard_normal())),
+           'yaw': float(np.deg2rad(2.0) * rng.standard_normal()),
+           'pitch': float(np.deg2rad(1.0) * rng.standard_normal())}
+    results, times = [], []
+    for j in range(legs):
+        drive, config = simulated(
+            seed + j, scenario='town', duration=600.0, imu_grade=grade, fix_noise=fixes,
+            start_ns=1_750_000_000_000_000_000 + j * APART, **own)
+        results.append(smooth(leg_of(drive.leg(), config), config))
+        times.append(drive.truth.start_ns)
+    return results, times, config, drive.truth
+
+
+def off(method, truth):
+    """Return (error, sigma) of each parameter, relative and rad; None where it is refused."""
+    found = {}
+    for name, true in zip(NAMES, (truth.scale, truth.yaw, truth.pitch), strict=True):
+        e = method.estimates[name]
+        size = true if name == 'scale_factor' else 1.0
+        found[name] = None if e.value is None else ((e.value - true) / size, e.sigma / size)
+    return found
+
+
+def run_vehicle(vehicle, legs, grade, fixes):
+    """Drive, fit, combine; return a row."""
+    from odocal_ros.calib.combine import combine_method
+    from odocal_ros.calib.smoother.several import combine_legs
+    begin = time.process_time()
+    results, times, config, truth = driven(vehicle, legs, grade, fixes)
+    good = [(r, t) for r, t in zip(results, times, strict=True) if r.border]
+    together = combine_legs(*zip(*good, strict=True), config)
+    return {'seed': vehicle, 'legs': [off(r, truth) for r in results],
+            'border': off(together, truth),
+            'mean': off(combine_method('smoother', [r for r, _ in good]), truth),
+            'disagreement': together.details['disagreement'],
+            'codes': sorted({r.code.name for r in together.reasons}),
+            'seconds': time.process_time() - begin}
+
+
+def table(rows):
+    """Print stated sigma and error over sigma of one leg and of all."""
+    print(f'{"":14}{"":>10}{"stated":>10}{"RMS error":>11}{"/sigma":>8}{"worst":>7}{"of":>5}')
+    for name, (title, unit) in NAMES.items():
+        for label, found in (('one leg', [leg for r in rows for leg in r['legs']]),
+                             ('mean', [r['mean'] for r in rows]),
+                             ('border', [r['border'] for r in rows])):
+            e = np.array([f[name] for f in found if f[name]])
+            if not len(e):
+                continue
+            z = e[:, 0] / e[:, 1]
+            print(f'{title:14}{label:>10}{np.median(e[:, 1]) * unit:10.1f}'
+                  f'{np.sqrt((e[:, 0]**2).mean()) * unit:11.1f}{np.sqrt((z**2).mean()):8.2f}'
+                  f'{np.abs(z).max():7.2f}{len(e):5d}')
+            title = ''
+    of = [r['disagreement'] for r in rows]
+    print('chi2 / freedom:', ', '.join(f'{d["chi2"]:.0f}/{d["freedom"]}' for d in of))
+    print('between legs:', [d['between_legs'] for d in of if d['between_legs']] or 'nothing')
+
+
+def main():
+    """Run what the file does not hold yet, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--vehicles', type=int, default=4)
+    parser.add_argument('--legs', type=int, default=6)
+    parser.add_argument('--grade', default='consumer')
+    parser.add_argument('--fixes', default='correlated')
+    parser.add_argument('--file', type=Path)
+    args = parser.parse_args()
+    path = args.file or Path(f'/tmp/border_{args.grade}_{args.fixes}_{args.legs}.jsonl')
+    have = read_rows(path)
+    with path.open('a') as out:
+        for vehicle in range(args.vehicles):
+            if vehicle not in have:
+                have[vehicle] = run_vehicle(vehicle, args.legs, args.grade, args.fixes)
+                out.write(json.dumps(have[vehicle]) + '\n')
+                out.flush()
+                print(f'vehicle {vehicle}: {have[vehicle]["seconds"]:.0f} s', file=sys.stderr,
+                      flush=True)
+    table([have[k] for k in range(args.vehicles)])
+
+
+if __name__ == '__main__':
+    main()

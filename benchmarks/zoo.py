@@ -1,0 +1,187 @@
+"""
+A zoo of real vehicles: does the product say what is so, and say nothing that is not.
+
+    python benchmarks/zoo.py --drives 100 [--only EFFECT] [--kind town] [--grade industrial]
+                             [--jobs 2] [--file F]
+
+Each drive is of a vehicle drawn by ``odocal_ros/sim/draw.py`` (docs/zoo.md), all effects at once
+or one alone (``--only clean``: none), configured as its operator would. Drive k of a run has seed
+70_000_000 + 1_000_000 e + k, fixed before the first run; e counts the effects, 0 for all. Kinds of
+drive and grades take turns, so that 15 drives hold each pair once. Rows go to the file line by
+line: an interrupted run goes on where it stopped.
+
+Printed by effect, kind and grade, for scale, yaw and pitch by the Imu's own axes (and by its
+housing, where the product states that): how many were given in drives that are not rejected, share
+within 1.96 sigma, RMS of error over sigma, median sigma, worst error over sigma. ``off``: not
+rejected though beyond 3.5 sigma; ``unnamed``: of these, without a reason that names a cause that
+is there (that the model does not fit names none); ``silent``: without any reason that something
+there explains; ``accepted``: with that verdict. ``false reasons``: drives with a reason that
+nothing in them explains.
+"""
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+import json
+import math
+import os
+from pathlib import Path
+import sys
+import time
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')     # two processes, two cores
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from resumed import read_rows
+from zoo_table import print_tables
+
+from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS
+
+CLEAN = 'clean'
+RUNS = ('all', *EFFECTS, CLEAN)
+FIRST_SEED, SEEDS_A_RUN = 70_000_000, 1_000_000
+BLOCK = 3       # drives a process does before it reports
+
+
+def seeds_of(run, drives, kind, grade):
+    """Return the first seeds of a run whose drives are of a kind and a grade, None: of any."""
+    first, found, k = FIRST_SEED + SEEDS_A_RUN * RUNS.index(run), [], 0
+    while len(found) < drives:
+        if kind in (None, kind_of(k)) and grade in (None, grade_of(k)):
+            found.append(first + k)
+        k += 1
+    return found
+
+
+def kind_of(k):
+    """Return the kind of a run's drive k."""
+    return KINDS[k % len(KINDS)]
+
+
+def grade_of(k):
+    """Return the grade of a run's drive k: five kinds, three grades, each pair once in 15."""
+    return GRADES[k % len(GRADES)]
+
+
+def configured(drive):
+    """Return the settings that the vehicle's operator has."""
+    from odocal_ros.config import Config, with_settings
+    from odocal_ros.sim.truth import settings
+    return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
+                                    for group, keys in settings(drive).items()
+                                    for key, v in keys.items()})
+
+
+def run_drive(seed, duration=None):
+    """Draw, drive, calibrate; return a row."""
+    from odocal_ros.pipeline import calibrate, combine
+    from odocal_ros.sim.scenarios import simulate
+    e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
+    run, kind, grade = RUNS[e], kind_of(k), grade_of(k)
+    effects = None if run == 'all' else () if run == CLEAN else (run,)
+    options, there = drawn(seed, kind, grade, effects,
+                           **{} if duration is None else {'duration': duration})
+    begin = time.process_time()
+    drive = simulate(options)
+    row = {'seed': seed, 'run': run, 'kind': kind, 'grade': grade, 'effects': list(there),
+           'drawn': compact(drive.options), 'asked': duration,
+           'simulated': time.process_time() - begin}
+    config, begin = configured(drive), time.process_time()
+    try:
+        calibration = combine([calibrate(drive.leg(), config)], config)
+    except Exception as error:      # a defect, to be counted and not to end the run
+        return row | {'verdict': 'failed', 'codes': [f'{type(error).__name__}: {error}']}
+    return row | {'seconds': time.process_time() - begin, **outcome(calibration, drive.truth)}
+
+
+def compact(options):
+    """Return what was drawn, to four digits: only what is not as in a plain drive."""
+    from odocal_ros.sim.options import resolved, SimOptions
+    plain = asdict(resolved(SimOptions(scenario=options.scenario, odometer=options.odometer)))
+    own = asdict(options)
+    plain, own = plain | plain.pop('real'), own | own.pop('real')
+    return {name: short(value) for name, value in own.items()
+            if value != plain[name] and name not in ('seed', 'scenario', 'imu_grade')}
+
+
+def short(value):
+    """Return numbers of four digits."""
+    if isinstance(value, tuple):
+        return [short(v) for v in value]
+    return float(f'{value:.4g}') if isinstance(value, float) else value
+
+
+def outcome(calibration, truth):
+    """Return verdict, codes and, for each figure, value, sigma and error (scale: relative)."""
+    row = {'verdict': calibration.verdict.value,
+           'codes': sorted({r.code.name for r in calibration.reasons})}
+    found = calibration.estimates
+    for name, key, true, unit in (('scale_factor', 'scale', truth.scale, truth.scale),
+                                  ('yaw_mounting_angle', 'yaw', truth.yaw, 1.0),
+                                  ('pitch_mounting_angle', 'pitch', truth.pitch, 1.0)):
+        estimate = found.get(name)
+        if estimate is None or estimate.value is None:
+            continue
+        row |= {key: estimate.value, f'{key}_sigma': estimate.sigma / unit,
+                f'{key}_error': (estimate.value - true) / unit, f'{key}_by': estimate.method}
+        if key != 'scale':
+            row |= against_housing(calibration, name, key, getattr(truth, f'{key}_housing'))
+    smoother = calibration.legs[0].methods.get('smoother')
+    details = smoother.details if smoother else {}
+    return row | {name: details[name] for name in ('iterations', 'settled', 'widened')
+                  if isinstance(details.get(name), int | float | bool)}
+
+
+def against_housing(calibration, name, key, true):
+    """Return the error against the housing's angle, and its sigma where the product states one."""
+    estimate = calibration.estimates[name]
+    details = calibration.methods[estimate.method].details
+    row = {f'{key}_housing_error': estimate.value - true}
+    if 'beside' in details:
+        row[f'{key}_housing_sigma'] = details['beside'][f'{name}_housing_sigma']['value']
+    return row
+
+
+def run_block(seeds, duration):
+    """Drive some drives (in a process of its own)."""
+    return [run_drive(seed, duration) for seed in seeds]
+
+
+def _run(seeds, args):
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row.get('asked') == args.duration}
+    missing = [seed for seed in seeds if seed not in have]
+    blocks = [missing[i:i + BLOCK] for i in range(0, len(missing), BLOCK)]
+    begin, done = time.monotonic(), 0
+    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
+        for rows in pool.map(run_block, blocks, [args.duration] * len(blocks)):
+            out.writelines(json.dumps(row) + '\n' for row in rows)
+            out.flush()
+            have |= {row['seed']: row for row in rows}
+            done += len(rows)
+            print(f'{done} of {len(missing)} drives in {time.monotonic() - begin:.0f} s',
+                  file=sys.stderr, flush=True)
+    return [have[seed] for seed in seeds]
+
+
+def main():
+    """Run what the file does not hold yet, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=30, help='of each run')
+    parser.add_argument('--only', choices=RUNS[1:], action='append', default=[],
+                        metavar='EFFECT', help=f'one effect alone; repeatable: {", ".join(RUNS)}')
+    parser.add_argument('--kind', choices=KINDS)
+    parser.add_argument('--grade', choices=GRADES)
+    parser.add_argument('--duration', type=float, help='s of a drive (600; straight 720)')
+    parser.add_argument('--jobs', type=int, default=2, help='processes')
+    parser.add_argument('--file', type=Path, default=Path('/tmp/zoo.jsonl'))
+    args = parser.parse_args()
+    if args.duration is not None and not math.isfinite(args.duration):
+        parser.error('--duration: want a finite number')
+    seeds = [seed for run in args.only or ['all']
+             for seed in seeds_of(run, args.drives, args.kind, args.grade)]
+    print_tables(_run(seeds, args))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,87 @@
+"""What the data of a leg tell of the constants of the vehicle: information, no prior in it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.angles import wrap
+
+Floats = NDArray[np.float64]
+LEAST = 1e-12      # of the largest eigenvalue: what is below is rounding
+# unit of a constant without a prior, ln K and angles: where a leg's equations stop being linear
+UNIT = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """
+    The data of a leg as a quadratic in the constants x, all else of the leg eliminated.
+
+    Their log likelihood is pull (x - value) - (x - value)' information (x - value) / 2, but for a
+    constant (docs/method.md, several legs). Constants go by their names; ln K, rad, m, s.
+
+    names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
+    a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
+    centre, sigma : (m,) what was believed beforehand, inf where nothing is.   used : (m,) the
+    sigmas with those beliefs widened that the leg gainsaid.
+    """
+
+    names: tuple[str, ...]
+    value: Floats
+    information: Floats
+    pull: Floats
+    centre: Floats
+    sigma: Floats
+    used: Floats
+
+    def widened(self, factor) -> 'Border':
+        """Return what data are worth whose sigmas are too small by a factor."""
+        return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
+
+    def loosened(self, sigmas: dict[str, float]) -> 'Border':
+        """
+        Return the border of a leg whose constants differ from the vehicle's by errors of its own.
+
+        sigmas : by name, of each constant's own error d, inf: the leg then says nothing of it.
+        The data see x + d; d is taken out: D - D A (1 + A' D A)^-1 A' D, A the sigmas as columns.
+        """
+        D, at = self.information, [self.names.index(name) for name in sigmas]
+        size = np.array(list(sigmas.values()))
+        known, own = np.isfinite(size), np.diag(D)[at]
+        # a column of any length will do for what is not bounded
+        size = np.where(known, size, np.where(own > 0, 1 / np.sqrt(np.maximum(own, 1e-300)), 0.0))
+        A = np.eye(len(D))[:, at] * size
+        DA = D @ A
+        taken = DA @ np.linalg.pinv(np.diag(known * 1.0) + A.T @ DA)
+        information = D - taken @ DA.T
+        return replace(self, information=(information + information.T) / 2,
+                       pull=self.pull - taken @ (A.T @ self.pull))
+
+    def turned(self, name, about: float) -> 'Border':
+        """Return the border with an angle, rad, given within half a turn of another."""
+        value, i = self.value.copy(), self.names.index(name)
+        value[i] = about + wrap(value[i] - about)
+        return replace(self, value=value)
+
+    def told(self, unit, least) -> 'Border':
+        """Return what is left of it in directions with so much information, in units of (m,)."""
+        size, V = self._directions(unit, least)
+        V, W = V / unit[:, None], V * unit[:, None]
+        return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
+
+    def rows(self, unit):
+        """
+        Return the data as rows of unit variance: (r, m), and what they should be: (r,).
+
+        unit : (m,) of the constants. Directions in which there is but rounding are no rows.
+        """
+        size, V = self._directions(unit, 0.0)
+        root = np.sqrt(size)
+        R = (V * root).T / unit
+        return R, R @ self.value + V.T @ (self.pull * unit) / root
+
+    def _directions(self, unit, least):
+        size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
+        keep = size > max(LEAST * size[-1], least, 1e-300)
+        return size[keep], V[:, keep]

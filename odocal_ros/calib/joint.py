@@ -1,0 +1,137 @@
+"""
+Several legs of a vehicle to one estimate of its constants: that of one fit of all their rows.
+
+Each leg comes as its border. Constants are those of the vehicle, the same in every leg, but that
+ln K walks at random from leg to leg; what is believed beforehand counts once. Equations:
+docs/method.md, several legs.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.linked_legs import LinkedLegs
+
+Floats = NDArray[np.float64]
+Z95 = 1.6449         # one-sided 95 % point of the normal law
+SURE = 2.7           # deviates, one in 300: some 15 constants are looked at
+MOST_SPREADS = 3     # constants that may differ between legs before all sigmas are widened
+WIDE = 1e3           # times what values of legs differ by: more than their sigma can be
+STEPS = 40           # of a bisection
+BENDS = 3            # passes in which legs are taken to where they were not linearised
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """
+    The constants by all legs.
+
+    names, value, covariance : (m,), (m, m), of the last leg where they walk.
+    sigma, used : (m,) believed beforehand, first and with what legs gainsaid.
+    chi2, freedom : disagreement of the legs before anything was widened, and what it should be.
+    spread : sigma by which legs differ, of each constant that does.   deviation : (J, m) of each
+    leg from the others, in sigmas, before that.   factor : on all sigmas, in ``covariance``.
+    bent : (J,) rad, error of taking the leg's equations to where the constants are.
+    """
+
+    names: tuple[str, ...]
+    value: Floats
+    covariance: Floats
+    sigma: Floats
+    used: Floats
+    chi2: float
+    freedom: int
+    deviation: Floats
+    spread: dict[str, float] = field(default_factory=dict)
+    factor: float = 1.0
+    bent: Floats = field(default_factory=lambda: np.zeros(0))
+
+
+def joint(borders, steps, drifting='scale_factor', angles=(), curved=()) -> Joint:
+    """
+    Combine legs of one vehicle.
+
+    Parameters
+    ----------
+    borders : sequence of Border
+        By time, at least one.
+    steps : (J - 1,) array
+        Sigma by which ``drifting`` may have changed from leg to leg.
+    drifting : str
+        The constant that walks.
+    angles : sequence of str
+        Constants that are the same after a whole turn.
+    curved : sequence of str
+        Those in which a leg's equations are not linear: 1 - cos of their change is an error of
+        that leg's own.
+
+    Returns
+    -------
+    Joint. Constants in which legs differ for certain are taken to scatter between them by as much
+    as it takes; where legs still differ by more than their sigmas allow, all sigmas are widened.
+
+    """
+    legs = LinkedLegs(list(borders), drifting, np.asarray(steps, float), angles)
+    bent = _bend(legs, [n for n in curved if n in legs.names])
+    chi2, freedom = legs.disagreement()
+    deviation, spread = legs.deviations(), _disputed(legs)
+    left, rest = legs.disagreement(spread)
+    factor = float(np.sqrt(left / rest)) if rest and deviate(left, rest) > Z95 else 1.0
+    x, C = legs.solve(spread)
+    where = legs.place(len(borders) - 1)
+    return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,
+                 chi2, freedom, deviation, spread, factor, bent)
+
+
+def deviate(chi2, freedom):
+    """Return the normal deviate of a chi-square (Wilson and Hilferty 1931)."""
+    a = 2 / (9 * freedom)
+    return ((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - a)) / np.sqrt(a)
+
+
+def _disputed(legs) -> dict[str, float]:
+    """Return the constants in which legs differ for certain, and by what sigma."""
+    spread: dict[str, float] = {}
+    while len(spread) < MOST_SPREADS:
+        now, freedom = legs.disagreement(spread)
+        found = []
+        for name in (n for n in legs.names if n not in spread):
+            left, rest = legs.disagreement(spread | {name: np.inf})
+            if rest < freedom:
+                found.append((deviate(now - left, freedom - rest), name, left + freedom - rest))
+        if not found or max(found)[0] < SURE:
+            break
+        _, name, target = max(found)
+        spread = spread | {name: _spread(legs, spread, name, target)}
+    return spread
+
+
+def _spread(legs, spread, name, target) -> float:
+    """
+    Return the sigma of a constant between legs at which they differ in it as much as they may.
+
+    target : the disagreement that is left where the constant is each leg's own, and one for each
+    leg but one (Paule and Mandel 1982).
+    """
+    i = legs.names.index(name)
+    high = WIDE * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
+    low = high * 1e-12
+    for _ in range(STEPS):
+        middle = float(np.sqrt(low * high))
+        chi2, _ = legs.disagreement(spread | {name: middle})
+        low, high = (middle, high) if chi2 > target else (low, middle)
+    return high
+
+
+def _bend(legs, curved):
+    """Give each leg an error of its own for the way from where it was linearised; (J,) of it."""
+    first, at = legs.borders, [legs.names.index(n) for n in curved]
+    bent = np.zeros(len(first))
+    for _ in range(BENDS if curved else 0):
+        x, _ = legs.solve()
+        way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
+        bent = (way**2).sum(axis=1) / 2
+        legs.borders = [b.loosened(dict.fromkeys(curved, size))
+                        for b, size in zip(first, bent, strict=True)]
+    return bent

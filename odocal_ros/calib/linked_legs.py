@@ -1,0 +1,121 @@
+"""The rows of several legs as one least squares: constants they share, one that walks, beliefs."""
+
+import numpy as np
+
+from odocal_ros.calib.border import Border, UNIT
+
+LEAST_STEP = 1e-7    # of ln K between legs: what no vehicle keeps, and no equations hold
+NO_NEWS = 1e-6       # share of a leg's information on a constant that others do not foresee
+TELLS = 1.0          # information by that believed: what a leg tells of a constant
+SAME = 1e-8          # singular value, of the largest, that is rounding
+
+
+class LinkedLegs:
+    """Borders on common names, the constants' prior, and the walk of one of them."""
+
+    def __init__(self, borders, drifting: str, steps, angles=()):
+        """Take legs by time; ``steps`` (J - 1,): sigmas of ``drifting`` between them."""
+        self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
+        self.borders = [_on(b, self.names) for b in borders]
+        last = self.borders[-1]
+        for name in angles:
+            about = last.value[self.names.index(name)]
+            self.borders = [b.turned(name, about) for b in self.borders]
+        self.centre = last.centre
+        self.sigma, self.used = (np.max([getattr(b, which) for b in self.borders], axis=0)
+                                 for which in ('sigma', 'used'))
+        self.unit = np.where(np.isfinite(self.used), self.used, UNIT)
+        self.drifting = self.names.index(drifting)
+        self.steps = np.maximum(steps, LEAST_STEP)
+
+    def columns(self, j):
+        """Return where the constants of leg j stand among the unknowns: z, then k by leg."""
+        m = len(self.names)
+        where = np.arange(m)
+        where[self.drifting] = m + j
+        return where
+
+    def system(self, spread=None, borders=None):
+        """Return the rows of all legs and of the walk, and what they should be."""
+        m, J = len(self.names), len(self.borders)
+        A, b = [], []
+        for j, border in enumerate(borders or self.borders):
+            R, y = (border.loosened(spread) if spread else border).rows(self.unit)
+            A.append(np.zeros((len(R), m + J)))
+            A[-1][:, self.columns(j)] = R
+            b.append(y)
+        walk = np.zeros((J - 1, m + J))
+        j = np.arange(J - 1)
+        walk[j, m + j], walk[j, m + j + 1] = -1 / self.steps, 1 / self.steps
+        used = [i for i in range(m + J) if i != self.drifting]
+        scale = np.concatenate([self.unit, np.full(J, self.unit[self.drifting])])[used]
+        return np.concatenate([*A, walk])[:, used] * scale, np.concatenate([*b, np.zeros(J - 1)])
+
+    def place(self, j):
+        """Return where the constants of leg j stand among the columns of ``system``."""
+        where = self.columns(j)
+        return where - (where > self.drifting)
+
+    def solve(self, spread=None):
+        """Return the unknowns and their covariance, of leg j at ``place``."""
+        A, b = self.system(spread)
+        held = np.flatnonzero(np.isfinite(self.used))
+        prior = np.zeros((len(held), A.shape[1]))
+        prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
+        Q, R = np.linalg.qr(np.concatenate([A, prior]))
+        inverse = np.linalg.inv(R)
+        x = inverse @ (Q.T @ np.concatenate([b, self.centre[held] / self.used[held]]))
+        scale = np.empty(A.shape[1])
+        for j in range(len(self.borders)):
+            scale[self.place(j)] = self.unit
+        return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
+
+    def disagreement(self, spread=None):
+        """
+        Return by how much the least cost rises when legs are one vehicle's, and freedom.
+
+        Of what legs tell at least as well as it was believed: farther off than that their
+        equations need not be true.
+        """
+        A, b = self.system(spread, [b.told(self.unit, TELLS) for b in self.borders])
+        U, size, _ = np.linalg.svd(A, full_matrices=False)
+        U = U[:, size > SAME * size[0]]
+        rest = b - U @ (U.T @ b)
+        return float(rest @ rest), A.shape[0] - U.shape[1]
+
+    def deviations(self, spread=None):
+        """
+        Return by how much each leg's constants differ from those by the others, in sigmas: (J, m).
+
+        The leg's pull at the joint estimate over its own sigma, each constant alone: the test of
+        one more unknown, as if the leg were left out (Baarda 1968).
+        """
+        x, C = self.solve(spread)
+        out = np.zeros((len(self.borders), len(self.names)))
+        for j, border in enumerate(self.borders):
+            border = border.told(self.unit, TELLS)
+            border = border.loosened(spread) if spread else border
+            D, where = border.information, self.place(j)
+            pull = border.pull - D @ (x[where] - border.value)
+            variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
+            news = variance > np.maximum(NO_NEWS * np.diag(D), 1e-300)
+            out[j, news] = pull[news] / np.sqrt(variance[news])
+        return out
+
+
+def _on(border: Border, names) -> Border:
+    """Return a border on more names, of which it says and believes nothing."""
+    if border.names == names:
+        return border
+    at = [names.index(n) for n in border.names]
+    m = len(names)
+    D = np.zeros((m, m))
+    D[np.ix_(at, at)] = border.information
+
+    def on(values, rest):
+        out = np.full(m, rest)
+        out[at] = values
+        return out
+    # a belief that a leg does not have is none that it has widened
+    return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
+                  on(border.sigma, 0.0), on(border.used, 0.0))

@@ -1,0 +1,41 @@
+"""A heading from outside: the yaw of the Imu's x axis, with an error that stays for a leg."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
+from odocal_ros.calib.smoother.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI
+from odocal_ros.nav.angles import arctan2, wrap
+
+LEAST_TURN = 5e-4     # rad: no receiver is better
+
+
+class HeadingRows(OutsideRows):
+    """Residuals of a heading (sent less predicted) and their derivatives at one state."""
+
+    name, source = 'heading', 'heading_noise'
+    levels_of = {'heading': slice(0, 1)}
+
+    def rows(self, problem, here):
+        """Return the rows."""
+        return _heading(problem.outside['heading'], here.state, here.points['heading'])
+
+    @staticmethod
+    def least(sent):
+        """Return the least level."""
+        return {'heading': (LEAST_TURN / float(np.median(sent.noise)))**2}
+
+
+def _heading(sent, state, points):
+    k = points.interval
+    C = state.C_nb[k]
+    x = (C @ points.R)[:, :, 0]
+    level2 = np.maximum(x[:, 0]**2 + x[:, 1]**2, 1e-6)
+    raw = wrap(sent.yaw - arctan2(x[:, 1], x[:, 0]) - state.constants[HEADING])
+    turns = np.stack([-x[:, 2] * x[:, 0] / level2, -x[:, 2] * x[:, 1] / level2,
+                      np.ones(len(k))], -1)
+    J, c = np.zeros((len(k), 1, BARE)), np.zeros((len(k), 1, M))
+    J[:, 0, PHI] = -turns
+    J[:, 0, BG] = np.einsum('ki,kij->kj', turns, C) * points.tau[:, None]
+    c[:, 0, GYRO_SCALE] = J[:, 0, BG.start + 2] * points.rate[:, 2]
+    c[:, 0, HEADING] = -1.0
+    return Rows(k, raw[:, None], J, c, 1 / sent.noise[:, None])

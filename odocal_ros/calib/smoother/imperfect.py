@@ -1,0 +1,140 @@
+"""
+What a good vehicle has not: none of it, or as much as is usual; the drive says which.
+
+An Imu with scale errors, axes that are not at right angles, a gyro that feels force; a receiver
+that smooths; tyres that grow; a body that leans. A leg is fitted with all of them, as large as
+the grade of the Imu and the road's experience have them. Most drives then tell which are there:
+of each kind two priors (none; as usual) are weighed by their evidence, and the constants' priors
+become those whose posterior has the mean square of both.
+
+Where fixes err slowly, metres come from the accelerometer, and its scale error is the odometer's.
+There no drive tells an error of a third of the grade from none: all are believed as usual.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR
+from odocal_ros.calib.smoother.state import IMPERFECT, KINDS
+
+BELIEF = 0.5         # that an imperfection is there
+NONE = 1e-3          # of the usual sigma: as good as no error
+ROUNDS, SAME = 20, 1e-3     # over the kinds; relative change of the sigmas that is none
+STAYS = 0.98         # of the usual variance
+FEW = 6              # passes to take out what is not there
+
+
+def believed(data, pull, belief=BELIEF):
+    """
+    Return how large errors of one kind are to be taken for.
+
+    Parameters
+    ----------
+    data : (k, k) array
+        What a drive tells of the errors: information, in units of the usual sigmas.
+    pull : (k, k) array
+        Outer square of the gradient at no error, of the same; ``data`` where there are none.
+    belief : float
+        How likely they are.
+
+    Returns
+    -------
+    (k,) array of prior variances, NONE^2 to 1, and the weight of the usual ones.
+
+    """
+    one = np.eye(len(data))
+    wide = np.linalg.inv(data + one)
+    log = 0.5 * (np.trace(wide @ pull) - np.linalg.slogdet(data + one)[1])
+    weight = 1 / (1 + (1 - belief) / belief * np.exp(-np.clip(log, -500.0, 500.0)))
+    mean_square = np.diag(wide @ pull @ wide)
+    square = weight * np.diag(wide) + weight * (1 - weight) * mean_square
+    rest = 1 / square - 1 / np.diag(np.linalg.inv(data))     # less what the data tell of each
+    taken = np.where(rest > 1.0, 1 / np.maximum(rest, 1e-300), 1.0)
+    return np.clip(taken, NONE**2, 1.0), float(weight)
+
+
+def weigh_kinds(data, gradient, kinds):
+    """
+    Return prior variances of all errors, each kind weighed with the others as last believed.
+
+    data : (k, k) information in units of the usual sigmas.   gradient : (k,) at no error, or None
+    for errors that are not there.   kinds : slices.
+    """
+    prior = np.ones(len(data))
+    for _ in range(ROUNDS):
+        before = prior.copy()
+        for kind in kinds:
+            own = np.arange(len(data))[kind]
+            rest = np.setdiff1d(np.arange(len(data)), own)
+            gain = np.linalg.solve(data[np.ix_(rest, rest)] + np.diag(1 / prior[rest]),
+                                   data[np.ix_(rest, own)]).T
+            D = data[np.ix_(own, own)] - gain @ data[np.ix_(rest, own)]
+            if gradient is None:
+                pull = D
+            else:
+                g = gradient[own] - gain @ gradient[rest]
+                pull = np.outer(g, g)
+            prior[own], _ = believed(D, pull)
+        if np.abs(np.log(prior / before)).max() < SAME:
+            break
+    return prior
+
+
+def judged_priors(now: Fit, grade, found=True):
+    """
+    Return a fit's priors with what is to be believed of imperfections.
+
+    grade : Grade, that the Imu is taken for.   found : False: as where there are none, whatever
+    the fit's values.
+    """
+    usual = imperfect_sigmas(grade, now.state.t[-1] - now.state.t[0])
+    there = np.flatnonzero(usual > 0)
+    sigma, last = usual[there], now.priors.constants[IMPERFECT][there]
+    if now.levels.correlation_time or not len(there):
+        return now.priors
+    pick = IMPERFECT.start + there
+    both = np.linalg.inv(now.solved.covariance[np.ix_(pick, pick)]
+                         / np.multiply.outer(sigma, sigma))
+    data = both - np.diag((sigma / last)**2)
+    data = (data + data.T) / 2 + 1e-3 * np.eye(len(sigma))
+    kinds = [np.isin(there, np.arange(len(usual))[kind]) for kind in KINDS]
+    prior = weigh_kinds(data, both @ (now.state.constants[pick] / sigma) if found else None,
+                        [kind for kind in kinds if kind.any()])
+    # what is there may be more than usual: then the prior has given way, and stays so
+    taken = np.where(prior > STAYS, np.maximum(last, sigma), np.sqrt(prior) * sigma)
+    if np.abs(np.log(taken / last)).max() < SAME:
+        return now.priors
+    sigmas = np.full(len(usual), NO_ERROR)
+    sigmas[there] = taken
+    return with_imperfect(now.priors, sigmas)
+
+
+def judge_running(now: Fit, grade) -> Fit:
+    """Return a fit with what it tells of imperfections believed: where the next sets out."""
+    priors = judged_priors(now, grade)
+    if priors is now.priors:
+        return now
+    return replace(now, priors=priors,
+                   first=with_imperfect(now.first, priors.constants[IMPERFECT]))
+
+
+def with_imperfect(priors, sigmas):
+    """Return priors with these sigmas of what is imperfect, (k,)."""
+    constants = priors.constants.copy()
+    constants[IMPERFECT] = sigmas
+    return replace(priors, constants=constants)
+
+
+def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
+    """
+    Return a fit whose sigmas hold the imperfections that there may be, and no more.
+
+    now : made with the usual ones.   trace : as for ``fit``.
+    """
+    about = judge_running(now, problem.grade)
+    if about is now:
+        return now
+    last = fit(problem, now.state, now.levels, FEW, about=about, frozen=True, trace=trace)
+    return replace(last, iterations=now.iterations + last.iterations)

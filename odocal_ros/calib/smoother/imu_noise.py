@@ -1,0 +1,55 @@
+"""White noise and walks of an Imu: as its grade, its standstills and its samples have them."""
+
+import numpy as np
+
+LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
+# noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
+# (or a simulator's) is silent at rest
+LEAST_SENSOR = {'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7}
+
+
+def sensor_noise(grade) -> dict[str, float]:
+    """Return the roots of the Imu's noise levels by its grade, SI: white ones and walks."""
+    stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
+              'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
+    return {name: max(sigma, LEAST_SENSOR[name]) for name, sigma in stated.items()}
+
+
+def at_rest(imu, leg, still) -> dict:
+    """Return white noise levels of gyro and accelerometer as standstills show them."""
+    turn = np.add.reduceat(imu.turn, imu.key[:-1])
+    dt = np.diff(imu.t)[:, None]
+    force = np.add.reduceat((imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt, imu.key[:-1])
+    T = np.diff(imu.t[imu.key])[:, None]
+    inside = still[:-1] & still[1:]
+    rest = np.flatnonzero(inside)
+    runs = np.split(rest, np.flatnonzero(np.diff(rest) > 1) + 1)
+    sums, freedom = np.zeros(2), 0
+    for run in runs:
+        if len(run) < 3:
+            continue
+        # the second difference knows no bias, no drift; its variance is six times that of one
+        for i, x in enumerate((turn, force)):
+            d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
+            sums[i] += (d**2).sum() / 3
+        freedom += len(run) - 2
+    if freedom < LEAST_REST:
+        return {}
+    return {name: max(float(total / freedom), LEAST_SENSOR[name]**2)
+            for name, total in zip(('gyro', 'accel'), sums, strict=True)}
+
+
+def shaken(imu) -> dict:
+    """
+    Return white noise levels of gyro and accelerometer as neighbouring samples show them.
+
+    What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
+    down from.
+    """
+    dt = np.diff(imu.t)
+    rate = imu.turn / dt[:, None]
+    out = {}
+    for name, x in (('gyro', rate), ('accel', imu.f_b)):
+        jump = np.median((np.diff(x, axis=0)**2).sum(axis=1)) / 2.366     # of chi2 with 3
+        out[name] = float(jump / 2 * np.median(dt))
+    return out

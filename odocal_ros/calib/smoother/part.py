@@ -1,0 +1,118 @@
+"""
+A part of the equations: what one sensor, or one belief, says of the unknowns.
+
+Each part is a file: residuals and derivatives at one state, first and least noise levels, and what
+its rows give to normal equations, cost, variance components and the budget of errors. It is made
+unweighted; ``weighed`` returns a copy of it at given levels, whose ``after`` takes a step in.
+"""
+
+from copy import copy
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from odocal_ros.calib.smoother.preintegrate import Intervals, Points
+from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
+
+TOLD = 3        # constants that the budget is of: ln K, yaw, pitch
+
+
+@dataclass(frozen=True, eq=False)
+class Here:
+    """
+    Where the equations are linearised: a state, and sums over samples brought to it.
+
+    points : sums to the times of the rows, by the name of their part.   gyro_change (K, 3) rad/s,
+    odo_later, fix_later s : by what gyro bias and delays exceed those that the sums were made
+    with.   spread : (K, 3) factors on the odometer's variances along, to the side and up (slips).
+    fitted : as for ``Motion``.
+    """
+
+    state: State
+    intervals: Intervals
+    points: dict[str, Points]
+    gyro_change: np.ndarray | float
+    odo_later: float
+    fix_later: float
+    priors: Priors
+    spread: np.ndarray | None
+    fitted: bool = False
+
+
+class Part:
+    """
+    One part, here one that says nothing; those of today are listed in ``equations``.
+
+    A sensor's own class has ``__init__(problem, here)`` and what differs from this; one with rows
+    of its own also raw, its residuals, and ``jacobians(n)``, their derivatives by the keyframes
+    and by the constants. ``near`` is what ``Solved.neighbours`` returns: (K, 2n + M, 2n + M).
+    """
+
+    name: ClassVar[str]
+    log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
+
+    @classmethod
+    def there(cls, problem) -> bool:
+        """Tell whether a leg has such rows."""
+        return True
+
+    @classmethod
+    def first_levels(cls, problem) -> tuple[dict, dict]:
+        """Return the variances to start from, by the names of its levels, and the least."""
+        return {}, {}
+
+    def in_use(self, levels) -> bool:
+        """Tell whether the rows are there with these levels."""
+        return True
+
+    def weighed(self, levels) -> 'Part':
+        """Return the part with its rows weighed."""
+        new = copy(self)
+        new.levels = levels
+        new.n = WITH_SLOW if levels.correlation_time else BARE
+        new.weigh(levels)
+        return new
+
+    def weigh(self, levels):
+        """Set what depends on the levels."""
+
+    def add(self, out):
+        """Add the rows to normal equations."""
+
+    def after(self, step, constants, reached):
+        """Bring the residuals to where a step (N, n), (M,) leads, were all linear."""
+        self.state = reached
+
+    def cost(self) -> float:
+        """Return the weighted sum of squares of the residuals."""
+        return 0.0
+
+    def components(self, near) -> dict[str, tuple[float, float]]:
+        """Return of each level its quadratic sum and what is expected of it."""
+        return {}
+
+    def effects(self, near):
+        """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
+        return ()
+
+    def to_told(self, near):
+        """Return the covariance of scale, yaw and pitch with the unknowns: (K, 3, 2n + M)."""
+        return near[:, 2 * self.n:2 * self.n + TOLD, :]
+
+
+def hold(out, k, columns, variance, residual, weight=1.0):
+    """Add rows that are an unknown each: those of columns at keyframes k."""
+    i = np.arange(out.g.shape[1])[columns]
+    out.diagonal[k, i, i] += weight / variance
+    out.g[k, i] -= weight * residual / variance
+
+
+def link(out, columns, decay, weight, residual):
+    """Add rows of all intervals, (K, c): an unknown at the end less its decayed one before."""
+    i = np.arange(out.g.shape[1])[columns]
+    out.diagonal[:-1, i, i] += decay**2 * weight
+    out.diagonal[1:, i, i] += weight
+    out.beside[:, i, i] -= decay * weight
+    out.g[:-1, i] += decay * weight * residual
+    out.g[1:, i] -= weight * residual

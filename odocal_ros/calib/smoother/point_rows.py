@@ -1,0 +1,174 @@
+"""
+Rows at times between keyframes, for sensors that say something of an instant.
+
+Each hangs on the keyframe before it, on the constants, and, where slow fix errors are estimated,
+on those of the keyframe after it. What lies far out loses weight as a heavy tail has it.
+"""
+
+from typing import ClassVar
+
+import numpy as np
+
+from odocal_ros.calib.smoother.part import Part, TOLD
+from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
+
+FAR = 3.0              # sigmas beyond which a row loses weight as a heavy tail has it
+FEWEST_ROWS = 5        # of which one may be an outlier
+FEWEST_BINS = 12       # to judge by, over how long errors are alike
+CUT = 3.0              # robust sigmas at which a residual is cut for that
+
+
+class PointRows(Part):
+    """
+    Rows of d components each.
+
+    A sensor's own class sets k (m,), the keyframes before; raw (m, d), residuals; thin, of how
+    many neighbours the errors are one: each row counts by so much less; share (m,), of the slow
+    fix error of the keyframe after, that is in a row of three components: None in what knows no
+    such. It has ``jacobians`` and ``stated``. Weighed are r (m, d), J (m, d, n + M), and J_end
+    (m, 3, 3) by that slow error, or None.
+    """
+
+    levels_of: ClassVar[dict[str, slice]]     # columns that a level, factor on variances, is of
+    source: ClassVar[str]                     # name in the budget
+    thin = 1.0
+    share: np.ndarray | None = None
+
+    @classmethod
+    def times(cls, problem, constants):
+        """Return when what was sent was true, s: (m,); sums to these times are in ``here``."""
+        raise NotImplementedError
+
+    def jacobians(self, n):
+        """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
+        raise NotImplementedError
+
+    def stated(self, rows):
+        """Return rows (m, d, c) in the sigmas that the sensor states."""
+        raise NotImplementedError
+
+    def known(self):
+        """Tell which components are there at all: (m, d) bool or one for all."""
+        return True
+
+    def weigh(self, levels):
+        """Set r, J and J_end, weighed for heavy tails as well."""
+        white = self.stated(self.raw[:, :, None])[:, :, 0]
+        factor = np.ones(white.shape[1])
+        for level, columns in self.levels_of.items():
+            factor[columns] /= np.sqrt(levels[level])
+        white = white * factor
+        self.weight = self._weights(white)
+        each = np.sqrt(self.weight / self.thin)
+        self.r = each * white
+        root = (each * factor)[:, :, None]
+        self.J = np.concatenate([self.stated(x) for x in self.jacobians(self.n)], axis=2) * root
+        self.J_end = None
+        if self.n == WITH_SLOW and self.share is not None:
+            one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
+            self.J_end = -self.stated(one) * root * self.share[:, None, None]
+        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.thin
+
+    def _sizes(self, white):
+        for columns in self.levels_of.values():
+            yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
+
+    def _weights(self, white):
+        """Return weights of whitened residuals, (m, d), those of one level together."""
+        w = np.ones_like(white)
+        if len(white) >= FEWEST_ROWS:
+            for columns, size in self._sizes(white):
+                w[:, columns] = np.minimum(1.0, FAR / np.maximum(size, 1e-12))[:, None]**2
+        return w
+
+    def cost(self):
+        """Return the losses that the weights belong to: squares, logarithms beyond FAR."""
+        total = 0.0
+        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.thin)):
+            far = np.maximum(size / FAR, 1.0)
+            total += float((np.minimum(size, FAR)**2 + 2 * FAR**2 * np.log(far)).sum())
+        return total / self.thin
+
+    def after(self, step, constants, reached):
+        """Bring the residuals to where the step leads."""
+        own = np.concatenate([step[self.k], np.broadcast_to(constants, (len(self.k), M))], axis=1)
+        self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
+        if self.J_end is not None:
+            self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
+
+    def add(self, out):
+        """Add the rows to normal equations."""
+        n, present = self.n, np.unique(self.k)
+        J, r = self.by_interval(self.J), self.by_interval(self.r[:, :, None])
+        H = np.swapaxes(J, 1, 2) @ J
+        g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
+        out.diagonal[present] += H[:, :n, :n]
+        out.border[present] += H[:, :n, n:]
+        out.corner += H[:, n:, n:].sum(axis=0)
+        out.g[present] += g[:, :n]
+        out.g_border += g[:, n:].sum(axis=0)
+        if self.J_end is None:
+            return
+        B = self.by_interval(self.J_end)
+        X = np.swapaxes(J, 1, 2) @ B
+        out.beside[present, :, SLOW] += X[:, :n]
+        out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
+        out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
+        out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
+
+    def by_interval(self, rows):
+        """Return rows (m, d, c) by interval, padded: (present, d most, c)."""
+        present, first, count = np.unique(self.k, return_index=True, return_counts=True)
+        place = np.arange(len(self.k)) - np.repeat(first, count)
+        out = np.zeros((len(present), int(count.max(initial=1)), *rows.shape[1:]))
+        out[np.repeat(np.arange(len(present)), count), place] = rows
+        return out.reshape(len(present), -1, rows.shape[2])
+
+    def _columns(self):
+        """Return the columns of J and of J_end among those of neighbours."""
+        n = self.n
+        return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
+
+    def components(self, near):
+        """Return for each level its quadratic sum and what is expected of it."""
+        if len(self.k) < FEWEST_ROWS:
+            return {}
+        (own, end), J = self._columns(), self.by_interval(self.J)
+        block = near[np.unique(self.k)]
+        taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
+        if self.J_end is not None:
+            B = self.by_interval(self.J_end)
+            taken = taken + 2 * ((J @ block[:, own[:, None], end]) * B).sum(axis=2)
+            taken = taken + ((B @ block[:, end[:, None], end]) * B).sum(axis=2)
+        d = self.r.shape[1]
+        taken = taken.reshape(len(block), -1, d)
+        known = np.broadcast_to(self.known(), self.r.shape)
+        r2 = np.where(known, self.r, 0.0)**2 * self.thin
+        return {level: (float(r2[:, columns].sum()),
+                        float(known[:, columns].sum() - taken[:, :, columns].sum()))
+                for level, columns in self.levels_of.items()}
+
+    def effects(self, near):
+        """Yield what a unit error of each row does."""
+        own, end = self._columns()
+        block = near[np.unique(self.k), 2 * self.n:2 * self.n + TOLD]
+        X = block[:, :, own] @ np.swapaxes(self.by_interval(self.J), 1, 2)
+        if self.J_end is not None:
+            X = X + block[:, :, end] @ np.swapaxes(self.by_interval(self.J_end), 1, 2)
+        yield self.source, X
+
+
+def alike(rows: PointRows) -> float:
+    """Return how many neighbouring errors are as good as one, by the spread of their means."""
+    r = rows.r / np.sqrt(rows.weight)
+    r = (r - np.median(r, axis=0))[:, :2]       # the level ones tell scale and yaw
+    scale = np.median(np.abs(r), axis=0) / 0.6745
+    r = np.clip(r, -CUT * scale, CUT * scale)
+    r = r - r.mean(axis=0)
+    power = (r**2).mean()
+    most, length = 1.0, 2
+    while len(r) >= FEWEST_BINS * length and power > 0:
+        bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
+        most = max(most, float(length * (bins.mean(axis=1)**2).mean() / power))
+        length *= 2
+    return most

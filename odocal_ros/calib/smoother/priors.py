@@ -1,0 +1,85 @@
+"""Priors as a part: what is believed of the biases, the constants, and where a leg begins."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.part import hold, Part, TOLD
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    BA,
+    BG,
+    BY_FORCE,
+    BY_SPEED,
+    FIX_LAG2,
+    GNSS_ARM,
+    GNSS_DELAY,
+    GYRO,
+    HEADING,
+    M,
+    ODO_ARM,
+    ODO_DELAY,
+    P,
+    PHI,
+    SIDESLIP,
+    SQUAT,
+    V,
+)
+
+ANYWHERE, ANY_SPEED, ANY_WAY = 1e4, 100.0, np.array([1.0, 1.0, 10.0])    # m, m/s, rad
+# believed of the vehicle, so the same in every leg
+SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
+          'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
+          'fix_latency': slice(GNSS_DELAY, GNSS_DELAY + 1),
+          'gyro_scale': slice(GYRO.start, GYRO.start + 3),
+          'gyro_by_force': slice(GYRO.start + 3, GYRO.stop),
+          'accelerometer_scale': slice(ACCEL.start, ACCEL.start + 3),
+          'accelerometer_axes': slice(ACCEL.start + 3, ACCEL.stop),
+          'receiver_smoothing': slice(FIX_LAG2, FIX_LAG2 + 1),
+          'tyre_changes': slice(BY_SPEED, BY_FORCE + 1),
+          'body_lean': slice(SQUAT, SIDESLIP + 1),
+          'heading': slice(HEADING, HEADING + 1)}
+
+
+class PriorRows(Part):
+    """Rows of the unknowns themselves: what is believed of each, beside no row of a sensor."""
+
+    name = 'priors'
+
+    def __init__(self, problem, here):
+        self.state, self.priors = here.state, here.priors
+        self.shared = {name: where for name, where in SHARED.items()
+                       if name != 'heading' or 'heading' in problem.outside}
+
+    def _biases(self):
+        """Yield columns, value and sigma of the biases at the first keyframe."""
+        state, priors = self.state, self.priors
+        yield BG, state.gyro_bias[0], priors.gyro_bias
+        yield BA, state.accel_bias[0], priors.accel_bias
+
+    def _constants_off(self):
+        return self.state.constants - self.priors.centre
+
+    def add(self, out):
+        """Add the rows to normal equations; the start is held but loosely, where it is."""
+        for columns, sigma in ((P, ANYWHERE), (V, ANY_SPEED), (PHI, ANY_WAY)):
+            hold(out, 0, columns, sigma**2, 0.0)
+        for columns, value, sigma in self._biases():
+            hold(out, 0, columns, sigma**2, value)
+        w = 1 / self.priors.constants**2
+        out.corner[range(M), range(M)] += w
+        out.g_border -= w * self._constants_off()
+
+    def cost(self):
+        """Return the sum of squares, in sigmas."""
+        total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
+        return total + (self._constants_off()**2 / self.priors.constants**2).sum()
+
+    def effects(self, near):
+        """Yield what the turn-on biases do."""
+        first = self.to_told(near)[0]
+        yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
+        yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
+
+    def shared_effects(self, covariance):
+        """Yield what errors do that are the same in every leg: names, (3, k)."""
+        for name, where in self.shared.items():
+            yield name, covariance[:TOLD, where] / self.priors.constants[where]

@@ -1,0 +1,134 @@
+"""What a fit shows of the vehicle beside its values: what varies, what is off, what that costs."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.problem import imperfect_sigmas
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    BA,
+    BY_SPEED,
+    BY_TIME,
+    CONSTANTS,
+    FIX_LAG2,
+    GNSS_ARM,
+    GYRO,
+    IMPERFECT,
+    LN_K,
+    ODO_ARM,
+    PITCH,
+    YAW,
+)
+from odocal_ros.grades import G, grade_of
+from odocal_ros.reasons import Code, Reason
+
+SURE = 3.0             # sigmas at which something is there
+AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4
+SCALES_OFF = 4.0       # of the grade's sigma: another Imu
+AXES_OFF = 3.0
+LEAST_LAG = 0.1        # s that are worth a word
+LEAST_CHANGE = 3e-4    # of the scale within the leg, the same
+LEAST_ARM = 0.3        # m, the same; that of the wheel up is where a body tilts about
+NEXT_DRIVE = 1e-3      # by how much the scale of one vehicle differs from drive to drive
+# what the model does not hold (docs/conventions.md): relative, rad
+FLOOR = np.array([3e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+
+
+def beside(value, covariance, grade) -> dict:
+    """
+    Return what stands beside the estimates: figures by their names in calibration.json.
+
+    value, covariance : (M,), (M, M) of the constants.   grade : Grade that the Imu is taken for.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    # scale_by_speed: the slope at FAST
+    out: dict = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
+                 for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
+                                       ('scale_by_time', BY_TIME, '1/s'))}
+    for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
+        out[f'{name}_mounting_angle_housing_sigma'] = _figure(
+            _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
+    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], NEXT_DRIVE), '1')
+    return out
+
+
+def _figure(value, unit):
+    return {'value': float(value), 'sigma': None, 'unit': unit}
+
+
+def _of_housing(found, found_sigma, sigma, misalignment):
+    """
+    Return the sigma of an angle against the housing's axes, where that of the Imu's own is given.
+
+    The angle between both is one of two errors of axes, of one size, whose sum is ``found``: half
+    of it, with what is left of either.
+    """
+    if not misalignment:
+        return sigma
+    told = min(1.0, found_sigma**2 / (2 * misalignment**2))
+    return np.sqrt(sigma**2 + misalignment**2 * (1 + told) / 2 + (found / 2)**2)
+
+
+def level_pitch(fit, near, widen) -> dict:
+    """Return the pitch against what the accelerometer calls level: method_real's third pitch."""
+    k = len(near) // 2
+    n = fit.solved.step.shape[1]
+    at = np.array([2 * n + PITCH, BA.start])
+    C = near[k][np.ix_(at, at)]
+    row = np.array([1.0, -1 / G])
+    return {'value': float(row @ [fit.state.constants[PITCH], fit.state.accel_bias[k, 0]]),
+            'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
+
+
+def remarks(problem, fit, sigma, config) -> list[Reason]:
+    """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
+    c, leg = fit.state.constants, problem.leg
+    said = []
+    if c[FIX_LAG2] > max(SURE * sigma[FIX_LAG2], LEAST_LAG**2):
+        said.append(Reason(Code.FIXES_SMOOTHED, 'the receiver smooths its fixes over about '
+                           f'{np.sqrt(c[FIX_LAG2]):.2f} s; the values allow for it'))
+    said += _varies(fit, sigma)
+    usual = imperfect_sigmas(grade_of(config.imu), leg.t_stop - leg.t_begin)
+    off = np.zeros(len(c))
+    off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
+    off *= np.abs(c) > SURE * sigma
+    if off[[AXIS_XY, AXIS_ZX]].max() > AXES_OFF:
+        worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
+        said.append(Reason(Code.IMU_AXES_SKEW, 'the axes of the accelerometer are off a right '
+                           f'angle by {np.rad2deg(abs(c[worst])):.2f} deg, {off[worst]:.0f} times '
+                           f'the {config.imu.grade} grade; the values allow for it'))
+    scales = [*range(GYRO.start, GYRO.start + 3), *range(ACCEL.start, ACCEL.start + 3)]
+    worst = max(scales, key=lambda i: off[i])
+    if off[worst] > SCALES_OFF:
+        said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
+                           f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
+                           f'the {config.imu.grade} grade; the values allow for it'))
+    return said + _arms(c, sigma, leg)
+
+
+def _varies(fit, sigma):
+    """Say where the scale is not one number through the leg."""
+    motion, c = fit.weighted['motion'].motion, fit.state.constants
+    said = []
+    for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from slow to fast'),
+                          (BY_TIME, motion.from_mean[:, 1], 'from begin to end')):
+        change = c[i] * np.ptp(span)
+        if abs(c[i]) > SURE * sigma[i] and abs(change) > LEAST_CHANGE:
+            said.append(f'{100 * change:+.2f} % {what}')
+    if not said:
+        return []
+    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the value is '
+                   'its mean over the way of this leg')]
+
+
+def _arms(c, sigma, leg):
+    """Say which lever arms lie far from where they are set."""
+    said = []
+    for name, where, axes in (('odometer.lever_arm', ODO_ARM, 'xy'),
+                              ('gnss.lever_arm', GNSS_ARM, 'xyz')):
+        for i, axis in zip(range(where.start, where.stop), axes, strict=False):
+            if abs(c[i]) > max(SURE * sigma[i], LEAST_ARM):
+                said.append(f'{name} {axis} by {c[i]:+.2f} m +- {sigma[i]:.2f}')
+    if not said:
+        return []
+    return [Reason(Code.LEVER_ARM_OFF, f'the drive puts {", ".join(said)} off its setting; the '
+                   'values allow for it')]

@@ -1,0 +1,38 @@
+"""Standstills as a part: no velocity at their keyframes, no turn within their intervals."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.motion import rotvec
+from odocal_ros.calib.smoother.part import hold, link, Part
+from odocal_ros.calib.smoother.state import PHI, V
+from odocal_ros.nav.rotations import transpose
+
+STILL_SPEED = 0.005                           # m/s at each keyframe of a standstill
+STILL_TURN = np.array([1e-4, 1e-4, 2e-5])     # rad/sqrt(s) about east, north, up
+
+
+class Rests(Part):
+    """Rows of the velocity of keyframes at rest, of the turn of intervals at rest."""
+
+    name = 'rests'
+
+    def __init__(self, problem, here):
+        self.state, self.still = here.state, problem.still
+        self.pair = self.still[:-1] & self.still[1:]
+        self.turn_variance = STILL_TURN**2 * here.intervals.T[:, None]
+
+    def turned(self):
+        """Return the turn within each interval, rad: (K, 3)."""
+        C = self.state.C_nb
+        return rotvec(C[1:] @ transpose(C[:-1]))
+
+    def add(self, out):
+        """Add the rows to normal equations."""
+        weight = self.still[:, None] / STILL_SPEED**2
+        hold(out, slice(None), V, 1.0, self.state.v_n, weight)
+        link(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
+
+    def cost(self):
+        """Return the sum of squares, in sigmas."""
+        total = (self.state.v_n[self.still]**2).sum() / STILL_SPEED**2
+        return total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()

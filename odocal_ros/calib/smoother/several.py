@@ -1,0 +1,106 @@
+"""Several legs of the smoother to one result, on the border of their equations."""
+
+import numpy as np
+
+from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.combine import newest
+from odocal_ros.calib.joint import Joint, joint
+from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
+from odocal_ros.calib.smoother.priors import SHARED
+from odocal_ros.calib.smoother.remarks import beside, FLOOR
+from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
+from odocal_ros.grades import grade_of
+from odocal_ros.reasons import Code, Reason
+
+P = 3                # parameters: ln K, yaw, pitch, the first of CONSTANTS
+DAY = 86400e9        # ns
+FAR_OFF = 5.0        # sigmas at which a delay or a lever arm that differs is worth saying
+ROUNDING = 1e-9      # of a correlation: there is none
+
+
+def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
+    """
+    Combine what the smoother says of several legs of one vehicle.
+
+    Parameters
+    ----------
+    results : sequence of MethodResult
+        Those with a border, at least one.
+    times_ns : sequence of int
+        When each leg was driven.
+    config : Config
+        Limits, ``verdict.scale_drift_per_day``.
+    numbers : sequence of int, optional
+        What the legs are called; 1, 2, ....
+
+    Returns
+    -------
+    MethodResult: what one fit of all legs would say, the scale as the last leg has it. A value
+    that no leg tells may come of all; one that the legs dispute has their scatter in its sigma
+    (LEGS_DISAGREE).
+
+    """
+    order = np.argsort(times_ns, kind='stable')
+    legs = [results[i] for i in order]
+    names = [(numbers or range(1, len(results) + 1))[i] for i in order]
+    days = np.diff(np.asarray(times_ns)[order]) / DAY
+    found = joint([leg.border for leg in legs], config.verdict.scale_drift_per_day * np.sqrt(days),
+                  CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
+    at = [found.names.index(name) for name in CONSTANTS]
+    C = floored(found.covariance[np.ix_(at, at)])
+    sigma = np.sqrt(np.diag(C))
+    ratio = sigma / found.factor / found.sigma[at]
+    scale = legs[-1].estimates['scale_factor']
+    nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
+                    (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
+    estimates, why = told(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
+    unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
+    if unsaid:
+        why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
+                          f'{in_words(unsaid)}; what the settings say of it is kept'))
+    sources = _sources(found.used[at] * found.factor, C)
+    return MethodResult('smoother', (*_disputed(found, names), *why), estimates, PARAMETERS,
+                        sources, _details(found, found.value[at], C, sources, len(legs))
+                        | {'beside': beside(found.value[at], C, grade_of(config.imu))})
+
+
+def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
+    """Say in which constants legs differ, and which leg differs most from the others."""
+    J, said = len(found.deviation), []
+    for name in found.spread:
+        z = found.deviation[:, found.names.index(name)]
+        k = int(np.argmax(np.abs(z)))
+        if name not in PARAMETERS and abs(z[k]) < FAR_OFF:
+            continue
+        # of two each differs from the other alike
+        who = f', leg {numbers[k]} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        said.append(f'{name} differs between the {J} legs {np.sqrt((z**2).mean()):.1f} times more '
+                    f'than their sigmas allow{who}')
+    if found.factor > 1:
+        said.append(f'the {J} legs differ {found.factor:.1f} times more than their sigmas allow, '
+                    'in more than their constants')
+    return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
+
+
+def _sources(used, C) -> tuple[Source, ...]:
+    """Return the budget: what is believed of the vehicle, and what is the legs' own."""
+    alike = np.abs(C[:P] / np.sqrt(np.outer(np.diag(C)[:P], np.diag(C)))).max(axis=0)
+    shared = [Source(name, C[:P, i] / used[i], True) for name, i in SHARED.items()
+              if alike[i].max() > ROUNDING]
+    apart = np.diag(FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    size, V = np.linalg.eigh(C[:P, :P] - apart)
+    return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
+            Source('model', np.diag(FLOOR)))
+
+
+def _details(found: Joint, value, C, sources, legs):
+    sigma = np.sqrt(np.diag(C))
+    return {
+        'legs_used': legs, 'widened': found.factor,
+        'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
+        'correlation': correlations(C[:P, :P], PARAMETERS),
+        'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
+                         'between_legs': found.spread, 'curvature': found.bent.tolist()},
+        **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}

@@ -1,0 +1,68 @@
+"""The odometer's rounding as a part: how far a reading at a keyframe may be off."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.part import hold, Part
+from odocal_ros.calib.smoother.state import E
+
+LEAST = 1e-3      # m
+
+
+class TravelError(Part):
+    """Rows of the travel error at each keyframe, of one level: scale units."""
+
+    name = 'travel'
+
+    def __init__(self, problem, here):
+        self.state, self.still = here.state, problem.still
+        self.least = problem.least['travel']
+        self.weight = once_a_rest(problem.still)
+
+    @classmethod
+    def first_levels(cls, problem):
+        """Return the level of rounding to a count, which is the least too."""
+        leg = problem.leg
+        level = {'travel': max(leg.travel.quantum**2 / 12, (LEAST / leg.rough_scale)**2)}
+        return level, level
+
+    def weigh(self, levels):
+        """Set the variance, scale units squared."""
+        self.variance = max(self.least, levels['travel'])
+        self.log_R = self.weight.sum() * np.log(self.variance)
+
+    def add(self, out):
+        """Add the rows to normal equations."""
+        hold(out, slice(None), slice(E, E + 1), self.variance, self.state.travel_error[:, None],
+             self.weight[:, None])
+
+    def cost(self):
+        """Return the weighted sum of squares."""
+        return (self.weight * self.state.travel_error**2).sum() / self.variance
+
+    def components(self, near):
+        """Return of the level its quadratic sum and what is expected of it, in motion."""
+        e, moving = self.variance, ~self.still
+        spread = np.concatenate([near[:, E, E], near[-1:, self.n + E, self.n + E]])
+        x = self.state.travel_error[moving]
+        return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
+
+    def effects(self, near):
+        """Yield what a unit error of each reading does."""
+        told = self.to_told(near)
+        root = np.sqrt(self.weight / self.variance)
+        travel = np.concatenate([told[:, :, E], told[-1:, :, self.n + E]]) * root[:, None]
+        yield 'quantisation', travel[:, :, None]
+
+
+def once_a_rest(still):
+    """
+    Return the weight of what is believed of the rounding at each keyframe, (N,).
+
+    A counter that stands errs by the same all the time: its keyframes together count as one.
+    """
+    starts = np.flatnonzero(np.diff(still, prepend=False) & still)
+    stops = np.flatnonzero(np.diff(still, append=False) & still) + 1
+    weight = np.ones(len(still))
+    for first, last in zip(starts, stops, strict=True):
+        weight[first:last] = 1 / (last - first)
+    return weight

@@ -1,0 +1,94 @@
+"""
+The body on its springs: it squats and rolls by what accelerates it, and takes sensors along.
+
+Roll and pitch answer as a second-order system does, each about the rear axle's centre. Rear
+tyres that push to the side drift there: the axle's centre moves at an angle to its wheels.
+"""
+
+import numpy as np
+
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.sim.motion import inertial_v, Motion
+from odocal_ros.sim.profile import hermite, Profile
+
+FREQUENCY = 2 * np.pi * 1.3   # rad/s
+DAMPING = 0.3
+STEP = 0.02                   # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
+
+
+def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float):
+    """Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles."""
+    t = np.round(np.arange(0.0, speed.end + STEP, STEP), 9)
+    forward, side = speed.derivative().mean(t), speed(t) * yaw_rate(t)
+    # nose up is a negative pitch; in a turn to the left the left side goes up
+    return tuple(hermite(t, *sprung(gain * push, STEP))
+                 for gain, push in ((body_roll, side), (-squat, forward)))
+
+
+def sprung(push, step: float):
+    """
+    Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u`` for u in straight lines.
+
+    push : (n,) u at equal steps; it has stood at the first before.
+    """
+    w, z = FREQUENCY, DAMPING
+    wd = w * np.sqrt(1 - z**2)
+    decay, s, c = np.exp(-z * w * step), np.sin(wd * step), np.cos(wd * step)
+    a, b = decay * (c + z * w / wd * s), decay * s / wd
+    d = decay * (c - z * w / wd * s)
+    slope = np.diff(push) / step
+    begin = push[:-1] - 2 * z / w * slope     # where a ramp would have it run along
+    y, dy = np.empty(len(push)), np.empty(len(push))
+    now, rate = float(push[0]), 0.0
+    y[0], dy[0] = now, rate
+    for k, (base, rise) in enumerate(zip(begin.tolist(), slope.tolist(), strict=True)):
+        off, off_rate = now - base, rate - rise
+        now = base + rise * step + a * off + b * off_rate
+        rate = rise - b * w * w * off + d * off_rate
+        y[k + 1], dy[k + 1] = now, rate
+    return y, dy
+
+
+def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t):
+    """Return the velocity to the left at times t, m/s: against the push of the tyres."""
+    v = speed(t)
+    return -sideslip * v * yaw_rate(t) * np.abs(v)
+
+
+def rotation(motion: Motion, t):
+    """Return what takes the body's axes to the vehicle's at (n,) times: (n, 3, 3)."""
+    roll, pitch = (profile(t) for profile in motion.tilt)
+    return matrix_from_rpy(np.stack([roll, pitch, np.zeros_like(roll)], -1))
+
+
+def felt(motion: Motion, state, lever_arm):
+    """
+    Return turn rate (rad/s) and specific force (m/s^2) in the body's axes: (n, 3) each.
+
+    lever_arm : of the Imu in base_link with the body level, m.
+    """
+    w_v, f_v = inertial_v(state, lever_arm)
+    if not motion.tilt:
+        return w_v, f_v
+    t, arm = state.t, np.asarray(lever_arm, dtype=float)
+    R = rotation(motion, t)
+    roll, dr, ddr, dp, ddp = _angles(motion, t)
+    s, c = np.sin(roll), np.cos(roll)
+    w_r = np.stack([dr, dp * c, -dp * s], -1)
+    dw_r = np.stack([ddr, ddp * c - dp * dr * s, -ddp * s - dp * dr * c], -1)
+    arm_v = R @ arm
+    w_rv = np.einsum('nij,nj->ni', R, w_r)
+    moved, turning = arm_v - arm, np.cross(w_rv, arm_v)
+    dw_v = np.gradient(w_v, t, axis=0) if len(t) > 1 else np.zeros_like(w_v)
+    f_v = (f_v + np.cross(dw_v, moved) + np.cross(w_v, np.cross(w_v, moved))
+           + 2 * np.cross(w_v, turning) + np.cross(np.einsum('nij,nj->ni', R, dw_r), arm_v)
+           + np.cross(w_rv, turning))
+    return np.einsum('nij,ni->nj', R, w_v) + w_r, np.einsum('nij,ni->nj', R, f_v)
+
+
+def _angles(motion, t):
+    """Return roll, its rate and acceleration, the pitch's rate and acceleration."""
+    roll, pitch = motion.tilt
+    rates = [p.derivative() for p in motion.tilt]
+    return (roll(t), rates[0](t), rates[0].derivative().mean(t), rates[1](t),
+            rates[1].derivative().mean(t))

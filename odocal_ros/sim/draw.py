@@ -1,0 +1,126 @@
+"""
+Draw a vehicle as real ones are: what it is, then what its sensors do; docs/zoo.md has the sources.
+
+Each effect draws from a stream of its own name: alone or among all others, it is the same.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.sim import draw_imu, draw_road
+from odocal_ros.sim.noise import stream
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.real import Real
+
+KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
+GRADES = ('consumer', 'industrial', 'tactical')
+EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS
+ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
+MOUNTING = {'consumer': (3.0, 3.0, 3.0), 'industrial': (1.5, 1.5, 2.0),
+            'tactical': (0.5, 0.5, 0.5)}               # deg: roll, pitch, yaw, 1 sigma
+NOMINAL = {'consumer': 0.015, 'industrial': 0.025, 'tactical': 0.005}   # relative, 1 sigma
+ODOMETERS = {'consumer': (0.6, 0.3, 0.1), 'industrial': (0.1, 0.2, 0.7),
+             'tactical': (1.0, 0.0, 0.0)}              # share of fine counters, coarse, speeds
+RTK = {'consumer': 0.1, 'industrial': 0.4, 'tactical': 0.9}
+TURNED = 0.2         # share whose Imu is mounted with a quarter or half turn, which is known
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What an effect goes by."""
+
+    grade: str       # consumer, industrial or tactical
+    kind: str        # of drive
+    rtk: bool
+    city: bool       # multipath, outages, worse covariances
+    robot: bool      # small, slow, without springs
+    options: dict    # SimOptions drawn so far
+    alone: bool      # the effect alone is asked for: let it be there
+
+
+def drawn(seed: int, kind: str, grade: str, effects=None, **given):
+    """
+    Return SimOptions of a drawn vehicle, and the names of the effects that it has.
+
+    Parameters
+    ----------
+    seed : int
+        Of the vehicle, and of the noise of its drive.
+    kind, grade : str
+        Scenario, and class of the Imu: consumer, industrial or tactical.
+    effects : sequence of str, optional
+        Those to be drawn; None: all, ``()``: the clean vehicle.
+    given : dict
+        SimOptions that are not drawn but as given; ``real`` a dict of its figures.
+
+    Raises
+    ------
+    BadUsage
+        A name is unknown.
+
+    """
+    if grade not in GRADES:
+        raise BadUsage(f'--vehicle real with --imu-grade {grade}: want one of '
+                       f'{", ".join(GRADES)}')
+    names = list(EFFECTS) if effects is None else list(effects)
+    for name in names:
+        if name not in EFFECTS:
+            raise BadUsage(f'--effect {name}: want one of {", ".join(EFFECTS)}')
+    if set(ODOMETER_EFFECTS) <= set(effects or ()):
+        raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer')
+    own = given.pop('real', {})
+    vehicle, options = _clean(seed, kind, grade, alone=effects is not None)
+    if 'scale' in given:
+        ratio = options['nominal_scale'] / options['scale']
+        given = {'nominal_scale': given['scale'] * ratio} | given
+    options |= given
+    if effects is None:
+        names = [n for n in names if n not in ODOMETER_EFFECTS or n == _odometer_of(vehicle, seed)]
+    real: dict = {}
+    there = []
+    for name in names:
+        changes, figures = EFFECTS[name](stream(seed, f'vehicle {name}'), vehicle)
+        if changes or figures:      # a draw may come out as none
+            there.append(name)
+        options |= changes
+        real |= figures
+    return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
+
+
+def _odometer_of(vehicle, seed):
+    """Return the effect that a drawn vehicle's odometer has, '' for a fine counter."""
+    shares = ODOMETERS[vehicle.grade]
+    return ('', 'coarse_pulses', 'coarse_speed')[
+        int(stream(seed, 'vehicle odometer').choice(3, p=shares))]
+
+
+def _clean(seed, kind, grade, alone):
+    """Return the vehicle and its options before any effect."""
+    rng = stream(seed, 'vehicle')
+    roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in MOUNTING[grade])
+    heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)
+    quarter = int(rng.integers(1, 4)) if rng.uniform() < TURNED else 0
+    rtk, city = bool(rng.uniform() < RTK[grade]), bool(rng.uniform() < 0.45)
+    robot = kind == 'yard' and grade == 'consumer'
+    size = 0.5 if robot else 1.0
+    antenna = size * rng.normal((0.8, 0.0, 1.3), (0.8, 0.3, 0.2))
+    imu = size * rng.normal((0.8, 0.0, 0.4), (0.6, 0.3, 0.2))
+    scale = 1 / (500.0 if robot else 1000.0)     # fine counts, but for a coarser odometer
+    options = {
+        'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
+        'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,
+        'mounting_rpy': (0.0, 0.0, quarter * math.pi / 2),
+        'antenna_lever_arm': _vector(antenna), 'imu_lever_arm': _vector(imu),
+        'odometer_lever_arm': (0.0, 0.0, -0.1 if robot else -0.3),
+        'odometer_rate': 50.0, 'fix_rate': float(rng.choice([1.0, 5.0, 10.0])),
+        'fix_noise': 'rtk' if rtk else 'white', 'fix_sigma': 0.02 if rtk else 1.5,
+        'nominal_scale': scale, 'scale': scale * (1 + NOMINAL[grade] * rng.standard_normal())}
+    options = {k: float(v) if isinstance(v, np.floating) else v for k, v in options.items()}
+    return Vehicle(grade, kind, rtk, city and kind != 'motorway', robot, options, alone), options
+
+
+def _vector(values):
+    return tuple(float(x) for x in values)

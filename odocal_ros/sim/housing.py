@@ -1,0 +1,37 @@
+"""
+Two frames of one Imu: its housing, and the frame that its own axes make.
+
+Gyro and accelerometer triads are not square with the housing, so yaw and pitch mean nothing
+before it is said of what. In the turn-and-push frame a turn about z is felt by the z gyro alone,
+and a push along x not by the y accelerometer. These are the angles that driving can tell.
+"""
+
+import numpy as np
+
+
+def angles(d_b):
+    """Return yaw and pitch mounting angle of the forward axis in b, rad."""
+    d = np.asarray(d_b, dtype=float)
+    return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
+
+
+def turn_and_push(gyro_matrix, accel_matrix):
+    """
+    Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
+
+    ``I + M`` is what the triads make of a vector. To first order it is ``I + [theta x]`` with
+    theta = (M_g,yz, -M_g,xz, -M_a,yx).
+    """
+    gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
+    z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
+    z /= np.linalg.norm(z)
+    x = np.cross(accel[1], z)      # felt by no y accelerometer, square with z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], -1)
+
+
+def own_angles(C_vb, C_bi, gyro_matrix, accel_matrix):
+    """Return yaw and pitch by the Imu's own axes, then by its housing, rad; matrices in i."""
+    d = np.asarray(C_vb)[0]
+    R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
+    return *angles(R.T @ d), *angles(d)

@@ -1,0 +1,142 @@
+"""What a real vehicle's sensors do beyond noise and bias: each figure with the value of none."""
+
+from dataclasses import dataclass, fields
+import difflib
+import math
+
+import numpy as np
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.grades import GRADES
+
+Vector = tuple[float, float, float]
+Matrix = tuple[float, ...]      # nine, row by row
+NONE3: Vector = (0.0, 0.0, 0.0)
+NONE9: Matrix = (0.0,) * 9
+WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
+SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
+          'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
+          'odometer_arm_error', 'antenna_arm_error', 'sideslip', 'squat', 'body_roll')
+POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
+            'imu_batch')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Real:
+    """
+    The vehicle's own figures, SI and radians; the Imu's in its own frame i (the housing).
+
+    The Imu reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
+    """
+
+    gyro_matrix: Matrix = NONE9      # M_g: scale on the diagonal, misalignment beside it
+    accel_matrix: Matrix = NONE9     # M_a
+    g_sensitivity: Matrix = NONE9    # G, rad/s per m/s^2
+    gyro_bias: Vector | None = None  # rad/s at the first sample; None: drawn by the grade
+    accel_bias: Vector | None = None   # m/s^2
+    gyro_slope: Vector = NONE3       # rad/s per K
+    accel_slope: Vector = NONE3      # m/s^2 per K
+    warm_rise: float = 0.0           # K that it still warms from the first sample on
+    warm_time: float = 300.0         # s
+    gyro_wander: float = 0.0         # rad/s, in-run instability, first order Markov
+    accel_wander: float = 0.0        # m/s^2
+    wander_time: float = 3600.0      # s
+    vibration: float = 0.0           # m/s^2 rms of each axis, reached at speed
+    gyro_vibration: float = 0.0      # rad/s rms
+    rectification: float = 0.0       # m/s^2 of bias per (m/s^2)^2 of vibration
+    imu_latency: float = 0.0         # s by which its stamps are late, in the mean
+    imu_jitter: float = 0.0          # s, 1 sigma
+    imu_batch: int = 1               # samples that arrive, and are stamped, together
+
+    speed_step: float = 0.0          # step of the speed sent, in its unit; 0: fine
+    speed_rounding: str = 'floor'    # floor or round
+    dead_band: float = 0.0           # speeds below are sent as 0
+    odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
+    speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
+    warming: float = 0.0             # relative growth of the tyres, warm against cold
+    warming_time: float = 600.0      # s of driving
+    tyre_slip: float = 0.0           # slip by tyre force over load: 1 / stiffness
+    driven: bool = True              # the wheel that is counted drives (else it only brakes)
+
+    sideslip: float = 0.0            # rad per m/s^2 to the side, rear axle drifts outwards
+    squat: float = 0.0               # rad per m/s^2, nose up
+    body_roll: float = 0.0           # rad per m/s^2, outwards
+
+    imu_arm_error: Vector = NONE3        # m, configured less true
+    odometer_arm_error: Vector = NONE3
+    antenna_arm_error: Vector = NONE3
+
+    receiver_lag: float = 0.0        # s, time constant of a first-order filter on positions
+    slow_errors: tuple = ()          # (sigma m of east and north, up twice; correlation s) each
+    bursts: float = 0.0              # multipath bursts per hour
+    burst_size: float = 12.0         # m, median
+    burst_time: float = 8.0          # s, median
+    drops: float = 0.0               # share of the fixes that never come
+    fix_jitter: float = 0.0          # s, 1 sigma, on top of fix_delay
+    stated_factor: float = 1.0       # stated sigma over true sigma
+    told_grade: str | None = None    # imu.grade as set; None: the right one
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = _checked(field.name, getattr(self, field.name), field.default)
+            object.__setattr__(self, field.name, value)
+
+    def matrix(self, name: str):
+        """Return a matrix by its name: (3, 3)."""
+        return np.reshape(getattr(self, name), (3, 3))
+
+
+def _checked(name, value, default):
+    """Return a figure as numbers and tuples of them, or say what is wrong with it."""
+    if name in WORDS:
+        if value not in WORDS[name] and value != default:
+            raise BadUsage(f'--real {name}={value}: want one of {", ".join(WORDS[name])}')
+        return value
+    if value is None and default is None:
+        return None
+    if isinstance(value, list | tuple):
+        value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+    numbers = _numbers(name, value, default)
+    if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
+        raise BadUsage(f'--real {name}: want finite numbers')
+    least = min(numbers, default=1.0)
+    if (name not in SIGNED and least < 0 or name in POSITIVE and least <= 0
+            or name == 'drops' and least >= 1 or name == 'imu_batch' and least != int(least)):
+        raise BadUsage(f'--real {name}={value}: out of range')
+    return value
+
+
+def _numbers(name, value, default):
+    """Return the numbers of a figure whose form is right."""
+    if name == 'slow_errors':
+        if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
+                                                 and v[1] for v in value)):
+            raise BadUsage('--real slow_errors: want pairs of sigma and correlation time, such '
+                           'as ((1.2,60),(0.9,900))')
+        return [x for pair in value for x in pair]
+    count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
+    if isinstance(value, tuple) != bool(count) or count and len(value) != count:
+        raise BadUsage(f'--real {name}: want {f"{count} numbers" if count else "one number"}')
+    return value if count else (value,)
+
+
+def parsed(text: str) -> tuple:
+    """
+    Return name and value of ``NAME=VALUE``.
+
+    Raises
+    ------
+    BadUsage
+        No such figure, or its value is no number, tuple or word.
+
+    """
+    import ast
+    name, _, value = text.partition('=')
+    names = [f.name for f in fields(Real)]
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 3) or names
+        raise BadUsage(f'--real {name}: no such figure; near: {", ".join(near)}')
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value

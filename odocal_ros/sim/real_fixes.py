@@ -1,0 +1,59 @@
+"""What a real receiver adds: a lag, slow errors, multipath, sigmas that are not those told."""
+
+import numpy as np
+
+from odocal_ros.sim import body
+from odocal_ros.sim.motion import point
+from odocal_ros.sim.noise import gauss_markov, stream
+
+NODES, WEIGHTS = np.polynomial.laguerre.laggauss(8)
+UP = 2.0             # errors of the height over those of east and north
+SPREAD = 0.9         # of the logarithm of a burst's size and length
+ONSET = (1.0, 3.0)   # s in which a burst comes and goes
+
+
+def places(motion, t, options):
+    """Return latitude, longitude (rad), height (m) that a receiver without noise tells at t."""
+    lag = options.real.receiver_lag
+    if not lag:
+        return _antenna(motion, t, options)
+    # the mean of the past with weights exp(-age / lag) / lag, by Gauss and Laguerre: exact for
+    # ways that are polynomials up to degree 15; before the first sample the vehicle stood
+    return tuple(sum(w * x for w, x in zip(WEIGHTS, row, strict=True)) for row in zip(
+        *(_antenna(motion, np.maximum(t - lag * node, 0.0), options) for node in NODES),
+        strict=True))
+
+
+def _antenna(motion, t, options):
+    tilt = body.rotation(motion, t) if motion.tilt else None
+    return point(motion.at(t), options.antenna_lever_arm, tilt)
+
+
+def errors(t, options):
+    """Return slow errors and bursts at (n,) times, ENU, m: (n, 3), or 0.0."""
+    real, total = options.real, 0.0
+    for k, (sigma, tau) in enumerate(real.slow_errors):
+        slow = gauss_markov(stream(options.seed, f'real slow {k}'), sigma, tau, t)
+        total = total + slow * [1.0, 1.0, UP]
+    return total + burst_errors(t, options) if real.bursts else total
+
+
+def burst_errors(t, options):
+    """Return errors by multipath: bursts to any side, of smooth onset: (n, 3)."""
+    real, rng = options.real, stream(options.seed, 'real bursts')
+    total, hours = np.zeros((len(t), 3)), t[-1] / 3600
+    for _ in range(rng.poisson(real.bursts * hours)):
+        begin, side = rng.uniform(0.0, t[-1]), rng.uniform(0, 2 * np.pi)
+        size, length = (median * np.exp(SPREAD * rng.standard_normal())
+                        for median in (real.burst_size, real.burst_time))
+        onset, up = rng.uniform(*ONSET), rng.normal()
+        x = np.clip(np.minimum(t - begin, begin + length + onset - t) / onset, 0.0, 1.0)
+        shape = size * x**2 * (3 - 2 * x)
+        total += shape[:, None] * [np.cos(side), np.sin(side), up]
+    return total
+
+
+def true_variance(white, options):
+    """Return the variance of the errors but for bursts, ENU: (3,) m^2. white: of the noise."""
+    slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
+    return white + slow * np.array([1.0, 1.0, UP**2])

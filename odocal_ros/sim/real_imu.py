@@ -1,0 +1,82 @@
+"""What a real Imu adds: crooked triads, g-sensitivity, warmth, vibration, late stamps."""
+
+import numpy as np
+
+from odocal_ros.sim.noise import gauss_markov, stream
+
+RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))   # Hz, width, share: wheel hop, engine
+SHAKEN_AT = 5.0      # m/s at which half of the vibration is there
+WANDER_STEP = 1.0    # s between draws of the in-run instability
+APART_NS = 50_000    # between the stamps of one batch
+
+
+def crooked(w_i, f_i, real):
+    """Return what the triads make of turn rate and specific force: (n, 3) each."""
+    gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
+    w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
+    if G.any():
+        w_m = w_m + f_i @ G.T
+    return w_m, f_i + f_i @ accel.T if accel.any() else f_i
+
+
+def drifts(t, speed, options):
+    """Return what warmth, wander and vibration add to gyro and accelerometer: (n, 3) or 0.0."""
+    real = options.real
+    warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
+    added = []
+    for name, shake in (('gyro', real.gyro_vibration), ('accel', real.vibration)):
+        slope, wander = getattr(real, f'{name}_slope'), getattr(real, f'{name}_wander')
+        total = warmth * np.array(slope) if real.warm_rise and any(slope) else 0.0
+        if wander:
+            total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
+                                    real.wander_time, t)
+        if shake:
+            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + SHAKEN_AT)
+            total = total + level * vibration(stream(options.seed, f'real {name} vibration'),
+                                              shake, options.imu_rate, len(t))
+            if name == 'accel' and real.rectification:
+                total = total + real.rectification * (shake * level)**2
+        added.append(total)
+    return added
+
+
+def _wander(rng, sigma, tau, t):
+    """Return a walk about 0 from the bias at the first sample on, straight between draws."""
+    knots = np.arange(0.0, t[-1] + 2 * WANDER_STEP, WANDER_STEP)
+    x = gauss_markov(rng, sigma, tau, knots)
+    return np.stack([np.interp(t, knots, column) for column in (x - x[0]).T], -1)
+
+
+def vibration(rng, rms: float, rate: float, n: int):
+    """
+    Return shaking of a body that goes nowhere, (n, 3): around its resonances, nothing at 0 Hz.
+
+    Its power falls as f^4 below them, as that of the acceleration of a bounded way does.
+    """
+    f = np.fft.rfftfreq(n, 1 / rate)
+    power = np.zeros_like(f)
+    for middle, width, share in RESONANCES:
+        at = min(middle, 0.4 * rate)
+        power += share * np.minimum(f / at, 1.0)**4 / (1 + ((f - at) / width)**2)
+    shape = np.sqrt(power)[:, None]
+    x = np.fft.irfft(np.fft.rfft(rng.standard_normal((n, 3)), axis=0) * shape, n, axis=0)
+    # both halves of the spectrum: the mean square of the shape is that of the samples
+    weight = np.full(len(f), 2.0)
+    weight[0] = 1.0
+    weight[-1] = 1.0 if n % 2 == 0 else 2.0
+    return rms * x / np.sqrt((weight * power).sum() / n)
+
+
+def stamped(ns, rng, latency: float, jitter: float, batch: int = 1):
+    """
+    Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
+
+    The mean of the jitter is none, but no stamp goes before its sample.
+    """
+    late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
+    stamp = ns + np.rint(late * 1e9).astype(np.int64)
+    apart = APART_NS * np.arange(len(ns))
+    if batch > 1:
+        last = np.minimum(np.arange(len(ns)) // batch * batch + batch - 1, len(ns) - 1)
+        stamp = stamp[last]
+    return np.maximum.accumulate(stamp - apart) + apart

@@ -1,0 +1,54 @@
+"""What real wheels and their senders add: tyres that grow, slip under force, coarse speeds."""
+
+import numpy as np
+
+AT_SPEED = 36.0      # m/s at which the speed law is stated
+REST = 0.01          # rolling resistance over load
+AIR = 1e-5           # air drag over load, per (m/s)^2
+G = 9.81
+
+
+def growth(state, real):
+    """Return by how much the rolling radius exceeds that of a cold, slow tyre: (n,), or 0.0."""
+    grown = 0.0
+    if real.speed_law:
+        grown = grown + real.speed_law * (state.speed / AT_SPEED)**2
+    if real.warming:
+        steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
+        grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
+    return grown
+
+
+def tyre_slip(state, real):
+    """Return the metres spun beyond the ground because the tyres pull or brake: (n,)."""
+    forward = np.where(state.speed < 0, -1.0, 1.0)
+    force = forward * state.acceleration / G + REST + AIR * state.speed**2     # over load
+    # half of the load is on the driven axle; all wheels brake
+    pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
+    slip = real.tyre_slip * (pull + np.minimum(force, 0.0))
+    way = np.diff(state.travel, prepend=state.travel[:1])
+    return np.cumsum(slip * way)
+
+
+def leg_factor(state, real) -> float:
+    """
+    Return true metres rolled over those of a wheel that neither grew nor slipped.
+
+    state : between the marks of the leg. The mean is by travel, to and fro alike.
+    """
+    if not (real.speed_law or real.warming or real.tyre_slip):
+        return 1.0
+    way = np.diff(state.travel)
+    spun = np.diff(tyre_slip(state, real)) if real.tyre_slip else 0.0
+    grown = growth(state, real) + np.zeros_like(state.t)
+    counted = (way + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
+    return float(np.abs(way).sum() / np.abs(counted).sum())
+
+
+def coarse(speed, real):
+    """Return speeds as a bus sends them: in steps, 0 below the dead band."""
+    if real.speed_step:
+        steps = np.abs(speed) / real.speed_step
+        steps = np.floor(steps) if real.speed_rounding == 'floor' else np.floor(steps + 0.5)
+        speed = np.sign(speed) * steps * real.speed_step
+    return np.where(np.abs(speed) < real.dead_band, 0.0, speed) if real.dead_band else speed

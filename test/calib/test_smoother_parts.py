@@ -1,0 +1,119 @@
+"""Parts of the smoother's equations: derivatives, and that all they say of a step agrees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from smoother_legs import leg_of, made, truth, with_velocity
+
+from odocal_ros.calib.smoother.chain import Normal
+from odocal_ros.calib.smoother.equations import Equations, PARTS
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    BA,
+    BG,
+    E,
+    GNSS_DELAY,
+    GYRO,
+    IMPERFECT,
+    M,
+    P,
+    PHI,
+    SLOW,
+    WITH_SLOW,
+)
+from odocal_ros.config import with_settings
+
+N = WITH_SLOW
+# relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
+# and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order
+LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3}
+# biases act within a second as under constant force and no turn, of which a vehicle makes 0.3 rad
+BIASES = dict.fromkeys(range(BG.start, BG.stop), 0.3) | dict.fromkeys(
+    (*range(BA.start, BA.stop), *range(N + ACCEL.start, N + ACCEL.stop)), 0.1)
+# an arm's swing: at the mean turn rate of the second, and with no delay in it
+SWING = {'fixes': 1e-2, 'velocity': 0.3}
+
+
+@pytest.fixture(scope='module')
+def shaken():
+    """Return the problem of a leg with all sensors, and a state where no term vanishes."""
+    drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
+                            antenna_lever_arm=(0.5, -0.3, 1.2))
+    config = with_settings(config, {'gnss.use_velocity': True})
+    leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0,
+                  imu_arm=np.array([1.2, 0.3, 0.4]))
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    rng = np.random.default_rng(1)
+    step = 1e-3 * rng.standard_normal((len(state.t), N))
+    step[:, PHI.start:BG.stop] *= 0.1
+    c = 1e-3 * rng.standard_normal(M)
+    # of the size that there is: derivatives leave out how these change what the others do
+    c[IMPERFECT] *= [1, 1, *[0.1] * 6, 1, 1, 1, 1, 1, 0.0, 0.1, 0.003, 0.0, 0.0, 0.0]
+    return problem, state.moved(step, c)
+
+
+def part_at(problem, state, name, sums=None):
+    return Equations(problem, state, sums or problem.sums(state)).parts[name]
+
+
+@pytest.mark.parametrize('name', LOOSE)
+def test_derivatives_are_those_of_finite_differences(shaken, name):
+    problem, state = shaken
+    # sums are held where they are shifted to a state, and made again where they are not
+    held = problem.sums(state) if name == 'motion' else None
+    part = part_at(problem, state, name, held)
+    *ends, constants = part.jacobians(N)
+    begin, end = ends if len(ends) == 2 else (*ends, np.zeros_like(ends[0]))
+    if name == 'fixes':
+        end[:, :, SLOW] = -np.eye(3) * part.share[:, None, None]
+    k = np.arange(len(part.raw)) if name == 'motion' else part.k
+    # every second keyframe moves: each row sees one end move only
+    even = np.arange(len(state.t)) % 2 == 0
+    for i in range(N + M):
+        # within a second: they do not see it
+        if GYRO.start <= i - N < GYRO.stop and name != 'motion':
+            continue
+        h = 1.0 if (i, name) == (E, 'motion') else 1e-5 if name == 'motion' else 1e-4
+
+        def raw(size, i=i):
+            step, c = np.zeros((len(state.t), N)), np.zeros(M)
+            if i < N:
+                step[even, i] = size
+            else:
+                c[i - N] = size
+            return part_at(problem, state.moved(step, c), name, held).raw
+
+        expected = constants[:, :, i - N] if i >= N else np.where(
+            even[k][:, None], begin[:, :, i], end[:, :, i])
+        loose = LOOSE[name] if name == 'motion' else BIASES.get(i, LOOSE[name])
+        loose = SWING.get(name, loose) if i == N + GNSS_DELAY else loose
+        np.testing.assert_allclose((raw(h) - raw(-h)) / (2 * h), expected, err_msg=str(i),
+                                   atol=loose * max(1.0, np.abs(expected).max()))
+    assert begin[:, :, P].any() == (name in ('motion', 'fixes'))
+
+
+@pytest.mark.parametrize('name', [part.name for part in PARTS])
+def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, name):
+    problem, state = shaken
+    # so wide that nothing lies far out: squares only
+    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'velocity_up', 'heading'), 1e8)
+    levels = problem.first_levels.but(correlation_time=40.0, **wide)
+    part = part_at(problem, state, name).weighed(levels)
+    normal = Normal.zeros(len(state.t), N, M)
+    part.add(normal)
+    rng = np.random.default_rng(2)
+    x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(M)
+    x[0, P.start:PHI.stop] = 0.0      # the start is held, that the chain can be solved: no belief
+    # H x by blocks of the chain
+    Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.border @ c
+    Hx[:-1] += np.einsum('kij,kj->ki', normal.beside, x[1:])
+    Hx[1:] += np.einsum('kji,kj->ki', normal.beside, x[:-1])
+    Hc = normal.corner @ c + np.einsum('kij,ki->j', normal.border, x)
+    change = (x * Hx).sum() + c @ Hc - 2 * ((normal.g * x).sum() + normal.g_border @ c)
+    before = part.cost()
+    part.after(x, c, state.moved(x, c))
+    # standstills take their turns anew: of second order in 1e-3 rad
+    assert part.cost() - before == pytest.approx(change, rel=1e-2 if name == 'rests' else 1e-6)
+    assert change != 0.0

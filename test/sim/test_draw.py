@@ -1,0 +1,86 @@
+"""Drawn vehicles: each effect alone is the one in the whole, and every draw can be driven."""
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import simulate
+from odocal_ros.sim.truth import settings
+
+
+def test_a_clean_vehicle_has_nothing_real_and_an_operator_who_knows_it():
+    options, there = drawn(7, 'town', 'industrial', ())
+    assert options.real == Real()
+    assert there == ()
+    told = settings(simulate(drawn(7, 'town', 'industrial', (), duration=200.0)[0]))
+    assert told['imu']['grade'] == 'industrial'
+    for group, name in (('imu', 'imu'), ('gnss', 'antenna'), ('odometer', 'odometer')):
+        assert told[group]['lever_arm'] == list(getattr(options, f'{name}_lever_arm'))
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
+    seeds = range(100, 140)
+    alone = [drawn(seed, 'town', 'industrial', (name,)) for seed in seeds]
+    clean = [drawn(seed, 'town', 'industrial', ())[0] for seed in seeds]
+    assert sum(one != bare for (one, _), bare in zip(alone, clean, strict=True)) >= 10
+    if name in (*ODOMETER_EFFECTS, 'fix_stamps', 'multipath', 'outages'):
+        return                    # alone they are made sure of
+    for seed, (one, there) in zip(seeds, alone, strict=True):
+        whole, names = drawn(seed, 'town', 'industrial')
+        assert not there or name in names
+        real, plain = asdict(one.real), asdict(Real())
+        changed = {k: v for k, v in real.items() if v != plain[k]}
+        assert changed.items() <= asdict(whole.real).items()
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('grade', GRADES)
+def test_a_drawn_vehicle_can_be_driven(kind, grade):
+    duration = 320.0 if kind == 'out_and_back' else 260.0
+    options, there = drawn(11, kind, grade, duration=duration, imu_rate=20.0)
+    drive = simulate(options)
+    assert len(there) >= 15
+    assert len(ODOMETER_EFFECTS) > len(set(there) & set(ODOMETER_EFFECTS))
+    for samples in (drive.imu, drive.odometer, drive.fix):
+        assert (np.diff(samples.stamp_ns) > 0).all()
+    assert abs(drive.truth.scale_ratio - 1) < 0.15
+    again = simulate(drawn(11, kind, grade, duration=duration, imu_rate=20.0)[0])
+    assert (again.imu.w_i == drive.imu.w_i).all()
+    assert (again.fix.latitude == drive.fix.latitude).all()
+
+
+def test_arms_left_at_zero_and_wrong_grades_are_what_the_operator_sets():
+    vehicles = [drawn(seed, 'town', 'consumer', ('lever_arms', 'grade'))[0]
+                for seed in range(60)]
+    zero = [o for o in vehicles if np.allclose(np.add(o.antenna_lever_arm,
+                                                      o.real.antenna_arm_error), 0)]
+    assert len(zero) == pytest.approx(0.3 * 60, abs=5 * np.sqrt(60 * 0.21))
+    # consumer cannot be too modest: a third of the draws says industrial
+    wrong = [o for o in vehicles if o.real.told_grade == 'industrial']
+    assert len(wrong) == pytest.approx(60 / 3, abs=5 * np.sqrt(60 * 2 / 9))
+
+
+def test_what_is_given_is_what_effects_go_by():
+    arm = (1.0, 0.2, 1.5)
+    seed = next(s for s in range(50) if np.allclose(np.add(
+        (o := drawn(s, 'town', 'consumer')[0]).antenna_lever_arm, o.real.antenna_arm_error), 0))
+    options, _ = drawn(seed, 'town', 'consumer', antenna_lever_arm=arm, scale=0.5,
+                       real={'squat': 0.0})
+    assert options.antenna_lever_arm == arm
+    assert options.real.antenna_arm_error == (-1.0, -0.2, -1.5)
+    assert options.scale == 0.5
+    assert options.real.squat == 0
+
+
+@pytest.mark.parametrize(('change', 'told'), [
+    ({'effects': ODOMETER_EFFECTS}, 'a vehicle has one odometer'),
+    ({'effects': ('rust',)}, '--effect rust: want one of triads'),
+    ({'grade': 'navigation'}, 'want one of consumer')])
+def test_what_cannot_be_drawn_is_said(change, told):
+    with pytest.raises(BadUsage, match=told):
+        drawn(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)

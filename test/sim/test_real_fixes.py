@@ -1,0 +1,84 @@
+"""A real receiver: its lag, its slow errors and bursts, and the sigma that it states."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.sim import real_fixes
+from odocal_ros.sim.motion import point
+from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import motion_of, simulate
+
+PAPER = SimOptions(scenario='paper', duration=600.0, imu_rate=20.0, heading=0.0)
+
+
+def north(drive, times):
+    """Return how far north of the start a receiver without noise tells the antenna, m."""
+    options = resolved(drive)
+    latitude, _, _ = real_fixes.places(motion_of(options), np.asarray(times), options)
+    return (latitude - options.latitude) * 6.36e6
+
+
+def test_a_receiver_that_filters_lags_by_its_closed_form():
+    tau = 0.8
+    slow, exact = (replace(PAPER, real=Real(receiver_lag=x)) for x in (tau, 0.0))
+    # at 20 m/s the lag is tau; in the ramp of 0.5 m/s^2 since 300 s the filter has settled
+    for t, want in ((450.0, 20 * tau), (330.0, 0.5 * 30 * tau - 0.5 * tau**2)):
+        late = (north(exact, [t]) - north(slow, [t]))[0]
+        # 1e-3: the metres of a radian of latitude here
+        assert late == pytest.approx(want, rel=3e-3)
+    # round-off of 4.5e6 m
+    assert north(slow, [0.3])[0] == pytest.approx(0, abs=1e-8)
+
+
+def test_slow_errors_have_their_size_and_the_covariance_knows():
+    slow = ((1.2, 5.0), (0.9, 20.0))
+    options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=Real(slow_errors=slow,
+                                                                     stated_factor=0.5))
+    drive = simulate(options)
+    want = 0.3**2 + 1.2**2 + 0.9**2
+    assert_allclose(drive.fix.covariance_n[0],
+                    0.25 * np.diag([want, want, 4 * want]), rtol=1e-12)
+    made = np.array([real_fixes.errors(np.arange(0.0, 600, 1.0), replace(
+        resolved(options), seed=s)) for s in range(60)])
+    # 60 drives of 600 s hold 60 * 600 / (2 * 20) independent draws of the slower one, each axis
+    n = 60 * 600 / 40
+    for axis, up in ((0, 1), (1, 1), (2, 4)):
+        assert made[..., axis].var() / (1.2**2 + 0.9**2) / up == pytest.approx(
+            1, rel=5 * np.sqrt(2 / n))
+
+
+def test_bursts_come_and_go_smoothly():
+    t = np.arange(0.0, 3600.0, 0.2)
+    options = replace(resolved(PAPER), real=Real(bursts=10.0, burst_size=10.0))
+    error = real_fixes.burst_errors(t, options)
+    size = np.hypot(error[:, 0], error[:, 1])
+    assert size.max() > 5
+    assert (size == 0).mean() > 0.8
+    # 3 x^2 - 2 x^3 rises by at most 1.5 of the size in an onset of a second
+    assert np.abs(np.diff(size)).max() <= 1.5 * size.max() * 0.2 / real_fixes.ONSET[0]
+
+
+def test_the_antenna_leans_with_the_body():
+    options = resolved(SimOptions(scenario='town', duration=200.0, antenna_lever_arm=(0, 0, 2.0),
+                                  real=Real(body_roll=0.01)))
+    motion, t = motion_of(options), np.arange(20.0, 190.0, 0.5)
+    leaning = real_fixes.places(motion, t, options)
+    stiff = point(motion.at(t), options.antenna_lever_arm)
+    aside = np.hypot(leaning[0] - stiff[0],
+                     (leaning[1] - stiff[1]) * np.cos(options.latitude)) * 6.37e6
+    state = motion.at(t)
+    most = np.abs(state.speed * state.yaw_rate).max()
+    # 2 m times 0.01 rad per m/s^2; the springs overshoot by 37 % of a sudden push at most
+    assert 0.5 < aside.max() / (2 * 0.01 * most) < 1.4
+
+
+def test_fixes_are_dropped_at_random_and_stamped_late():
+    plain, real = (simulate(replace(PAPER, fix_delay=0.1, real=Real(**figures)))
+                   for figures in ({}, {'drops': 0.2, 'fix_jitter': 0.01}))
+    n, kept = len(plain.fix.stamp_ns), len(real.fix.stamp_ns)
+    assert kept == pytest.approx(0.8 * n, abs=5 * np.sqrt(n * 0.16))
+    assert (np.diff(real.fix.stamp_ns) > 0).all()

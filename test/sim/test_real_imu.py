@@ -1,0 +1,110 @@
+"""What a real Imu adds: triads, warmth, vibration that goes nowhere, late stamps."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.sim import real_imu
+from odocal_ros.sim.noise import stream
+from odocal_ros.sim.options import resolved, SimOptions
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import simulate
+
+STRAIGHT = SimOptions(scenario='straight', duration=200.0, imu_rate=20.0, imu_grade='perfect')
+MANY = 40_000
+
+
+def options(**figures):
+    return resolved(replace(STRAIGHT, real=Real(**figures)))
+
+
+def test_the_imu_reads_by_its_model():
+    rng = stream(1, 'test')
+    w, f = rng.standard_normal((2, 7, 3))
+    gyro, accel, G = rng.normal(0, 0.01, (3, 3, 3))
+    w_m, f_m = real_imu.crooked(w, f, Real(gyro_matrix=tuple(gyro.ravel()),
+                                           accel_matrix=tuple(accel.ravel()),
+                                           g_sensitivity=tuple(G.ravel())))
+    for k in range(7):
+        assert_allclose(w_m[k], (np.eye(3) + gyro) @ w[k] + G @ f[k], atol=1e-15)
+        assert_allclose(f_m[k], (np.eye(3) + accel) @ f[k], atol=1e-15)
+
+
+def test_a_bias_given_is_the_bias_and_warms_along_its_curve():
+    given = options(gyro_bias=(0.01, -0.02, 0.03), gyro_slope=(1e-4, 0, -2e-4), warm_rise=10.0,
+                    warm_time=50.0)
+    drive, plain = simulate(given), simulate(STRAIGHT)
+    assert drive.truth.gyro_bias == pytest.approx([0.01, -0.02, 0.03])
+    more = drive.imu.w_i - plain.imu.w_i
+    t = (drive.imu.stamp_ns - given.start_ns) * 1e-9
+    warm = 10 * (1 - np.exp(-t / 50))
+    assert_allclose(more, [0.01, -0.02, 0.03] + warm[:, None] * [1e-4, 0, -2e-4], atol=1e-15)
+    assert (drive.imu.f_i == plain.imu.f_i).all()
+
+
+def test_the_wander_begins_at_the_bias_and_grows_as_a_markov_process():
+    t = np.arange(0.0, 100.0, 0.05)
+    ends = [real_imu.drifts(t, np.zeros(len(t)), replace(options(
+        gyro_wander=0.01, wander_time=200.0), seed=seed))[0] for seed in range(300)]
+    assert all((one[0] == 0).all() for one in ends)
+    # variance of x(T) - x(0): 2 s^2 (1 - exp(-T / tau)); 900 draws, 5 sigma
+    last = np.array([one[-1] for one in ends])
+    assert last.var() / (2e-4 * -np.expm1(-t[-1] / 200)) == pytest.approx(
+        1, rel=5 * np.sqrt(2 / 900))
+
+
+@pytest.mark.parametrize('rate', [50.0, 200.0])
+def test_vibration_shakes_as_said_and_goes_nowhere(rate):
+    x = real_imu.vibration(stream(2, 'test'), 0.5, rate, MANY)
+    # resonances 6 Hz wide: some 2 * 6 Hz draws a second
+    assert x.var() / 0.25 == pytest.approx(1, rel=5 * np.sqrt(2 / (3 * MANY / rate * 12)))
+    power = np.abs(np.fft.rfft(x, axis=0))**2
+    f = np.fft.rfftfreq(MANY, 1 / rate)
+    # the share of white noise of this size below 1 Hz would be 2 / rate: here (f / 12 Hz)^4 of it
+    assert power[f < 1].sum() / power.sum() < 2 / rate * (1 / 12)**4
+
+
+def test_vibration_comes_with_speed_and_moves_the_bias_by_its_square():
+    t, speed = np.arange(MANY) / 20.0, np.full(MANY, 5.0)       # half of it at 5 m/s
+    shaken = options(vibration=0.8, rectification=0.01)
+    _, accel = real_imu.drifts(t, speed, shaken)
+    assert accel.mean(axis=0) == pytest.approx(0.01 * 0.4**2, rel=1e-6)
+    _, still = real_imu.drifts(t, 0 * speed, shaken)
+    assert (still == 0).all()
+
+
+def test_stamps_are_late_in_order_and_in_batches():
+    ns = np.arange(MANY) * 10_000_000
+    late = (real_imu.stamped(ns, stream(3, 'test'), 0.02, 0.003) - ns) * 1e-9
+    # stamps so far apart seldom cross: mean within 5 sigma, spread as said
+    assert late.mean() == pytest.approx(0.02, abs=5 * 0.003 / MANY**0.5)
+    assert late.std() == pytest.approx(0.003, rel=5 / np.sqrt(2 * MANY))
+    wild = real_imu.stamped(ns, stream(3, 'test'), 0.02, 0.02)
+    assert (np.diff(wild) >= real_imu.APART_NS).all()
+    assert (wild >= ns).all()
+    batch = real_imu.stamped(ns, stream(3, 'test'), 0.002, 0.0, 4)
+    assert set(np.diff(batch).tolist()) == {real_imu.APART_NS,
+                                            40_000_000 - 3 * real_imu.APART_NS}
+    assert (batch[:4] - ns[3] >= 2_000_000).all()
+
+
+def test_late_stamps_move_no_true_mark():
+    plain, late = simulate(STRAIGHT), simulate(options(imu_latency=0.07))
+    assert late.truth.start_ns - plain.truth.start_ns == 70_000_000
+    assert (late.imu.f_i == plain.imu.f_i).all()
+
+
+@pytest.mark.parametrize(('figures', 'told'), [
+    ({'gyro_matrix': (1, 2)}, 'want 9 numbers'), ({'squat': (1, 2)}, 'want one number'),
+    ({'gyro_bias': 1.0}, 'want 3 numbers'), ({'vibration': -1}, 'out of range'),
+    ({'speed_rounding': 'up'}, 'want one of floor, round'), ({'drops': 1.0}, 'out of range'),
+    ({'told_grade': 'best'}, 'want one of consumer'), ({'slow_errors': (1, 60)}, 'want pairs'),
+    ({'slow_errors': ((1, 0),)}, 'want pairs'),
+    ({'warm_time': 0.0}, 'out of range'), ({'squat': float('nan')}, 'want finite'),
+    ({'imu_batch': 1.5}, 'out of range')])
+def test_figures_that_cannot_be_are_refused(figures, told):
+    from odocal_ros.errors import BadUsage
+    with pytest.raises(BadUsage, match=told):
+        Real(**figures)
