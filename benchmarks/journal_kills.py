@@ -1,11 +1,12 @@
 """
 What kill -9 costs: the node is killed at random moments of a leg and its journal replayed.
 
-    python benchmarks/journal_kills.py [--kills 50] [--seed 20260601] [--longest 9]
+    python benchmarks/journal_kills.py [--kills 50] [--seed 20260601] [--longest 9] [--stage stop]
 
 Every kill is a new node process that hears a simulated drive over DDS at ten times real time.
 Lost is the wall time from the newest Imu message in the journal to the kill; the replay must find
-the leg by its start mark.
+the leg by its start mark. With ``--stage stop`` or ``save`` it is killed after ~/stop_leg or
+~/save instead, and its result folders are looked at: whole or none, and none wrong.
 """
 
 import argparse
@@ -27,7 +28,11 @@ def main() -> None:
     parser.add_argument('--kills', type=int, default=50)
     parser.add_argument('--seed', type=int, default=20260601)
     parser.add_argument('--longest', type=float, default=9.0, help='s of leg at most')
+    parser.add_argument('--stage', choices=('record', 'stop', 'save'), default='record')
     args = parser.parse_args()
+    if args.stage != 'record':
+        kill_at_files(args)
+        return
     driven, lost, found, short = drive(), [], 0, 0
     for moment_s in np.random.default_rng(args.seed).uniform(0.0, args.longest, args.kills):
         with tempfile.TemporaryDirectory() as folder:
@@ -43,6 +48,23 @@ def main() -> None:
     print(f'{len(lost)} kills: lost {max(lost):.3f} s at most, {np.mean(lost):.3f} s on average; '
           f'{found} legs found by their mark and replayed, {short} '
           'killed in the first second with nothing on the disk yet')
+
+
+def kill_at_files(args) -> None:
+    """Kill while results are computed and written, and count."""
+    from kills import drive, killed_at_files, wrong
+    driven, bad = drive(), 0
+    longest = min(args.longest, {'stop': 4.0, 'save': 0.5}[args.stage])
+    moments = np.random.default_rng(args.seed).uniform(0.0, longest, args.kills)
+    for count, moment_s in enumerate(moments, 1):
+        with tempfile.TemporaryDirectory() as folder:
+            left = killed_at_files(driven, args.stage, float(moment_s), Path(folder))
+        good = not left.half and left.latest and left.journal[0] in (0, 1) and not wrong(left)
+        bad += not good
+        print(f'{count:3} killed {moment_s:5.2f} s after {args.stage}: {len(left.whole)} whole, '
+              f'{len(left.half)} half, journal exit {left.journal[0]}' + ('' if good else ', BAD'),
+              flush=True)
+    print(f'{args.kills} kills, {bad} bad')
 
 
 if __name__ == '__main__':

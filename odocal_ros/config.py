@@ -210,9 +210,12 @@ class PublishConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:
-    base: str = setting('base_link', ro=True, about='Vehicle frame in the files written.')
-    imu: str = setting('', ro=True, about='Imu frame; empty: that of the Imu messages.')
-    local: str = setting('odocal_enu', ro=True, about='Frame of the published paths.')
+    base: str = setting('base_link', ro=True, frame=True,
+                        about='Vehicle frame in the files written.')
+    imu: str = setting('', ro=True, frame=True,
+                       about='Imu frame; empty: that of the Imu messages.')
+    local: str = setting('odocal_enu', ro=True, frame=True,
+                         about='Frame of the published paths.')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +255,7 @@ def _settings(owner, prefix=''):
         else:
             m = f.metadata
             yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
-                          m['choices'], m['about'], m['ro'])
+                          m['choices'], m['about'], m['ro'], m['frame'])
 
 
 SETTINGS = {s.name: s for s in _settings(Config())}

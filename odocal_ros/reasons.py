@@ -64,6 +64,7 @@ class Code(Enum):
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg; what was driven '
                                   'until the recording broke off was used.')
+    FRAME_REPLACED = NOTE, 'Set frames.imu to the frame that the Imu has in TF; mend its driver.'
     COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
     FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
                                      'the receiver and the sky.')

@@ -79,6 +79,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'before its stop mark: a node or a computer that was killed, or a bag stopped too early. '
         'The leg was taken to end at the last sample that all topics have, where the vehicle need '
         'not stand.',
+        Code.FRAME_REPLACED: 'The header of the Imu names a frame that TF does not take (TF takes '
+        'letters, digits and `_ . / -`, and no `/` at the beginning). The files for TF name '
+        'another one, as the sentence says.',
         Code.COVARIANCE_UNKNOWN: 'Fixes come without a covariance, or with zero or NaN in it; '
         '`gnss.default_sigma` was taken.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '

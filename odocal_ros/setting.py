@@ -5,14 +5,21 @@ import math
 from typing import Any
 
 from odocal_ros.errors import BadConfig
+from odocal_ros.outside import is_frame, one_line
 
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
 
-def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False) -> Any:
-    """Declare a setting. ``ro``: fixed at start-up. NaN passes where the default is NaN."""
+def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False,
+            frame=False) -> Any:
+    """
+    Declare a setting; NaN passes where the default is NaN.
+
+    ro : fixed at start-up.   frame : the name of a coordinate frame.
+    """
     return field(default=default, metadata={
-        'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro})
+        'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro,
+        'frame': frame})
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class Setting:
     choices: tuple
     about: str
     read_only: bool
+    frame: bool
 
     @property
     def kind(self) -> str:
@@ -54,6 +62,8 @@ class Setting:
             raise BadConfig(f'{self.name}: {value!r} is not {TYPES[kind]}')
         if self.choices and value not in self.choices:
             raise BadConfig(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
+        if kind is str:
+            self._check_text(value)
         if kind in (int, float):
             unset = kind is float and math.isnan(value)
             if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
@@ -66,3 +76,12 @@ class Setting:
                 raise BadConfig(f'{self.name} = {value:g}: want {self.low:g} to {self.high:g} '
                                 f'{unit}'.rstrip())
         return value
+
+    def _check_text(self, value):
+        """Refuse what no name is: it would stand in files and on terminals."""
+        if one_line(value) != value:
+            raise BadConfig(f"{self.name}: '{one_line(value)}' has characters that cannot be seen")
+        # empty is one where that means something: as the default
+        if self.frame and not is_frame(value) and value != self.default:
+            raise BadConfig(f'{self.name}: {value!r} is no frame name; want letters, digits and '
+                            '_ . / -, no / at its beginning')

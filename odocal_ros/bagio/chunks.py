@@ -7,25 +7,22 @@ joining files copies chunks and packs nothing again.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-import os
 from pathlib import Path
 import struct
-from typing import BinaryIO
 import zlib
 
 import numpy as np
 
 from odocal_ros.bagio.recover import CHANNEL, Channel, CHUNK, FOOTER, MCAP_MAGIC, MESSAGE, SCHEMA
 from odocal_ros.bagio.sources import zstd_module
+from odocal_ros.whole import whole_file, WholeFile
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 1, 7, 8, 11, 15
 LEVEL = 1                     # of zstd: a third of the size at a hundredth of a core
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
-PART = '.part'                # of files being written: no ending that a bag's files have
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,32 +95,7 @@ def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chu
         return _fill(file, channels, chunks)
 
 
-@contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that is there, whole and safe on the disk, after the block, or not at all."""
-    part = path.with_name(f'.{path.name}{PART}')
-    try:
-        with part.open('wb') as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(path)
-        sync_folder(path.parent)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-
-
-def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _fill(file: BinaryIO, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> int:
+def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> int:
     """Write all records of a file; return its size."""
     described = b''.join(
         _record(SCHEMA, struct.pack('<H', key) + _text(c.msgtype)

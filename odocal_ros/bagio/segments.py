@@ -9,11 +9,13 @@ go, and its name tells which they are: a reader that finds both takes the joined
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+import os
 from pathlib import Path
 
-from odocal_ros.bagio.chunks import Chunk, read_chunks, whole_file, write_file
+from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
 from odocal_ros.bagio.recover import Channel
+from odocal_ros.whole import disk, write_text
 
 TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
 
@@ -85,7 +87,7 @@ class SegmentedBag:
         self._write_metadata()
         for path in self.folder.glob('part_*.mcap'):
             if path not in {segment.path for segment in self.segments}:
-                path.unlink()
+                disk(os.unlink, path)
         return self.segments[0].path
 
     def add(self, chunks: Sequence[Chunk]) -> None:
@@ -106,7 +108,7 @@ class SegmentedBag:
         at = self.segments.index(segments[0])
         self.segments[at:at + len(segments)] = [joined]
         for segment in segments:
-            segment.path.unlink()
+            disk(os.unlink, segment.path)
 
     def _write(self, name: str, first: int, last: int, chunks: Iterable[Chunk]) -> Segment:
         tally = _Tally()
@@ -137,12 +139,6 @@ class _Tally:
 def _chunks_of(segments: Iterable[Segment]) -> Iterator[Chunk]:
     for segment in segments:
         yield from read_chunks(segment.path)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, safe on the disk when this returns."""
-    with whole_file(path) as file:
-        file.write(text.encode())
 
 
 def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:

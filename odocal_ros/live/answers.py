@@ -4,6 +4,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
 from odocal_ros.output.summary import sentence
+from odocal_ros.outside import said_by
 from odocal_ros.reasons import Verdict
 
 MOST_REASONS = 3
@@ -49,7 +50,7 @@ def _worth_telling(calibration: Calibration) -> list:
 
 def one_line(error: BaseException) -> str:
     """Return an error as one line; one that was not foreseen says so."""
-    text = ' '.join(str(error).split())
+    text = said_by(error)
     if isinstance(error, OdocalError):
         return text
     return f'internal error, please report it: {type(error).__name__}: {text}'

@@ -1,10 +1,36 @@
-"""Message definitions out of the message classes, so that a journal can be read anywhere."""
+"""Message classes by name, and their definitions, so that a journal can be read anywhere."""
 
 import importlib
+from importlib.machinery import PathFinder
+from pathlib import Path
 import re
 
+from odocal_ros.errors import BadConfig
+
+MESSAGE_TYPE = re.compile(r'(?P<package>[a-z][a-z0-9_]*)/msg/(?P<name>[A-Z][A-Za-z0-9]*)')
 NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
 KIND = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
+
+
+def message_class(msgtype: str):
+    """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
+    match = MESSAGE_TYPE.fullmatch(msgtype)     # somebody on the net may have chosen it
+    try:
+        if match is None or not _has_messages(match['package']):
+            raise ImportError
+        return getattr(importlib.import_module(f'{match["package"]}.msg'), match['name'])
+    except (ImportError, AttributeError):
+        raise BadConfig(
+            f'message type {msgtype!r} cannot be imported here: install its package or source '
+            f"its workspace ('ros2 interface show {msgtype}' must work), or correct the type"
+        ) from None
+
+
+def _has_messages(package: str) -> bool:
+    """Return whether a package has messages, without running anything of it."""
+    found = PathFinder.find_spec(package)
+    places = found and found.submodule_search_locations or ()
+    return any(Path(place, 'msg').is_dir() for place in places)
 
 
 def definition_of(kind: type) -> str:

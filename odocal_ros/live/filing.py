@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from rclpy.task import Future
 
@@ -24,6 +25,8 @@ class Filing:
         self._worker, self._log, self._show = worker, log, show
         self._shelf = Shelf()
         self._warned: Calibration | None = None    # the operator was told that latest stays
+        self._under_way = 0
+        self._artist = Worker()        # a leg that ends meanwhile need not wait for a report
 
     def save(self, calibration: Calibration, config: Config, topics: dict[str, str],
              imu_frame: str, now_ns: int, asked: bool) -> Future:
@@ -33,8 +36,10 @@ class Filing:
         asked : by the operator. ``latest`` does not go to a worse result, unless he asks again.
         """
         future = Future()
+        self._under_way += 1
 
         def then(outcome, error):
+            self._under_way -= 1
             if error is None:
                 folder, stays = outcome
                 self.saved, self.trouble = str(folder), ''
@@ -51,9 +56,34 @@ class Filing:
             self._show()
 
         self._worker.submit(partial(
-            outputs.save, calibration, config, [{'bag': '', 'sha256': None, 'topics': topics}],
+            self._write, calibration, config, [{'bag': '', 'sha256': None, 'topics': topics}],
             imu_frame, now_ns, self._shelf, asked and calibration is self._warned), then)
         return future
+
+    @property
+    def busy(self) -> bool:
+        """Return whether files are being written."""
+        return self._under_way > 0 or self._artist.busy
+
+    def _write(self, *values) -> tuple[Path, str]:
+        """Write the numbers; for the worker."""
+        folder, stays, draw = outputs.save(*values)
+        if draw is not None:
+            self._artist.submit(draw, self._drawn)
+        return folder, stays
+
+    def _drawn(self, why, error) -> None:
+        if error is not None or why:
+            self._log.warning('the report is not drawn: '
+                              f'{answers.one_line(error) if error else why}')
+
+    def poll(self) -> None:
+        """Take over what has been drawn."""
+        self._artist.poll()
+
+    def close(self, grace_s: float) -> bool:
+        """Let the report be drawn, waiting a moment for it; return whether it is."""
+        return self._artist.close(grace_s)
 
     def withdraw(self, left) -> None:
         """Let ``latest`` and ``saved`` go back to what holds only the legs left."""

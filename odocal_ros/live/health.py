@@ -8,6 +8,7 @@ MEMORY = 64            # blocks kept for the rate
 RATE_SPAN_NS = 3_000_000_000
 SILENCE_NS = 2_000_000_000
 JUMP_NS = 1_000_000_000
+FEW = 3
 
 
 class Health:
@@ -52,10 +53,7 @@ class Health:
             self.fix_status = int(block.status[-1])
         if not len(stamps):
             return
-        newest = int(stamps[-1])
-        # one stale stamp is a hiccup of the driver; a whole block of them is a new start of time
-        if self.newest_ns and stamps.max() < self.newest_ns - JUMP_NS:
-            self.jumped_back = True
+        newest = self._newest(stamps)
         steps = np.diff(stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]) * 1e-9
         rising = steps[steps > 0]
         if len(rising):
@@ -67,6 +65,25 @@ class Health:
         self.newest_ns = newest
         self.delay_s = (int(block.received_ns[-1]) - int(block.stamp_ns[-1])) * 1e-9
         self._ends.append((self.count, newest))
+
+    def _newest(self, stamps) -> int:
+        """
+        Return the newest stamp with a block of them, and note whether time has started anew.
+
+        One or two stale stamps are a hiccup of the driver, more are a new start of time; where a
+        block ends with few of them, the next one tells.
+        """
+        known = stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]
+        steps = np.diff(known)
+        at = int(np.argmin(steps)) if len(steps) else 0
+        fell = bool(len(steps)) and known[at + 1:].max() < known[at] - JUMP_NS
+        after_wild = steps[at - 1] > JUMP_NS if at else not self.newest_ns
+        if not fell or after_wild:
+            return int(stamps[-1])
+        if at and len(known) - 1 - at < FEW:
+            return int(known[at])
+        self.jumped_back = True
+        return int(stamps[-1])
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""

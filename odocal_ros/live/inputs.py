@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-import importlib
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
@@ -17,9 +16,11 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from odocal_ros.config import Config
-from odocal_ros.errors import BadConfig, BadData, OdocalError
+from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
 from odocal_ros.messages import make_reader, Reader
+from odocal_ros.outside import said_by
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
@@ -31,18 +32,6 @@ DEPTH = {'imu': 5000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
 LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
           'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
-
-
-def message_class(msgtype: str):
-    """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
-    try:
-        package, folder, name = msgtype.split('/')
-        return getattr(importlib.import_module(f'{package}.{folder}'), name)
-    except (ValueError, ImportError, AttributeError):
-        raise BadConfig(
-            f'message type {msgtype!r} cannot be imported here: install its package or source '
-            f"its workspace ('ros2 interface show {msgtype}' must work), or correct the type"
-        ) from None
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
@@ -105,7 +94,7 @@ class Input:
             elif self.publishers:
                 self.subscribe(self.publishers[0].topic_type, config)
         except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
-            trouble = ' '.join(str(error).split())
+            trouble = said_by(error)
             if trouble != self.trouble:
                 self._node.get_logger().error(trouble)
             self.trouble = trouble
@@ -174,13 +163,13 @@ class Input:
         reader, deserialize = self.reader, self._deserialize
         if reader is None or deserialize is None:
             return []
-        if not self.frame and self.slot == 'imu':
-            self.frame = deserialize(raws[0]).header.frame_id
         try:
+            if not self.frame and self.slot == 'imu':
+                self.frame = deserialize(raws[0]).header.frame_id
             pairs = reader.rows(raws, received_ns, deserialize)
         except Exception as error:  # whatever a foreign message does, the node lives on
             self._failed += len(raws)
-            self.trouble = f'{self.topic}: {" ".join(str(error).split())}'
+            self.trouble = f'{self.topic}: {said_by(error)}'
             pairs = []
         self.health.unusable = self._failed + reader.unreadable
         if not pairs and reader.trouble:

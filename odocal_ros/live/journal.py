@@ -12,7 +12,8 @@ from rclpy.clock_type import ClockType
 from rclpy.serialization import serialize_message
 
 from odocal_ros.config import Config
-from odocal_ros.live.inputs import Input, message_class
+from odocal_ros.live.definitions import message_class
+from odocal_ros.live.inputs import Input
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import Heard, JournalWriter
@@ -149,8 +150,8 @@ class Journal:
         self._batch = {}
         self._writer.submit(self._writer.start_anew)
 
-    def close(self) -> None:
-        """Write what is left; a long leg's files may stay apart."""
+    def close(self) -> bool:
+        """Write what is left; a long leg's files may stay apart; return whether all is done."""
         self._hand_over()
         self._writer.submit(self._writer.finish)
-        self._writer.close(GRACE_S)
+        return self._writer.close(GRACE_S)

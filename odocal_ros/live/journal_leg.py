@@ -3,13 +3,15 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+import shutil
 from typing import TextIO
 
 from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.recover import Channel
-from odocal_ros.bagio.segments import SegmentedBag, write_text
-from odocal_ros.live.journal_space import claim, make_room
+from odocal_ros.bagio.segments import SegmentedBag
+from odocal_ros.live.journal_space import claim, clear_empty, make_room
+from odocal_ros.whole import write_text
 
 MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
 MARGIN = 2**20                # for metadata and file heads
@@ -44,11 +46,17 @@ class LegJournal:
         self._claim: TextIO | None = None
         self._others = 0              # bytes of the other journals
         self._over = False            # given up, or finished
+        self._late: list[Chunk] = []  # marks that came after the end
 
     @property
     def folder(self) -> str:
         """Return where it is written, empty before it is."""
         return str(self._bag.folder) if self._bag else ''
+
+    @property
+    def marks_wait(self) -> bool:
+        """Return whether there are marks that the finished journal lacks."""
+        return bool(self._late)
 
     def put(self, chunks: list[Chunk]) -> None:
         """Write chunks, and those that wait."""
@@ -67,15 +75,30 @@ class LegJournal:
             self.put([])
             if self._bag is not None and not self._waiting:
                 self._try(self._finish)
+            elif self._bag is not None and not self._bag.segments:     # the disk took nothing
+                shutil.rmtree(self._bag.folder, ignore_errors=True)
+                self._bag = None
         self._over, self._waiting = True, []
         if self._claim is not None:
             self._claim.close()
 
     def add(self, chunks: list[Chunk]) -> None:
         """Add a mark to the finished journal."""
+        self._late += chunks
+        self.retry()
+
+    def retry(self) -> None:
+        """Write marks that the disk has not taken yet."""
         bag = self._bag
-        if bag is not None and bag.segments and bag.folder.exists():
-            self._try(lambda: bag.add(chunks))
+        if bag is None or not bag.segments or not bag.folder.exists():
+            self._late = []         # there is nothing to replay
+        elif self._late:
+            self._try(self._add_late)
+
+    def _add_late(self) -> None:
+        assert self._bag is not None
+        self._bag.add(self._late)
+        self._late, self.trouble = [], ''
 
     def _write(self) -> None:
         if self._bag is None:
@@ -96,14 +119,15 @@ class LegJournal:
         """Make the folder, with the settings in it."""
         root = self.plan.root
         root.mkdir(parents=True, exist_ok=True)
+        clear_empty(root)
         self._others = make_room(root, self.plan.limit)
         folder = _free(root, self.plan.name)
         try:
             write_text(folder / JOURNAL, self.plan.settings)
+            self._claim = claim(folder)
         except OSError:
-            folder.rmdir()
+            shutil.rmtree(folder, ignore_errors=True)
             raise
-        self._claim = claim(folder)
         bag = SegmentedBag(folder)
         bag.channels = self._channels
         return bag

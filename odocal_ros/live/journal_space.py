@@ -3,10 +3,16 @@
 from contextlib import suppress
 import fcntl
 from pathlib import Path
+import re
 import shutil
+import time
 from typing import TextIO
 
 from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.whole import PART
+
+NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
+NEW_S = 10.0       # a node may be about to write into its folder
 
 
 def journals(root: Path) -> list[Path]:
@@ -18,6 +24,21 @@ def journals(root: Path) -> list[Path]:
                 if not folder.is_symlink():
                     found.append(((folder / JOURNAL).stat().st_mtime_ns, folder))
     return [folder for _, folder in sorted(found)]
+
+
+def clear_empty(root: Path) -> None:
+    """Remove journals in which nothing is: their nodes died before, or the disk took no more."""
+    for folder in list(root.iterdir()):
+        with suppress(OSError):
+            named = NAME.fullmatch(folder.name) and not folder.is_symlink()
+            old = named and folder.stat().st_mtime < time.time() - NEW_S
+            if old and all(is_nothing(path) for path in folder.iterdir()) and not _in_use(folder):
+                shutil.rmtree(folder)
+
+
+def is_nothing(path: Path) -> bool:
+    """Return whether a file of a journal holds no message, for certain."""
+    return path.name == JOURNAL or path.name.endswith(PART)
 
 
 def size_of(folder: Path) -> int:

@@ -1,10 +1,11 @@
 """The settings of a leg beside its journal: a parameter file that says what it is."""
 
-import json
-import math
+from datetime import datetime, UTC
 
 from odocal_ros import __version__
 from odocal_ros.config import Config, flat
+from odocal_ros.outside import for_shell
+from odocal_ros.yaml_text import parameters
 
 HEAD = """\
 # Journal of a leg: 'odocal replay' on this folder computes it again with the settings below,
@@ -15,22 +16,13 @@ HEAD = """\
 
 def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, str]) -> str:
     """Return the text of journal.yaml; ``topics`` are slot -> topic."""
-    settings = {name: _text(value) for name, value in flat(config).items()}
-    about = {'software': _text(f'odocal_ros {__version__}'), 'leg_id': str(leg_id),
-             'leg_start_ns': str(start_ns)} | {
-                 f'topics.{slot}': _text(topic) for slot, topic in topics.items()}
-    return HEAD + _block('/**', settings) + _block('odocal_journal', about)
+    about = {'software': f'odocal_ros {__version__}', 'leg_id': leg_id, 'leg_start_ns': start_ns}
+    about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
+    return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
 
 
-def _block(key: str, values: dict[str, str]) -> str:
-    lines = [f'    {name}: {text}\n' for name, text in values.items()]
-    return f'{key}:\n  ros__parameters:\n{"".join(lines)}'
-
-
-def _text(value) -> str:
-    """Return a value as rcl and odocal read it back to the last bit."""
-    if isinstance(value, tuple):
-        return f'[{", ".join(map(_text, value))}]'
-    if isinstance(value, float):
-        return '.nan' if math.isnan(value) else repr(value)
-    return json.dumps(value)     # text in quotes, so that a joint may be named 0 or on
+def replay_command(folder: str, start_ns: int) -> str:
+    """Return what computes a cancelled leg from its journal, from its mark to its last sample."""
+    seconds, nanoseconds = divmod(start_ns, 10**9)
+    start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
+    return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])

@@ -80,10 +80,11 @@ class JournalWriter:
         """Have the thread call one of the methods below."""
         self._jobs.put((job, values))
 
-    def close(self, grace_s: float) -> None:
-        """Let the thread end after the jobs it was given, waiting a moment for them."""
+    def close(self, grace_s: float) -> bool:
+        """Let the thread end after the jobs it was given; return whether it has, in that time."""
         self._jobs.put(None)
         self._thread.join(grace_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
@@ -101,6 +102,12 @@ class JournalWriter:
         if self._leg is not None:
             self.trouble, self.folder = self._leg.trouble, self._leg.folder
 
+    def _show_late(self) -> None:
+        """Try marks of closed legs again that the disk did not take: what is dropped stays so."""
+        for leg in [leg for leg in self._closed.values() if leg.marks_wait]:
+            leg.retry()
+            self.trouble = leg.trouble
+
     # jobs
 
     def take(self, batch: dict[str, Heard], reach_ns: int, marks: Heard | None) -> None:
@@ -110,6 +117,7 @@ class JournalWriter:
             chunk = self._packed(heard)
             chunks.append(chunk)
             self._preroll.feed(slot, heard.newest_ns or heard.sent_ns[-1], chunk, reach_ns)
+        self._show_late()
         if self._leg is not None:
             self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
 
@@ -129,7 +137,9 @@ class JournalWriter:
     def add(self, leg_id: int, marks: Heard) -> None:
         """Add a mark to the journal of a leg that is closed."""
         if leg_id in self._closed:
-            self._closed[leg_id].add([self._packed(marks)])
+            leg = self._closed[leg_id]
+            leg.add([self._packed(marks)])
+            self.trouble = leg.trouble
 
     def finish(self) -> None:
         """Close the journal of the open leg and join its files."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from math import nan
+import time
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -17,6 +18,7 @@ from odocal_ros.live.computing import Computing
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.guidance import after_result, quantities_ok
 from odocal_ros.live.journal import Journal
+from odocal_ros.live.journal_text import replay_command
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.params import restored_from
 from odocal_ros.live.quantities import words
@@ -24,7 +26,7 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.watch import Watch
-from odocal_ros.live.worker import Worker
+from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
@@ -58,6 +60,7 @@ class LegWay:
     def tick(self) -> None:
         """Take over what the worker has done and what time has brought."""
         self._worker.poll()
+        self._filing.poll()
         self.pump()
         if self._recording.time_jumped:
             self._start_time_anew()
@@ -71,17 +74,19 @@ class LegWay:
         """Decode what has arrived."""
         self._recording.pump(self._config(), self._outlets.scale_factor())
 
-    def close(self) -> None:
-        """Let the worker end."""
+    def close(self) -> bool:
+        """Let the worker end; return whether it has."""
         self._watch.end()
-        self._worker.close()
+        until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
+        done = self._worker.close(until - time.monotonic())
+        return self._filing.close(max(0.0, until - time.monotonic())) and done
 
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""
         if self.session.state is State.RECORDING or self._close_by_ns is not None:
-            text = f'time jumped: leg {self.session.leg_id} is cancelled; start it again'
-            self._log.warning(text)
-            self._drop_leg(text)
+            self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
+            self._drop_leg(lost='time jumped back')
+            self._log.warning(self._lost_leg())
         else:
             self._log.warning('time jumped: the samples so far are dropped')
         self._recording.start_anew()
@@ -98,7 +103,7 @@ class LegWay:
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
-            config=session.config if session.busy else self._config(),
+            config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
             outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
@@ -178,14 +183,25 @@ class LegWay:
         self._computing.answer(success, text)
         return success, text
 
-    def _drop_leg(self, text: str) -> None:
-        self.session.cancel()
+    def _lost_leg(self) -> str:
+        """Return what became of a leg that was dropped by nobody's wish, empty without one."""
+        session = self.session
+        if not session.lost:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {replay_command(folder, session.start_ns)} '
+                'computes it' if folder else 'no journal was kept of it')
+        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; ~/start_leg starts '
+                'another')
+
+    def _drop_leg(self, text: str = '', lost: str = '') -> None:
+        self.session.cancel(lost)
         self._watch.end()
         self._close_by_ns = self._snapshot = None
         self._computing.drop()
         self.show_status()
         self._journal.end()
-        self._computing.answer(False, text)
+        self._computing.answer(False, text or self._lost_leg())
 
     def _save(self, calibration: Calibration, asked: bool = False) -> Future:
         """Write the result files in the worker; the future has the answer."""

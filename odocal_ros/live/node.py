@@ -21,12 +21,14 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live import params
-from odocal_ros.live.answers import one_line
+from odocal_ros.live import answers, params
+from odocal_ros.live.inputs import TOPICS
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.recording import Recording
+from odocal_ros.outside import one_line, said_by
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
@@ -53,24 +55,27 @@ class Calibrator(Node):
     Calibrates an odometer over legs that the operator marks by service.
 
     Works in any executor; SingleThreadedExecutor is meant. ``Session`` remembers legs,
-    ``Recording`` samples; the node itself only joins them.
+    ``Recording`` samples; the node itself only joins them. ``at_work``: destroyed while one of its
+    threads was, which will end with the process.
     """
 
+    at_work = False
+
     def __init__(self, node_name: str = 'calibrator', **kwargs) -> None:
-        super().__init__(node_name, **kwargs)
         try:
-            self._build()
+            super().__init__(node_name, **kwargs)
+            try:
+                self._build()
+            except Exception:
+                self.destroy_node()
+                raise
         except (ParameterException, InvalidQosOverridesError) as error:
-            self.destroy_node()
-            text = ' '.join(str(error).split())
-            raise BadConfig(f'{text}; correct the parameter and start again') from None
-        except Exception:
-            self.destroy_node()
-            raise
+            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
 
     def _build(self) -> None:
         self.config = params.declare(self)
         params.declare_results(self)
+        params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
         self.outlets = Outlets(self)
         self.journal = Journal(self, self.outlets.status_topic)
         self.recording = Recording(self, self.config, self.journal.remember)
@@ -92,9 +97,13 @@ class Calibrator(Node):
     def destroy_node(self) -> None:
         """End worker, journal and clock callbacks with the node."""
         for part in ('operation', 'journal', 'recording'):
-            if hasattr(self, part):
-                getattr(self, part).close()
+            if hasattr(self, part) and getattr(self, part).close() is False:
+                self.at_work = True
         super().destroy_node()
+
+    def get_logger(self) -> PlainLog:
+        """Return the node's log."""
+        return PlainLog(super().get_logger())
 
     # parameters
 
@@ -175,7 +184,7 @@ def main(args=None) -> int:
                              'written after --ros-args (see calibrator --help)')
         _init(args)
     except Exception as error:
-        text = ' '.join(str(error).split()).split(', at /')[0]
+        text = said_by(error).split(', at /')[0]
         return _complain(f'{text}; write parameters as --ros-args -p name:=value, remaps as -r '
                          'from:=to')
     executor, node, code = SingleThreadedExecutor(), None, 0
@@ -189,12 +198,17 @@ def main(args=None) -> int:
         code = _complain(str(error))
     except Exception as error:
         # a callback caught in the middle of a shutdown may find its publisher gone
-        code = _complain(one_line(error)) if rclpy.ok() else 0
+        code = _complain(answers.one_line(error)) if rclpy.ok() else 0
     finally:
         executor.shutdown()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+    if node is not None and node.at_work:
+        # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     return code
 
 
@@ -214,7 +228,7 @@ def _init(args) -> None:
 
 
 def _complain(text: str) -> int:
-    print(f'calibrator: {text}', file=sys.stderr)
+    print(one_line(f'calibrator: {text}'), file=sys.stderr)
     return 1
 
 

@@ -58,6 +58,8 @@ class Operation(LegWay):
     def _last_result(self) -> tuple[bool, str]:
         """Return the answer to a stop without a leg."""
         session, now = self.session, self.situation()
+        if now.lost:
+            raise Refused(now.lost)
         good = words(quantities_ok(now))
         if session.calibration is not None:
             success, text = answers.outcome(session.calibration, good=good,

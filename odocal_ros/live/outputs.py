@@ -1,5 +1,7 @@
 """What leaves the node besides status and parameters: paths and result files."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime, UTC
 import os
 from pathlib import Path
@@ -10,7 +12,7 @@ import numpy as np
 from std_msgs.msg import Header
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config, with_settings
+from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.shelf import Shelf
 
@@ -49,12 +51,13 @@ def output_root(config: Config) -> Path:
 
 
 def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
-         now_ns: int, shelf: Shelf, force: bool) -> tuple[Path, str]:
+         now_ns: int, shelf: Shelf, force: bool) -> tuple[Path, str, Callable[[], str] | None]:
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
     ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty. Returns the
-    folder, and why ``latest`` stays where it was, empty when it does not; ``force`` moves it.
+    folder, why ``latest`` stays where it was, empty when it does not (``force`` moves it), and
+    what adds the report, which takes long to draw.
 
     Raises
     ------
@@ -62,19 +65,25 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
         The folder cannot be written.
 
     """
-    from odocal_ros.output.files import write_results
-    if not config.frames.imu and imu_frame:
-        config = with_settings(config, {'frames.imu': imu_frame})
+    from odocal_ros.output.files import Results
+    from odocal_ros.output.frames import framed
+    calibration, config = framed(calibration, config, imu_frame)
     root = output_root(config)
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:
         folder = _free(root, name)
-        write_results(calibration, config, folder, inputs, iso(now_ns))
+        try:
+            results = Results(calibration, config, folder, inputs, iso(now_ns))
+            results.write()
+        except OdocalError:
+            with suppress(OSError):
+                folder.rmdir()      # empty: its name was only reserved
+            raise
         stays = shelf.file(folder, marks(calibration.legs), force)
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                           'output.directory to a folder that can') from None
-    return folder, stays
+    return folder, stays, results.draw if results.has_report else None
 
 
 def marks(legs) -> frozenset[int]:

@@ -1,5 +1,6 @@
 """Settings as ROS parameters, and the result as parameters that only the node may set."""
 
+from collections.abc import Iterable
 import difflib
 import math
 
@@ -12,6 +13,8 @@ from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.config import Config, SETTINGS, with_settings
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.restored import Restored
+from odocal_ros.output.stored import check_estimate
+from odocal_ros.outside import one_line
 from odocal_ros.reasons import Verdict
 from odocal_ros.setting import Setting
 
@@ -20,7 +23,11 @@ ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'r
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
 PREFIX = 'result.'
+QOS: dict[str, tuple[str, ...]] = {
+    'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
+    'history': ('keep_last', 'keep_all', 'system_default'), 'depth': ()}
 NO_STAMP = 'an unknown date'
+TAKE = 'take the file that ~/save wrote'
 
 
 def _result_defaults() -> dict:
@@ -78,17 +85,37 @@ def declare(node: Node) -> Config:
         except ParameterException as error:
             raise BadConfig(_refusal(name, setting, error)) from None
         values[name] = setting.default if value is None else _plain(value)
-    _warn_of_typos(node)
+    _warn_of_unknown(node)
     return with_settings(Config(), values)
 
 
-def _warn_of_typos(node: Node) -> None:
-    """Name overrides that are nearly settings; ROS passes over what nobody declares."""
+def _warn_of_unknown(node: Node) -> None:
+    """Name overrides in our groups that are no settings; ROS passes over what nobody declares."""
+    groups = {name.partition('.')[0] for name in SETTINGS if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public way to them
+        group, dot, _ = name.partition('.')
         near = difflib.get_close_matches(name, SETTINGS, 1, 0.8)
-        if near and name not in SETTINGS:
-            node.get_logger().warning(
-                f'no parameter {name}: did you mean {near[0]}? It is not taken.')
+        if name not in SETTINGS and (near or dot and group in groups):
+            mean = f': did you mean {near[0]}?' if near else ''
+            node.get_logger().warning(f'no parameter {name}{mean or "."} It is not taken.')
+
+
+def check_qos(node: Node, topics: Iterable[str]) -> None:
+    """
+    Raise BadConfig for an override of the QoS of a topic listened to that rclpy would fail at.
+
+    It would do so with a word of its insides, and for a topic found later only then.
+    """
+    overrides = getattr(node, '_parameter_overrides', {})
+    for topic in topics:
+        for policy, wanted in QOS.items():
+            name = f'qos_overrides.{topic}.subscription.{policy}'
+            value = overrides[name].value if name in overrides else None
+            number = policy == 'depth' and type(value) is int and 0 < value < 2**31
+            if value is not None and not number and value not in wanted:
+                want = f'one of {", ".join(wanted)}' if wanted else 'a whole number above 0'
+                raise BadConfig(f'{name}: {value!r} is not {want}; correct the parameter and '
+                                'start again')
 
 
 def changed(config: Config, parameters: list[Parameter]) -> Config:
@@ -107,10 +134,10 @@ def declare_results(node: Node) -> None:
         kind = type(default)
         whole = kind is float and type(value) is int
         if type(value) is not kind and not whole:
-            raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; take the file '
-                            'that ~/save wrote')
+            raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {TAKE}')
         if whole:
             node.set_parameters([Parameter(name, value=float(value))])
+    restored_from({name: node.get_parameter(name).value for name in RESULTS})
 
 
 def as_results(calibration: Calibration, stamp: str) -> dict:
@@ -127,16 +154,36 @@ def as_results(calibration: Calibration, stamp: str) -> dict:
 
 
 def restored_from(results: dict) -> Restored | None:
-    """Return the result that ``result.*`` hold, None where they hold none."""
+    """
+    Return the result that ``result.*`` hold, None where they hold none.
+
+    Raises
+    ------
+    BadConfig
+        No calibration gives such values: the checks are those of a calibration.json.
+
+    """
+    try:
+        return _restored(results)
+    except ValueError as error:
+        raise BadConfig(f'{error}; {TAKE}') from None
+
+
+def _restored(results):
+    legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
+    if legs < 0:
+        raise ValueError(f'result.legs: {legs} is no number of legs')
+    if one_line(stamp) != stamp:
+        raise ValueError(f"result.stamp: '{one_line(stamp)}' is no date")
     estimates = {}
     for name, unit in ESTIMATES.items():
         value, sigma = (None if math.isnan(x) else x for x in (
             results[PREFIX + name], results[PREFIX + name + '_sigma']))
+        check_estimate(name, value, sigma)
         estimates[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
     if all(e.value is None for e in estimates.values()):
         return None
-    return Restored(estimates, results[PREFIX + 'legs'], results[PREFIX + 'valid'],
-                    results[PREFIX + 'stamp'] or NO_STAMP)
+    return Restored(estimates, legs, results[PREFIX + 'valid'], stamp or NO_STAMP)
 
 
 def _number(value) -> float:

@@ -52,7 +52,8 @@ class Recording:
                 self.progress.feed(slot, block, config, self.inputs.form, found_scale)
                 if self.tap is not None:
                     self.tap(slot, block)
-            self._remember(source, raws, sent_ns)
+            if not self.time_jumped:     # of another time: no sample of a leg before it
+                self._remember(source, raws, sent_ns)
 
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""

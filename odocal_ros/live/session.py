@@ -57,6 +57,7 @@ class Session:
         self.calibration: Calibration | None = None
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
         self.trouble = ''
+        self.lost = ''      # why the leg last touched was dropped by nobody's wish
         self._last_id = 0
 
     @property
@@ -82,6 +83,7 @@ class Session:
         self.leg_id, self.start_ns, self.stop_ns = self._last_id, mark_ns, 0
         self.config = config
         self.state, self.event, self.trouble = State.RECORDING, 'started', ''
+        self.lost = ''
 
     def stop(self, mark_ns: int) -> None:
         """End the open leg at a mark; it is computed next."""
@@ -104,11 +106,11 @@ class Session:
         """Note that the computation failed; the leg stays open."""
         self.state, self.trouble = State.FAILED, trouble
 
-    def cancel(self) -> None:
-        """Drop the open leg."""
+    def cancel(self, lost: str = '') -> None:
+        """Drop the open leg; ``lost``: why, where nobody asked for it."""
         if not self.open_leg:
             raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept')
-        self.event = 'cancelled'
+        self.event, self.lost = 'cancelled', lost
         self._settle(self.calibration)
 
     def begin_undo(self) -> list[KeptLeg]:
@@ -120,6 +122,7 @@ class Session:
             raise Refused('no leg to undo: none is kept')
         dropped = self.legs.pop()
         self._touch(dropped, 'undone')
+        self.lost = ''
         self.state = State.COMPUTING if self.legs else State.IDLE
         self.calibration = None
         return self.legs
@@ -135,7 +138,7 @@ class Session:
                           'before ~/reset')
         dropped, self.legs = self.legs, []
         self.calibration, self.state, self.trouble = None, State.IDLE, ''
-        self.restored = None
+        self.restored, self.lost = None, ''
         return dropped
 
     def dropped(self, leg: KeptLeg) -> None:

@@ -29,6 +29,7 @@ class Situation:
     outlook: Outlook | None = None               # of the leg that is recorded
     outlook_age_s: float = nan                   # since the way it is of
     saved: str = ''
+    lost: str = ''                               # a leg that nobody wanted dropped
     save_trouble: str = ''                       # why the newest result is in no folder
     journal: str = ''                            # folder of the newest leg's journal
     journal_trouble: str = ''                    # why it cannot be written

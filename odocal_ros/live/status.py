@@ -56,7 +56,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'can_tell': ', '.join(now.ability.can) if now.ability else '',
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
-        'save_trouble': now.save_trouble,
+        'save_trouble': now.save_trouble, 'lost': now.lost,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
     return DiagnosticStatus(
@@ -73,7 +73,7 @@ def level(now: Situation) -> bytes:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
     doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
-                                or now.save_trouble)
+                                or now.save_trouble or now.lost)
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
@@ -97,7 +97,7 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (seen, good, text, *troubles)))
+    return '; '.join(filter(None, (seen, good, now.lost, text, *troubles)))
 
 
 def _reason_codes(now: Situation) -> str:

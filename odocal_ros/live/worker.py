@@ -4,7 +4,7 @@ from collections.abc import Callable
 import queue
 import threading
 
-GRACE_S = 2.0      # files take some 20 ms
+GRACE_S, FILES_S = 1.0, 4.0      # launch asks a second time, and harder, after 5 s
 
 
 class Worker:
@@ -12,15 +12,21 @@ class Worker:
     Runs jobs one after the other in a thread of its own.
 
     ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
-    the job itself ever runs beside the callbacks. A node told to end waits a moment for it, so
-    that result files just asked for are written, but not for a long computation.
+    the job itself ever runs beside the callbacks. A node told to end waits for result files just
+    asked for, report included, but not for a long computation.
     """
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue = queue.SimpleQueue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
+        self._at_work = False
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Return whether a job is under way or waits."""
+        return self._at_work or not self._jobs.empty()
 
     def submit(self, job: Callable[[], object],
                then: Callable[[object, Exception | None], None]) -> None:
@@ -33,15 +39,18 @@ class Worker:
             then, result, error = self._done.get()
             then(result, error)
 
-    def close(self) -> None:
-        """Let the thread end after the jobs it was given, waiting a moment for them."""
+    def close(self, grace_s: float = GRACE_S) -> bool:
+        """Let the thread end after the jobs it was given; return whether it has, in that time."""
         self._jobs.put(None)
-        self._thread.join(GRACE_S)
+        self._thread.join(grace_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
             job, then = entry
+            self._at_work = True
             try:
                 self._done.put((then, job(), None))
             except Exception as error:  # every failure of a job is an answer to the operator
                 self._done.put((then, None, error))
+            self._at_work = False

@@ -13,6 +13,7 @@ from pathlib import Path
 import sys
 
 from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.offline.say import say, warn
 from odocal_ros.output.figures import with_sigma
 
 LIMIT = 4.0     # sigmas: by chance in one of 16 000
@@ -108,9 +109,9 @@ def main(argv: list[str] | None = None) -> int:
         if not found or found[0].value is None:
             raise BadUsage(f'{argv[0]}: no scale factor to compare; see its reasons')
     except OdocalError as error:
-        print(f'against_truth: {error}', file=sys.stderr)
+        warn(f'against_truth: {error}')
         return 2
-    print(table(found))
+    say(table(found))
     return 0 if all(row.agrees for row in found) else 1
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.outside import one_line
 
 
 def once(paths: list[Path]) -> tuple[list[Path], list[Path]]:
@@ -67,6 +68,6 @@ def told_apart(paths: list[Path], legs: list[list], inputs: list[dict]):
     names = [entry['bag'] for entry in inputs]
     if len(set(names)) == len(names):
         return [leg for some in legs for leg in some], inputs
-    return ([replace(leg, bag=str(path)) for path, some in zip(paths, legs, strict=True)
+    return ([replace(leg, bag=one_line(path)) for path, some in zip(paths, legs, strict=True)
              for leg in some],
-            [entry | {'bag': str(path)} for path, entry in zip(paths, inputs, strict=True)])
+            [entry | {'bag': one_line(path)} for path, entry in zip(paths, inputs, strict=True)])

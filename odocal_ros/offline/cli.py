@@ -8,6 +8,7 @@ import tempfile
 
 from odocal_ros import __version__
 from odocal_ros.errors import OdocalError
+from odocal_ros.offline.say import warn
 
 COMMANDS = {
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
@@ -64,17 +65,17 @@ def main(argv=None) -> int:
         sys.stdout.flush()       # here, where a full disk can still be told
         return code
     except OdocalError as error:
-        print(f'odocal: {error}' if not isinstance(error, _Usage) else error, file=sys.stderr)
+        warn(str(error) if isinstance(error, _Usage) else f'odocal: {error}')
         return WRONG_USE
-    except KeyboardInterrupt:
-        print('odocal: interrupted, nothing written', file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
     except OSError as error:       # a full disk, a stream that went away
         what = error.filename or 'output'
-        print(f'odocal: {what}: {error.strerror or error}', file=sys.stderr)
+        warn(f'odocal: {what}: {error.strerror or error}')
         return WRONG_USE
     except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
         return _internal(error)
@@ -87,8 +88,8 @@ def _internal(error) -> int:
         f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n')
         traceback.print_exception(error, file=f)
     first = (str(error).splitlines() or [''])[0]
-    print(f'odocal: internal error ({type(error).__name__}: {first}); '
-          f'please report it with {f.name}', file=sys.stderr)
+    warn(f'odocal: internal error ({type(error).__name__}: {first}); '
+         f'please report it with {f.name}')
     return INTERNAL
 
 

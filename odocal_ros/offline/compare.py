@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 import sys
 
+from odocal_ros.offline.say import say
+
 HELP = 'change between calibrations against their sigmas'
 FINE = 1e-3      # relative change below which a scale's is said in ppm
 CAUSES = {
@@ -44,9 +46,9 @@ def run(args) -> int:
     if args.json:
         json.dump(as_json(stored, found, said, text, changed), sys.stdout, indent=2,
                   allow_nan=False)
-        print()
+        say('')
     else:
-        print('\n'.join(_screen(stored, found, said, text)))
+        say('\n'.join(_screen(stored, found, said, text)))
     return OK if changed is False else REJECTED
 
 

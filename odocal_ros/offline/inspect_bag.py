@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from odocal_ros.offline.say import say
+
 HELP = 'tell what a bag holds and what it lacks'
 SLOTS = ('imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')
 
@@ -35,5 +37,5 @@ def run(args) -> int:
     overrides = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
     with open_bag(Path(args.bag)) as bag:
         found = inspect(bag, args.bag, config, overrides)
-    print(json.dumps(found, indent=2, allow_nan=False) if args.json else text(found))
+    say(json.dumps(found, indent=2, allow_nan=False) if args.json else text(found))
     return 0

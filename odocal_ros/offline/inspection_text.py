@@ -3,6 +3,8 @@
 import math
 import textwrap
 
+from odocal_ros.outside import one_line
+
 WIDTH = 98
 QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
@@ -30,9 +32,10 @@ def _topics(found, roles) -> list[str]:
     kinds = max((len(_short(topic['type'])) for topic in found['topics']), default=0)
     lines = []
     for topic in found['topics']:
+        name, kind = one_line(topic['name']), one_line(_short(topic['type']))
         rate = f'{topic["rate_hz"]:8.2f} Hz' if topic['rate_hz'] and topic['count'] > 1 else ''
         role = f'<- {roles[topic["name"]]}' if topic['name'] in roles else ''
-        lines.append(f'  {topic["name"]:{wide}}  {_short(topic["type"]):{kinds}} '
+        lines.append(f'  {name:{wide}}  {kind:{kinds}} '
                      f'{topic["count"]:8d} {rate:11}  {role}'.rstrip())
     return ['topics', *lines]
 
@@ -48,7 +51,7 @@ def _details(topic, roles) -> list[str]:
         points.append(topic['trouble'])
     if topic['name'] not in roles and not any('odd:' in p for p in points):
         points = points[:2]      # of topics not used, a look is enough
-    return [topic['name'], *(line for point in points for line in _wrapped(point, 2))]
+    return [one_line(topic['name']), *(line for point in points for line in _wrapped(point, 2))]
 
 
 def _of_imu(topic):

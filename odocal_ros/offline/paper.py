@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.say import say
 
 HELP = 'reproduce tables 1-4 of the two-point paper'
 PICTURES = ('.png', '.svg', '.pdf')
@@ -27,12 +28,12 @@ def run(args) -> int:
         draw(tables, picture)
     if args.json:
         import json
-        print(json.dumps(tables.as_dict(), indent=2, allow_nan=False))
+        say(json.dumps(tables.as_dict(), indent=2, allow_nan=False))
     else:
         from odocal_ros.paper.text import text_of
-        print(text_of(tables), end='')
+        say(text_of(tables), end='')
         if picture is not None:
-            print(f'\n{picture}: the track and the growth of each error')
+            say(f'\n{picture}: the track and the growth of each error')
     return 0
 
 

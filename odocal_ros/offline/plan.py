@@ -6,6 +6,7 @@ from pathlib import Path
 import sys
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.say import say
 
 HELP = 'predicted sigmas of a drive not yet driven'
 NOISE = {'white': 0.0, 'correlated': 60.0}
@@ -62,9 +63,9 @@ def run(args) -> int:
     found = changes(drive, sigmas, before)
     if args.json:
         json.dump(as_json(before, sigmas, found), sys.stdout, indent=2, allow_nan=False)
-        print()
+        say('')
     else:
-        print(screen(before, sigmas, found))
+        say(screen(before, sigmas, found))
     return 0
 
 

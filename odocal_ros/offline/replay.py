@@ -9,6 +9,8 @@ import sys
 from textwrap import fill
 
 from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.offline.say import say, warn
+from odocal_ros.outside import one_line
 
 HELP = 'calibrate from recorded bags'
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
@@ -48,13 +50,14 @@ def run(args) -> int:
     from odocal_ros.offline.legs import EACH_STOP, parse_leg
     config = _config(args)
     asked = [text if text == EACH_STOP else parse_leg(text) for text in args.leg]
-    output = Path(args.output) if args.output else Path(f'odocal_{Path(args.bags[0]).stem}')
-    if (output / 'calibration.json').exists() and not args.force:
+    output = Path(args.output) if args.output else Path(
+        f'odocal_{one_line(Path(args.bags[0]).stem)}')
+    if (output / 'calibration.json').exists() and not args.force:     # said before the work
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
-    from odocal_ros.config import with_settings
     from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
     from odocal_ros.offline.journal import journal_notes
+    from odocal_ros.output.frames import framed
     from odocal_ros.pipeline import combine
     paths, again = once([Path(bag) for bag in args.bags])
     for path in again:
@@ -85,10 +88,8 @@ def run(args) -> int:
     if unlike := unlike_settings(configs):
         _tell(args, f'{", ".join(unlike)}: not the same in all journals; each leg is computed '
               f'with its own, limits and files are by those of {used[-1].name}')
-    if not config.frames.imu and imu_frame:
-        config = with_settings(config, {'frames.imu': imu_frame})
     legs, inputs = told_apart(used, legs, inputs)
-    calibration = combine(legs, config)
+    calibration, config = framed(combine(legs, config), config, imu_frame)
     return _report(calibration, config, inputs, output, args)
 
 
@@ -103,7 +104,7 @@ def _look(path, args) -> None:
 
 def _tell(args, note: str) -> None:
     if not args.quiet:
-        print(f'odocal: {note}', file=sys.stderr)
+        warn(f'odocal: {note}')
 
 
 def _config(args, journal=None):
@@ -152,13 +153,14 @@ def _legs_of(path, args, asked, config, journal, unit):
     quiet = args.quiet or args.json
     # the hash costs as long as reading the file: beside the decoding, which holds one core
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
+        name = one_line(bag.name)
         if journal:
             _tell(args, f'{bag.name} is a journal: settings and topics from {journal.path}; '
                   'options go before them')
         topics, readers = _readers(bag, args, config, journal)
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()
-        with Phase(f'reading {bag.name}', quiet) as phase:
+        with Phase(f'reading {name}', quiet) as phase:
             bag.read(readers, recorder.feed, phase)
         recorder.form = readers[topics['odometer']].form or recorder.form
         if recorder.form.scale_unit != (unit or recorder.form.scale_unit):
@@ -180,9 +182,9 @@ def _legs_of(path, args, asked, config, journal, unit):
         for note in bag.notes:
             if isinstance(note, str):
                 _tell(args, note)
-        results = _calibrated(recorder, spans, config, notes, bag.name, args)
-        with Phase(f'checksum of {bag.name}', quiet):
-            described = {'bag': bag.name, 'sha256': digest.result(), 'topics': topics}
+        results = _calibrated(recorder, spans, config, notes, name, args)
+        with Phase(f'checksum of {name}', quiet):
+            described = {'bag': name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
     return results, described, frame, recorder.form.scale_unit
 
@@ -219,9 +221,7 @@ def _size(stream) -> tuple[int, int | None]:
 def _report(calibration, config, inputs, output, args) -> int:
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.output.files import as_json, write_results
-    from odocal_ros.output.report import NAME as REPORT
-    from odocal_ros.output.summary import screen
+    from odocal_ros.output.files import as_json, said_when_interrupted, write_results
     from odocal_ros.output.worse import replacing, stored_in
     from odocal_ros.reasons import Verdict
     created = datetime.now(UTC).isoformat(timespec='seconds')
@@ -230,24 +230,32 @@ def _report(calibration, config, inputs, output, args) -> int:
     with Phase('writing the results', args.quiet or args.json):
         written = write_results(calibration, config, output, inputs, created, force=args.force,
                                 tell=troubles.append)
-    for trouble in troubles if not args.quiet else ():
-        print(f'odocal: {trouble}', file=sys.stderr)
-    worse = replacing(old, output)
-    if worse and not args.quiet:
-        print(f'odocal: {output}: a better calibration was replaced, as --force asks: {worse}',
-              file=sys.stderr)
-    if args.json:
-        json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
-        print()
-    elif not args.quiet:
-        columns, rows = _size(sys.stdout)
-        print(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
-        if args.holdout:
-            print('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
-        others = ', '.join(p.name for p in written if p.name != REPORT)
-        text = f'written: {output}/ ({others})'
-        print('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
-                           break_on_hyphens=False) if rows else text))
-        if output / REPORT in written and not troubles:
-            print(f'report:  {output / REPORT}')
+    try:
+        for trouble in troubles:
+            _tell(args, trouble)
+        if worse := replacing(old, output):
+            _tell(args, f'{output}: a better calibration was replaced, as --force asks: {worse}')
+        if args.json:
+            json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
+            say('')
+        elif not args.quiet:
+            _show(calibration, output, written, args, drawn=not troubles)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(said_when_interrupted(output)) from None
     return REJECTED if calibration.verdict is Verdict.REJECTED else OK
+
+
+def _show(calibration, output, written, args, drawn) -> None:
+    """Print the result and where it is."""
+    from odocal_ros.output.report import NAME as REPORT
+    from odocal_ros.output.summary import screen
+    columns, rows = _size(sys.stdout)
+    say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
+    if args.holdout:
+        say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
+    others = ', '.join(p.name for p in written if p.name != REPORT)
+    text = f'written: {output}/ ({others})'
+    say('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
+                     break_on_hyphens=False) if rows else text))
+    if output / REPORT in written and drawn:
+        say(f'report:  {output / REPORT}')

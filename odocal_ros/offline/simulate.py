@@ -3,10 +3,12 @@
 import argparse
 import math
 from pathlib import Path
-import shlex
 import sys
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.offline.say import say
+from odocal_ros.outside import for_comment, for_shell, one_line
+from odocal_ros.whole import uninterrupted, write_text
 
 HELP = 'write a bag with known truth'
 TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
@@ -169,15 +171,16 @@ def run(args) -> int:
     topics = drive_topics(drive)
     write_bag(out, topics, args.storage, args.compression, args.force, _progress(args.quiet))
     known = None if known is None else math.radians(known)
-    _write_yaml(beside[0], truth_entries(drive, out.name), f'Truth of {out.name}.')
-    _write_yaml(beside[1], {'/**/calibrator': {'ros__parameters': settings(drive, known)}},
-                f'What an operator of {out.name} would know.')
+    with uninterrupted():      # a bag is never without its truth
+        _write_yaml(beside[0], truth_entries(drive, out.name), f'Truth of {out.name}.')
+        _write_yaml(beside[1], {'/**/calibrator': {'ros__parameters': settings(drive, known)}},
+                    f'What an operator of {out.name} would know.')
     if not args.quiet:
         replay = ['odocal', 'replay', str(out), '--config', str(beside[1]),
                   *topic_arguments(drive)]
-        print(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
-              f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
-              f'{shlex.join(replay)}')
+        say(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
+            f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
+            f'{for_shell(replay)}')
     return 0
 
 
@@ -196,12 +199,9 @@ def _check_beside(path: Path, force: bool) -> None:
 def _write_yaml(path: Path, content: dict, title: str) -> None:
     """Write a file whole or not at all."""
     import yaml
-    part = path.with_name(f'.{path.name}.part')
     try:
-        part.write_text(f'# {title} {MADE_HERE}\n'
-                        + yaml.safe_dump(content, sort_keys=False, default_flow_style=None),
-                        encoding='utf-8')
-        part.replace(path)
+        write_text(path, for_comment(one_line(f'{title} {MADE_HERE}'))
+                   + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     except OSError as error:
         raise BadUsage(f'{path}: cannot write ({error.strerror}); the bag itself is '
                        'complete') from None

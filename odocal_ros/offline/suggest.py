@@ -1,11 +1,10 @@
 """Which topics a bag's inputs most likely are, and the replay command that says so."""
 
-import shlex
-
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.topics import candidates, choose_topics, named, OPTION, wanted
+from odocal_ros.outside import for_shell
 
 COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 
@@ -46,16 +45,16 @@ def command(path, topics, config, overrides, mapping, extra) -> str:
     """Return the replay that the findings suggest; '' where an input is missing."""
     if not {'imu', 'odometer', 'fix'} <= mapping.keys():
         return ''
-    words = ['odocal', 'replay', shlex.quote(path)]
+    words = ['odocal', 'replay', path]
     for slot, topic in mapping.items():
         others = {s: t for s, t in mapping.items() if s != slot}
         found = candidates(topics, slot, config, others) + [topic] * (topic not in candidates(
             topics, slot, config, others))
         if slot in overrides or len(found) > 1:
-            words += [OPTION[slot], shlex.quote(topic)]
+            words += [OPTION[slot], topic]
     if 'odometer_right' in mapping and 'odometer_right' not in overrides:
         extra = ['odometer.left=topic', 'odometer.right=topic', *extra]
     for option in extra:
         words += option.split(' ', 1) if option.startswith('--') else [
-            '--set', shlex.quote(option)]
-    return ' '.join(words)
+            '--set', option]
+    return for_shell(words)

@@ -5,8 +5,9 @@ from math import tau
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
-from odocal_ros.output.file_head import head, number
+from odocal_ros.output.file_head import head
 from odocal_ros.output.summary import known
+from odocal_ros.yaml_text import parameters
 
 CONTROLLERS = 'ros2_controllers.yaml'
 # controllers that take the radius itself, and their parameter for it
@@ -33,10 +34,8 @@ def controllers(calibration: Calibration, config: Config, content: dict) -> dict
              '# that the controller drives. The multipliers are against odometer.nominal_scale:',
              '# with others in force during the drive, multiply those by these.',
              '# Older releases name the radius rear_wheels_radius or rear_wheel_radius.']
-    for name, values in blocks.items():
-        lines += [f'{name}:', '  ros__parameters:',
-                  *(f'    {key}: {number(value)}' for key, value in values.items())]
-    return {CONTROLLERS: '\n'.join(lines) + '\n'}
+    text = '\n'.join(lines) + '\n'
+    return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
 
 
 def _multipliers(calibration, config) -> dict[str, float]:

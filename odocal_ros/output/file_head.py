@@ -1,23 +1,18 @@
-"""What stands at the top of every file that others load, and how numbers are written in them."""
-
-import math
+"""What stands at the top of every file that others load."""
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.summary import sentence
+from odocal_ros.outside import for_comment, one_line
 
 
 def head(calibration: Calibration, content: dict) -> str:
-    """Return comment lines: what made the file, when, from which bags, with which result."""
+    """Return ``about`` as comment lines."""
+    return for_comment(about(calibration, content))
+
+
+def about(calibration: Calibration, content: dict) -> str:
+    """Return two lines: what made the file, when, from which bags, and with which result."""
     bags = ', '.join(str(i['bag']) for i in content['inputs'] if i.get('bag')) or 'live'
-    lines = [f'{content["software"]}, {content["created"]}, {len(calibration.legs)} leg'
-             f'{"s" * (len(calibration.legs) != 1)}, from: {bags}', sentence(calibration)]
-    return ''.join(f'# {line}\n' for line in lines)
-
-
-def number(value: float | None) -> str:
-    """Return a double as YAML that every reader types as one: 1e-05 is text to YAML 1.1."""
-    if value is None or not math.isfinite(value):
-        return '.nan'
-    text = repr(float(value))
-    mantissa, e, exponent = text.partition('e')
-    return text if not e or '.' in mantissa else f'{mantissa}.0e{exponent}'
+    return (f'{content["software"]}, {content["created"]}, {len(calibration.legs)} leg'
+            f'{"s" * (len(calibration.legs) != 1)}, from: {one_line(bags)}\n'
+            f'{sentence(calibration)}')

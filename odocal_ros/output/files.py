@@ -1,15 +1,10 @@
-"""
-Result files: calibration.json (schema 1) and what other programs load.
+"""Result files: calibration.json (schema 1) and what other programs load."""
 
-A file is written whole or not at all: into a temporary one beside it, then renamed.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import json
 import math
-import os
 from pathlib import Path
-import uuid
 
 import numpy as np
 
@@ -18,6 +13,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResu
 from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
+from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
 from odocal_ros.output.track_table import overall
 
@@ -118,48 +114,70 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
     """
     Write the result files and return their paths, calibration.json first, the report last.
 
-    Files of formats that this result does not give are removed, so that a folder never holds
-    parts of two calibrations. ``tell`` is given a sentence when the report cannot be drawn.
+    ``tell`` is given a sentence when the report cannot be drawn.
 
     Raises
     ------
     BadUsage
         There is a calibration.json and no ``force``, or the folder cannot be written.
+    KeyboardInterrupt
+        Saying what was written, where something was.
 
     """
-    directory = Path(directory)
-    if (directory / MAIN).exists() and not force:
-        raise BadUsage(f'{directory / MAIN} exists; give another folder with --output, or '
-                       '--force to replace it')
-    content = as_json(calibration, config, inputs, created)
-    texts = {MAIN: json.dumps(content, indent=2, allow_nan=False) + '\n'}
-    texts |= ros_files.texts(calibration, config, content)
-    wanted = {REPORT} if 'report' in config.output.formats else set()
+    results = Results(calibration, config, directory, inputs, created)
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for name in (ros_files.NAMES | {REPORT}) - set(texts):
-            (directory / name).unlink(missing_ok=True)
-        for name in sorted(texts, key=MAIN.__eq__):     # the main file last: it vouches for all
-            write_whole(directory / name, texts[name])
-        if wanted:      # it takes a second to draw: the numbers are safe by then
-            page, why = report_or_why(calibration, config, content)
-            write_whole(directory / REPORT, page)
-            if why:
-                tell(f'{directory / REPORT}: not drawn: {why}')
-    except OSError as error:
-        raise BadUsage(f'{directory}: results cannot be written ({error.strerror}); choose a '
-                       'folder that can (--output, or output.directory of the node)') from None
-    return [directory / name for name in [*texts, *wanted]]
+        written = results.write(force)
+        if results.has_report:
+            if why := results.draw():
+                tell(f'{results.directory / REPORT}: not drawn: {why}')
+            written.append(results.directory / REPORT)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(said_when_interrupted(results.directory) if results.folder.written
+                                else '') from None
+    return written
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f'.{path.name}.{uuid.uuid4().hex}')
-    try:
-        with temporary.open('x', encoding='utf-8') as f:
-            f.write(text)
-            f.flush()
-            os.fsync(f.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+class Results:
+    """
+    The files of a calibration on their way to a folder, which is exchanged as a whole.
+
+    The report takes seconds to draw: it is added, and the numbers do not wait for it.
+    """
+
+    def __init__(self, calibration: Calibration, config: Config, directory: Path,
+                 inputs: list[dict], created: str) -> None:
+        self.directory = Path(directory)
+        self.has_report = 'report' in config.output.formats
+        self.folder = ResultFolder(self.directory, MAIN,
+                                   frozenset(ros_files.NAMES | {MAIN, REPORT}))
+        self._of = calibration, config, as_json(calibration, config, inputs, created)
+
+    def write(self, force: bool = False) -> list[Path]:
+        """Write all but the report; return the paths."""
+        texts = {MAIN: json.dumps(self._of[2], indent=2, allow_nan=False) + '\n'}
+        texts |= ros_files.texts(*self._of)
+        with self._said():
+            self.folder.put(texts, force)
+        return [self.directory / name for name in texts]
+
+    def draw(self) -> str:
+        """Add the report; return why it could not be drawn, which it then says itself."""
+        page, why = report_or_why(*self._of)
+        with self._said():
+            self.folder.add(REPORT, page)
+        return why
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise BadUsage(
+                f'{self.directory}: results cannot be written ({error.strerror}); choose a folder '
+                'that can (--output, or output.directory of the node)') from None
+
+
+def said_when_interrupted(directory: Path) -> str:
+    """Return what an interrupted command has left where it had written its result."""
+    report = (directory / REPORT).exists()
+    return f'the results are in {directory}/' + ('' if report else f', {REPORT} is not')

@@ -14,7 +14,8 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output.summary import sentence
 
 TRACK = 'track.geojson'
-MOST = 5000          # points of a feature: maps draw no more, and files stay small
+MOST = 5000          # points of a feature: maps draw no more
+MOST_OF_ALL = 150_000        # of a file: it stays small however many legs there are
 ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
          'values found; as_configured: with the values before; fixes: of the receiver; both '
          'tracks begin at the start mark')
@@ -23,8 +24,9 @@ PLACES, HEIGHT_PLACES = 8, 3     # 1e-8 deg: 1 mm
 
 def geojson(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
     """Return the file by name, nothing when no leg has a track."""
+    most = max(2, min(MOST, MOST_OF_ALL // (3 * max(1, len(calibration.legs)))))
     features = [feature for n, leg in enumerate(calibration.legs, 1)
-                for feature in _features(n, leg)]
+                for feature in _features(n, leg, most)]
     if not features:
         return {}
     whole = {'type': 'FeatureCollection', 'name': 'odocal', 'about': ABOUT,
@@ -33,18 +35,18 @@ def geojson(calibration: Calibration, config: Config, content: dict) -> dict[str
     return {TRACK: json.dumps(whole, allow_nan=False, ensure_ascii=False) + '\n'}
 
 
-def _features(number: int, leg: LegResult) -> list[dict]:
+def _features(number: int, leg: LegResult, most: int) -> list[dict]:
     if leg.origin is None:
         return []
     out = []
     for name, rows, make in (('corrected', leg.track_n, _line),
                              ('as_configured', leg.track_before_n, _line),
                              ('fixes', leg.reference_n, _points)):
-        positions = _positions(rows, leg)
+        positions = _positions(rows, leg, most)
         if len(positions):
             out.append(_feature(make(positions), number, leg, name,
                                 {'points': len(positions), 'of': len(rows)}))
-    track = _positions(leg.track_n, leg)
+    track = _positions(leg.track_n, leg, most)
     if len(track):
         for name, row, stamp_ns in (('start', 0, leg.start_ns), ('stop', -1, leg.stop_ns)):
             point = {'type': 'Point', 'coordinates': track[row].tolist()}
@@ -58,11 +60,11 @@ def _feature(geometry, number, leg, kind, more):
                            'verdict': leg.verdict.value} | more}
 
 
-def _positions(rows_n, leg) -> np.ndarray:
+def _positions(rows_n, leg, most) -> np.ndarray:
     """Return rows of n, m, as (k, 2 or 3) longitude, latitude, deg, and height, m, if known."""
     if rows_n is None or not len(rows_n):
         return np.empty((0, 3))
-    few = np.linspace(0, len(rows_n) - 1, min(len(rows_n), MOST)).round().astype(int)
+    few = np.linspace(0, len(rows_n) - 1, min(len(rows_n), most)).round().astype(int)
     rows_n = np.array(rows_n, dtype=float)[few]
     rows_n = rows_n[np.isfinite(rows_n[:, :2]).all(axis=1)]
     level = np.isnan(rows_n[:, 2]).any()

@@ -8,6 +8,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output.summary import known
+from odocal_ros.outside import for_table
 
 LEGS = 'legs.csv'
 SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',
@@ -30,7 +31,7 @@ def leg_table(calibration: Calibration, config: Config, content: dict) -> dict[s
 def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
     """Return a row; what a leg does not know is an empty cell."""
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
-    row = {'leg': number, 'bag': leg.bag, 'start [UTC]': _iso(leg.start_ns),
+    row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': _iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,
            'imu_samples': leg.imu_samples, 'pulses': leg.pulses, 'fixes': leg.fixes,

@@ -1,6 +1,7 @@
 """Texts of the files that other programs load unchanged."""
 
-from xml.sax.saxutils import quoteattr
+import re
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -8,10 +9,13 @@ from odocal_ros.calib.result import BESIDE, Calibration
 from odocal_ros.config import Config
 from odocal_ros.output.controller_files import CONTROLLERS, controllers
 from odocal_ros.output.device_files import DEVICES, devices
-from odocal_ros.output.file_head import head, number
+from odocal_ros.output.file_head import about, head
+from odocal_ros.output.frames import IMU_FRAME
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.leg_table import leg_table, LEGS
+from odocal_ros.outside import for_comment, for_launch, for_shell, for_xml_comment
 from odocal_ros.reasons import Verdict
+from odocal_ros.yaml_text import parameters
 
 PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
@@ -20,7 +24,6 @@ LAUNCH, URDF, COMMAND = ('imu_transform.launch.xml', 'imu_transform.urdf', 'imu_
 NAMES = {PARAMS, VELOCITY, IMU, LAUNCH, URDF, COMMAND, CONTROLLERS, DEVICES, TRACK, LEGS}
 # declared by the node for every drive; of one wheel they stay unknown
 TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width')
-IMU_FRAME = 'imu_link'      # REP-145, where frames.imu is left empty
 AXES = 'xyz'
 
 
@@ -44,21 +47,18 @@ def texts(calibration: Calibration, config: Config, content: dict) -> dict[str, 
 
 
 def _params(calibration, content) -> str:
-    lines = [head(calibration, content).rstrip(),
-             '# for the node calibrator: --params-file, or ros2 param load',
-             '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)',
-             '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
-             'points left of forward',
-             '/**:', '  ros__parameters:', '    result:']
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
+    result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
         if name not in BESIDE:
-            lines += [f'      {name}: {number(entry["value"])}',
-                      f'      {name}_sigma: {number(entry["sigma"])}']
-    valid = calibration.verdict is not Verdict.REJECTED
-    lines += [f'      legs: {len(calibration.legs)}', f'      valid: {str(valid).lower()}',
-              f"      stamp: '{content['created']}'"]
-    return '\n'.join(lines) + '\n'
+            result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}
+    result |= {'legs': len(calibration.legs),
+               'valid': calibration.verdict is not Verdict.REJECTED, 'stamp': content['created']}
+    return (head(calibration, content)
+            + '# for the node calibrator: --params-file, or ros2 param load\n'
+            '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)\n'
+            '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
+            'points left of forward\n' + parameters({'result': result}))
 
 
 def _autoware(calibration, config, content) -> dict[str, str]:
@@ -82,12 +82,9 @@ def _speed_factor(calibration) -> float | None:
 
 def _velocity_converter(factor, frame) -> str:
     return ('# for autoware vehicle_velocity_converter, in place of its param file of this name;\n'
-            '# the two stddev are its defaults, not measured here\n'
-            '/**:\n  ros__parameters:\n'
-            f'    speed_scale_factor: {number(factor)}\n'
-            '    velocity_stddev_xx: 0.2\n'
-            '    angular_velocity_stddev_zz: 0.1\n'
-            f'    frame_id: {frame}\n')
+            '# the two stddev are its defaults, not measured here\n' + parameters({
+                'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
+                'angular_velocity_stddev_zz': 0.1, 'frame_id': frame}))
 
 
 def _gyro_bias_i(calibration, config):
@@ -100,13 +97,11 @@ def _gyro_bias_i(calibration, config):
 
 
 def _imu_corrector(bias_i) -> str:
-    lines = ['# for autoware imu_corrector, in place of its param file of this name;',
-             '# the stddev are its defaults, not measured here',
-             '/**:', '  ros__parameters:']
-    lines += [f'    angular_velocity_offset_{axis}: {number(b)}'
-              for axis, b in zip(AXES, bias_i, strict=True)]
-    lines += [f'    angular_velocity_stddev_{axis}{axis}: 0.03' for axis in AXES]
-    return '\n'.join(lines) + '\n'
+    offsets = {f'angular_velocity_offset_{axis}': float(b)
+               for axis, b in zip(AXES, bias_i, strict=True)}
+    return ('# for autoware imu_corrector, in place of its param file of this name;\n'
+            '# the stddev are its defaults, not measured here\n' + parameters(
+                offsets | {f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}))
 
 
 def _transform(calibration, config, content) -> dict[str, str]:
@@ -115,25 +110,35 @@ def _transform(calibration, config, content) -> dict[str, str]:
     xyz = [repr(float(v)) for v in config.imu.lever_arm]
     rpy = [repr(float(v)) for v in calibration.imu_rotation_rpy]
     base, imu = config.frames.base, config.frames.imu or IMU_FRAME
-    options = ' '.join([*(f'--{a} {v}' for a, v in zip(AXES, xyz, strict=True)),
-                        *(f'--{a} {v}' for a, v in zip(('roll', 'pitch', 'yaw'), rpy,
-                                                       strict=True)),
-                        f'--frame-id {base}', f'--child-frame-id {imu}'])
-    note = head(calibration, content).replace('# ', '').replace('--', '-').strip()
-    urdf = (f'<!-- put into your URDF in place of the joint that carries the IMU\n{note} -->\n'
-            f'<joint name={quoteattr(f"{base}_to_{imu}")} type="fixed">\n'
-            f'  <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>\n'
-            f'  <parent link={quoteattr(base)}/>\n  <child link={quoteattr(imu)}/>\n</joint>\n')
-    launch = ('<?xml version="1.0"?>\n'
-              f'<!-- include it in the launch file of your vehicle\n{note} -->\n<launch>\n'
-              f'  <node pkg="tf2_ros" exec="static_transform_publisher" name='
-              f'{quoteattr(f"{base}_to_{imu}")}\n        args={quoteattr(options)}/>\n</launch>\n')
-    command = (head(calibration, content)
-               + f'# The attitude of {imu} on {base}. robot_localization takes it from TF, which '
-               'this command publishes;\n'
-               '# it is not the yaw_offset of navsat_transform, which corrects a compass.\n'
-               f'ros2 run tf2_ros static_transform_publisher {options}\n')
-    return {LAUNCH: launch, URDF: urdf, COMMAND: command}
+    name = re.sub(r'\W', '_', f'{base}_to_{imu}')        # a node's name has no / . -
+    words = [word for option, value in zip((*AXES, 'roll', 'pitch', 'yaw'), (*xyz, *rpy),
+                                           strict=True) for word in (f'--{option}', value)]
+    words += ['--frame-id', base, '--child-frame-id', imu]
+    joint = ElementTree.Element('joint', name=name, type='fixed')
+    ElementTree.SubElement(joint, 'origin', xyz=' '.join(xyz), rpy=' '.join(rpy))
+    ElementTree.SubElement(joint, 'parent', link=base)
+    ElementTree.SubElement(joint, 'child', link=imu)
+    launch = ElementTree.Element('launch')
+    ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
+                           name=name, args=for_launch(words))
+    told = about(calibration, content)
+    command = (for_comment(
+        f'{told}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
+        'this command publishes;\n'
+        'it is not the yaw_offset of navsat_transform, which corrects a compass.')
+        + f'ros2 run tf2_ros static_transform_publisher {for_shell(words)}\n')
+    return {LAUNCH: '<?xml version="1.0"?>\n' + _xml(
+                launch, f'include it in the launch file of your vehicle\n{told}'),
+            URDF: _xml(joint, f'put into your URDF in place of the joint that carries the IMU\n'
+                              f'{told}'),
+            COMMAND: command}
+
+
+def _xml(root, note: str) -> str:
+    """Return an element as text after a comment."""
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding='unicode')
+    return f'<!-- {for_xml_comment(note)} -->\n{text}\n'
 
 
 MAKERS = {'autoware': _autoware, 'transform': _transform, 'ros2_control': controllers,

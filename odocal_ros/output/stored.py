@@ -110,13 +110,21 @@ def _estimate(entry, key) -> Estimate:
     if not isinstance(entry, dict) or not {'value', 'sigma', 'unit'} <= set(entry):
         raise ValueError(f'result.{key} lacks value, sigma or unit')
     value, sigma = (_number(entry[part], f'result.{key}.{part}') for part in ('value', 'sigma'))
-    if sigma is not None and sigma < 0:
-        raise ValueError(f'result.{key}.sigma is negative')
-    if key.startswith('scale_') and value is not None and value <= 0:
-        raise ValueError(f'result.{key}.value is not positive')
+    check_estimate(key, value, sigma)
     if entry['unit'] is not None and not isinstance(entry['unit'], str):
         raise ValueError(f'result.{key}.unit is no text')
     return Estimate(value, sigma, entry['unit'] or '', str(entry.get('method') or ''))
+
+
+def check_estimate(name: str, value: float | None, sigma: float | None) -> None:
+    """Raise ValueError where no calibration gives such a value, wherever it was kept."""
+    for part, number in (('value', value), ('sigma', sigma)):
+        if number is not None and not math.isfinite(number):
+            raise ValueError(f'result.{name}: its {part} is not finite')
+    if sigma is not None and sigma < 0:
+        raise ValueError(f'result.{name}: its sigma is negative')
+    if name.startswith(('scale_', 'track_width')) and value is not None and value <= 0:
+        raise ValueError(f'result.{name}: its value is not positive')
 
 
 def _number(value, what) -> float | None:

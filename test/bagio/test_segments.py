@@ -2,7 +2,6 @@
 
 import errno
 import os
-from pathlib import Path
 import struct
 import zlib
 
@@ -18,6 +17,7 @@ from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.recover import Channel
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.errors import BadBag
+from odocal_ros.whole import PART
 
 T0 = ros_bags.T0
 CHANNELS = {
@@ -113,7 +113,7 @@ def test_the_index_of_a_chunk_points_at_its_messages(monkeypatch, zstd):
 
 def test_a_growing_bag_is_read_at_any_moment(tmp_path):
     bag, messages = grown(tmp_path / 'leg', 4)
-    (bag.folder / f'.{part_name(4, 4)}{chunks.PART}').write_bytes(b'being written')
+    (bag.folder / f'.{part_name(4, 4)}{PART}').write_bytes(b'being written')
     assert read(bag.folder) == messages
     assert sorted(p.name for p in bag.folder.glob('*.mcap')) == [
         part_name(k, k) for k in range(4)]
@@ -159,7 +159,7 @@ def steps(monkeypatch):
                 return change(*args, **kwargs)
             return act
         for name in ('rename', 'unlink'):
-            monkeypatch.setattr(Path, name, counted(getattr(Path, name)))
+            monkeypatch.setattr(os, name, counted(getattr(os, name)))
     return allow
 
 
@@ -192,13 +192,13 @@ def test_a_full_disk_leaves_what_was_written(tmp_path, monkeypatch):
 
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(chunks.os, 'fsync', full)
+    monkeypatch.setattr(os, 'fsync', full)
     with pytest.raises(OSError, match='No space left'):
         bag.append(second(3)[0])
     with pytest.raises(OSError, match='No space left'):
         bag.finish()
     assert read(bag.folder) == messages
-    assert not list(bag.folder.glob(f'.*{chunks.PART}'))
+    assert not list(bag.folder.glob(f'.*{PART}'))
     monkeypatch.undo()
     bag.append(second(3)[0])
     bag.finish()

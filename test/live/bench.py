@@ -17,13 +17,17 @@ PATIENCE = 20.0   # s, for one event; only a failing test waits so long
 
 
 class NodeProcess:
-    """The node as a process of its own; what it prints is kept."""
+    """
+    The node as a process of its own; what it prints is kept.
 
-    def __init__(self, *args: str, env: dict | None = None) -> None:
+    before : Python that runs before the node does.
+    """
+
+    def __init__(self, *args: str, env: dict | None = None, before: str = '') -> None:
         paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))
         self.process = subprocess.Popen(
-            [*NODE, '--ros-args', *args] if args else NODE, text=True, bufsize=1,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            [*NODE[:2], before + NODE[2], *(('--ros-args', *args) if args else ())], text=True,
+            bufsize=1, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             env=os.environ | {'PYTHONPATH': paths} | (env or {}))
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -15,6 +15,7 @@ from odocal_ros.offline.cli import main
 from odocal_ros.offline.legs import marked_legs
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
+SCALE = 1.02      # true
 SPEED = 10.0      # times real time: 760 messages a second
 BEFORE_S, START_S, LAST_S = 30.0, 60.0, 170.0    # of the drive: played from, marked, played to
 
@@ -37,7 +38,7 @@ def drive():
     """Return types and messages of a drive that starts at 60 s."""
     return messages_of(simulate(SimOptions(
         scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=21.0, fix_rate=5.0,
-        odometer='speed', fix_noise='rtk')))
+        odometer='speed', fix_noise='rtk', scale=SCALE)))
 
 
 def killed(driven, moment_s: float, folder: Path) -> Remains:
@@ -83,3 +84,65 @@ def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
         code = main(['replay', str(journal), *more, '--json', '--force', '--output',
                      str(journal.parent.parent / 'replayed')])
     return code, json.loads(out.getvalue()) if out.getvalue() else None, said.getvalue()
+
+
+@dataclass(frozen=True)
+class Files:
+    """What a node that was killed at its files has left of results."""
+
+    whole: list            # calibration.json of each result folder that has one
+    half: list             # folders with files of a result, and no calibration.json or another's
+    latest: bool           # points at a whole one, or is not there
+    journal: tuple         # code, calibration.json and words of a replay of the journal
+
+
+def killed_at_files(driven, stage: str, moment_s: float, folder: Path) -> Files:
+    """Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage)."""
+    types, sent = driven
+    node, client = NodeProcess('-p', f'output.directory:={folder}'), Client()
+    try:
+        player = Player(client.node, types)
+        wait_for(player.matched, 'subscriptions')
+        player.play(part(sent, BEFORE_S, START_S), 3 * SPEED)
+        client.until(state='idle')
+        client.start()
+        player.play(part(sent, START_S, LAST_S), 3 * SPEED)
+        asked, begin = client.ask('stop_leg'), time.monotonic()
+        player.play(part(sent, LAST_S, LAST_S + 2), 3 * SPEED)
+        if stage == 'save':
+            wait_for(asked.done, 'the result')
+            client.ask('save')
+            begin = time.monotonic()
+        time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))
+        node.process.kill()
+        node.wait()
+    finally:
+        node.end()
+        client.close()
+    journal, = (folder / 'journal').iterdir()
+    results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
+               and path.name != 'journal' and not path.name.startswith('.')]
+    contents = {path: _content(path) for path in results}
+    latest = folder / 'latest'
+    return Files([c for c in contents.values() if c],
+                 [path for path, c in contents.items() if c is None and any(path.iterdir())],
+                 not latest.is_symlink() or bool(_content(latest)), replayed(journal))
+
+
+def wrong(left: Files) -> list[float]:
+    """Return by how many sigmas values that were not rejected miss the truth, where too many."""
+    off = [abs(scale['value'] - SCALE) / scale['sigma']
+           for one in (*left.whole, left.journal[1]) if one and one['verdict'] != 'rejected'
+           for scale in [one['result']['scale_factor']]]
+    return [sigmas for sigmas in off if sigmas > 5]
+
+
+def _content(folder: Path) -> dict | None:
+    """Return calibration.json where all that stands beside it is of the same calibration."""
+    try:
+        content = json.loads((folder / 'calibration.json').read_text())
+    except FileNotFoundError:
+        return None
+    others = [p for p in folder.iterdir() if p.suffix in ('.yaml', '.txt', '.xml', '.urdf')]
+    same = all(content['created'] in path.read_text() for path in others)
+    return content if same and (folder / 'calibration.yaml') in others else None

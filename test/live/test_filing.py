@@ -1,5 +1,6 @@
 """The answer of ~/save, and what it takes to put a worse result in the place of a good one."""
 
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -85,3 +86,24 @@ def test_a_warning_holds_for_its_own_result_only(save):
     save(BAD)
     other = Calibration(BAD.reasons, {}, {}, ())
     assert not save(other)[1]
+
+
+def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(tmp_path, monkeypatch):
+    gate, worker, done = threading.Event(), Worker(), []
+    monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: (
+        gate.wait(20), ('<html></html>', ''))[1])
+    filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=done.append),
+                    lambda: None)
+    config = with_settings(Config(), {'output.directory': str(tmp_path)})
+    future = filing.save(GOOD, config, {}, 'imu_link', NOW_NS, True)
+    wait_for(lambda: worker.poll() or future.done(), 'the answer')
+    assert (tmp_path / 'latest' / 'calibration.json').exists()
+    assert not (tmp_path / 'latest' / 'report.html').exists()
+    worker.submit(lambda: 'a leg', lambda result, error: done.append(result))
+    wait_for(lambda: worker.poll() or done, 'the leg')
+    assert filing.busy
+    assert not filing.close(0.05)
+    gate.set()
+    wait_for((tmp_path / 'latest' / 'report.html').exists, 'the report')
+    assert done == ['a leg']
+    worker.close()

@@ -74,6 +74,29 @@ def test_one_stale_stamp_is_no_jump_of_time_a_block_of_them_is():
     assert (health.jumped_back, health.newest_ns) == (False, int(2.2 * SECOND))
 
 
+def test_a_jump_within_a_block_is_seen_however_it_is_cut():
+    stamps = [*np.arange(20.0, 21.0, 0.1), *np.arange(5.0, 6.0, 0.1)]
+    for cut in range(1, len(stamps)):
+        health = Health()
+        health.decoded(rows([19.9]))
+        health.decoded(rows(stamps[:cut]))
+        health.decoded(rows(stamps[cut:]))
+        assert health.jumped_back, cut
+
+
+def test_a_wild_stamp_within_a_block_is_no_jump():
+    stamps = np.arange(20.0, 22.0, 0.1)
+    for at in range(1, 19):
+        for wild in (-15.0, 1e6):
+            health, some = Health(), stamps.copy()
+            some[at] += wild
+            health.decoded(rows([19.9]))
+            health.decoded(rows(some))
+            health.decoded(rows([22.0]))
+            assert not health.jumped_back, (at, wild)
+            assert health.newest_ns == 22 * SECOND
+
+
 def test_zero_stamps_do_not_count_as_flowing():
     health = Health()
     health.arrived([1], now_ns=SECOND)

@@ -206,7 +206,7 @@ def test_definitions_are_those_of_the_message_types(msgtype):
     assert rclpy
     from rosbags.typesys import get_types_from_msg
 
-    from odocal_ros.live.inputs import message_class
+    from odocal_ros.live.definitions import message_class
     found = get_types_from_msg(definition_of(message_class(msgtype)), msgtype)
     known = make.store().fielddefs
     assert msgtype in found

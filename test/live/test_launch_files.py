@@ -57,6 +57,7 @@ def test_an_empty_method_leaves_the_one_of_the_file():
 @pytest.mark.parametrize(('read', 'path'), [(of_python, PYTHON), (of_xml, XML)],
                          ids=['python', 'xml'])
 def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, read, path):
+    from odocal_ros.live.definitions import message_class
     import odocal_ros.live.inputs as inputs
     mine = tmp_path / 'mine.yaml'
     mine.write_text(yaml.safe_dump({'/**/calibrator': {'ros__parameters': {
@@ -72,7 +73,7 @@ def test_the_node_started_so_listens_where_it_is_told(start, connect, tmp_path, 
              '/truck/right': 'std_msgs/msg/Int64', '/truck/gps/fix': inputs.FIX,
              '/a/speed': inputs.VELOCITY[0], '/truck/compass': inputs.IMU}
     for name, kind in names.items():
-        client.node.create_publisher(inputs.message_class(kind), name, 10)
+        client.node.create_publisher(message_class(kind), name, 10)
     for name in names:
         wait_for(lambda name=name: client.node.count_subscribers(name), f'a subscriber of {name}')
     assert client.get('method', 'use_sim_time') == ['two_point', False]

@@ -67,7 +67,21 @@ def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments,
     ('method:=magic', "method: 'magic' is not one of auto, two_point"),
     ('odometer.type:=no_msgs/msg/Such', "'no_msgs/msg/Such' cannot be imported here"),
     ('result.valid:=7', 'result.valid: 7 is not of type bool'),
-    ('qos_overrides./imu/data.subscription.depth:=x', "'x' of type 'STRING'"),
+    ('result.scale_factor:=-0.5', 'result.scale_factor: its value is not positive; take the file'),
+    ('result.scale_factor_sigma:=-1.0', 'result.scale_factor: its sigma is negative'),
+    ('result.yaw_mounting_angle:=.inf', 'result.yaw_mounting_angle: its value is not finite'),
+    ('result.track_width:=0.0', 'result.track_width: its value is not positive'),
+    ('result.legs:=-5', 'result.legs: -5 is no number of legs'),
+    ('result.stamp:="a\\eb"', 'is no date'),
+    ('frames.base:=$(x)', 'frames.base: '),
+    ('use_sim_time:=abc', 'use_sim_time'),
+    ('qos_overrides./imu/data.subscription.reliability:=often', 'qos_overrides'),
+    ('qos_overrides./fix.subscription.history:=7', 'qos_overrides'),
+    ('qos_overrides./imu/data.subscription.depth:=-3', 'qos_overrides'),
+    ('start_type_description_service:=7', 'start_type_description_service'),
+    ('qos_overrides./odometer.subscription.depth:=x', 'qos_overrides'),
+    ('qos_overrides./odometer.subscription.reliability:=often', 'qos_overrides'),
+    ('qos_overrides./imu/data.subscription.depth:=x', "'x' is not a whole number"),
     ('leg.min_distance', "Couldn't parse parameter override rule"),
 ])
 def test_a_bad_override_is_one_line_and_exit_1(domain, override, words):
@@ -76,6 +90,7 @@ def test_a_bad_override_is_one_line_and_exit_1(domain, override, words):
     line, = node.lines
     assert line.startswith('calibrator: ')
     assert words in line
+    assert 'internal' not in line
 
 
 def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
@@ -101,10 +116,14 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
 
 
 def test_a_parameter_that_does_not_exist_is_named(start, connect):
-    node = start('-p', 'leg.min_distanse:=3.0', '-p', 'somebody.elses:=1')
+    node = start('-p', 'leg.min_distanse:=3.0', '-p', 'somebody.elses:=1', '-p', 'imu.colour:=red',
+                 '-p', 'result.gyro_bias_x:=1.0')
     connect().until(state='waiting')
     assert 'no parameter leg.min_distanse: did you mean leg.min_distance?' in node.text
+    assert 'no parameter imu.colour. It is not taken.' in node.text
     assert 'somebody' not in node.text
+    assert 'gyro_bias' not in node.text
+    assert node.text.count('WARN') == 2
 
 
 def test_messages_that_cannot_be_read_are_said(start, connect):

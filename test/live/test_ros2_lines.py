@@ -12,7 +12,7 @@ from player import messages_of, part, Player
 import pytest
 from test_shown_names import has_field, INPUT_TYPES
 
-from odocal_ros.live.inputs import message_class
+from odocal_ros.live.definitions import message_class
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LINES = [(page, shlex.split(line)) for page, line in all_commands('ros2')]

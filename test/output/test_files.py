@@ -9,7 +9,7 @@ from odocal_ros import __version__
 from odocal_ros.config import Config, SETTINGS, with_settings
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import files
-from odocal_ros.output.files import as_json, write_results, write_whole
+from odocal_ros.output.files import as_json, write_results
 
 CREATED = '2026-01-02T03:04:05+00:00'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
@@ -115,37 +115,3 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(good, tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(BadUsage, match='results cannot be written'):
         write_results(good, Config(), tmp_path / 'file' / 'out', INPUTS, CREATED)
-
-
-def test_a_write_that_breaks_off_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch):
-    path = tmp_path / 'a.json'
-    write_whole(path, 'old')
-
-    def full(fd):
-        raise OSError(28, 'No space left on device')
-
-    monkeypatch.setattr(files.os, 'fsync', full)
-    with pytest.raises(OSError, match='No space'):
-        write_whole(path, 'new')
-    assert path.read_text() == 'old'
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_reader_of_the_old_file_reads_it_to_its_end(tmp_path):
-    path = tmp_path / 'a.json'
-    write_whole(path, 'old and whole')
-    with path.open() as reader:
-        write_whole(path, 'new')
-        assert reader.read() == 'old and whole'
-    assert path.read_text() == 'new'
-
-
-def test_the_main_file_comes_after_all_that_it_vouches_for(good, tmp_path, monkeypatch):
-    order = []
-    whole = write_whole
-    monkeypatch.setattr(files, 'write_whole',
-                        lambda path, text: (order.append(path.name), whole(path, text)))
-    write_results(good, Config(), tmp_path, INPUTS, CREATED)
-    # the report takes a second to draw: nothing waits for it
-    assert order[-2:] == ['calibration.json', 'report.html']
-    assert len(order) > 4

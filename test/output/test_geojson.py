@@ -11,7 +11,7 @@ import pytest
 from odocal_ros.config import Config
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output.files import as_json
-from odocal_ros.output.geojson import geojson, MOST
+from odocal_ros.output.geojson import geojson, MOST, TRACK
 from odocal_ros.output.leg_table import leg_table
 
 CREATED = '2026-01-02T03:04:05+00:00'
@@ -144,3 +144,13 @@ def test_the_table_gives_each_value_by_the_method_that_the_whole_takes(good):
     row, = rows_of(replace(good, legs=(both,), estimates=estimates))
     assert float(row['yaw_mounting_angle [rad]']) == 0.5
     assert float(row['scale_factor [m/pulse]']) == 0.05
+
+
+def test_a_file_of_many_legs_stays_small(good):
+    leg = replace(good.legs[0], origin=(0.7, 0.2, 100.0), track_n=np.zeros((MOST, 3)),
+                  track_before_n=np.zeros((MOST, 3)), reference_n=np.zeros((MOST, 3)))
+    sizes = []
+    for count in (10, 100):
+        whole = replace(good, legs=(leg,) * count)
+        sizes.append(len(geojson(whole, Config(), {'software': '', 'created': ''})[TRACK]))
+    assert sizes[1] < 1.3 * sizes[0]

@@ -204,7 +204,7 @@ def test_evidence_of_next_to_nothing_renders_too(good, rows):
 def test_names_from_outside_are_text_not_markup(good):
     evil = '<script>alert("x")</script>&amp;\'--><b>'
     inputs = [{'bag': evil, 'sha256': 'cd' * 32, 'topics': {'imu': f'/{evil}'}}]
-    config = with_settings(Config(), {'frames.base': evil, 'imu.grade': 'tactical'})
+    config = with_settings(Config(), {'odometer.field': evil, 'imu.grade': 'tactical'})
     page, text, parsed = page_of(drawn(good, bag=evil), config, inputs)
     assert parsed.tags['script'] == 0
     assert unescape('&lt;script&gt;alert("x")') in text

@@ -12,6 +12,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.config import Config, with_settings
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
+from odocal_ros.yaml_text import number
 
 CREATED = '2026-01-02T03:04:05+00:00'
 
@@ -108,11 +109,11 @@ def test_every_file_written_is_known_for_removal(good):
 
 @pytest.mark.parametrize('value', [1e-5, 1e22, -3e-7, 0.1, 0.0, 1.0, -123456.789])
 def test_numbers_stay_doubles_for_every_yaml_reader(value):
-    text = ros_files.number(value)
+    text = number(value)
     assert yaml.safe_load(text) == value
     assert isinstance(yaml.safe_load(text), float)
     assert re.search(r'[.]', text)
 
 
 def test_what_is_not_known_is_nan_in_parameter_files():
-    assert ros_files.number(None) == ros_files.number(math.inf) == '.nan'
+    assert number(None) == number(math.inf) == '.nan'

@@ -1,0 +1,163 @@
+"""
+A result folder: exchanged as a whole, so that it never holds parts of two calibrations.
+
+Files are written into a sibling, and one rename puts it in the place of the folder. Where that
+cannot be (a mount, a folder that holds other things too), files are exchanged one by one, the
+main file taken away first and put there last: it vouches for the others.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, ExitStack, suppress
+import ctypes
+import errno
+import os
+from pathlib import Path
+import re
+import shutil
+import uuid
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.whole import disk, locked, PART, sync_folder, uninterrupted, write_text
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+NOT_BY_RENAME = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
+ASIDE = '.old'
+LEFT = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?')
+
+
+class ResultFolder:
+    """
+    The folder at a place.
+
+    main : the file that makes a folder a result.   ours : all that a result may have.
+    """
+
+    def __init__(self, place: Path, main: str, ours: frozenset[str]) -> None:
+        self.place = Path(os.path.realpath(place))
+        self._main, self._ours = main, ours
+        self._main_file: tuple = ()       # which file the one put there is
+
+    @property
+    def written(self) -> bool:
+        """Return whether what stands there is what was put there."""
+        with suppress(OSError):
+            return self._main_file == _which(self.place / self._main)
+        return False
+
+    def put(self, texts: Mapping[str, str], force: bool) -> None:
+        """
+        Put a result there, or leave all as it was.
+
+        Raises
+        ------
+        BadUsage
+            There is one and no ``force``.
+        OSError
+            It cannot be written.
+
+        """
+        self.place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with self._sibling(self.place.parent, texts) as new:
+                if self._exchangeable():
+                    self._exchange(new, force)
+                    return
+        except OSError as error:
+            if error.errno not in NOT_BY_RENAME or not self.place.is_dir():
+                raise
+        with self._sibling(self.place, texts) as new:
+            self._file_by_file(new, texts, force)
+
+    def add(self, name: str, text: str) -> bool:
+        """Add a file to what was put there; return False where another result has come since."""
+        with locked(self.place.parent):
+            if self.written:
+                write_text(self.place / name, text)
+            return self.written
+
+    @contextmanager
+    def _sibling(self, parent: Path, texts: Mapping[str, str]) -> Iterator[Path]:
+        """Make a folder with the files; what is left of it after the block is removed."""
+        new = parent / f'.{self.place.name}.{uuid.uuid4().hex}{PART}'
+        with locked(self.place.parent):
+            self._clear(parent)
+            disk(os.mkdir, new)
+            held = ExitStack()
+            held.enter_context(locked(new))     # before anybody may clear it away
+        with held:
+            try:
+                for name, text in texts.items():
+                    write_text(new / name, text)
+                sync_folder(new)
+                self._main_file = _which(new / self._main)
+                yield new
+            finally:
+                shutil.rmtree(new, ignore_errors=True)
+
+    def _clear(self, parent: Path) -> None:
+        """Clear away what others were killed at; those at work hold theirs."""
+        found = [(parent / name, LEFT.fullmatch(name)) for name in os.listdir(parent)]
+        for one, left in ((one, left) for one, left in found if left):
+            with suppress(OSError), locked(one, wait=False) as held:
+                if left['aside'] and not (parent / left['place']).exists():
+                    one.rename(parent / left['place'])
+                elif held:
+                    shutil.rmtree(one, ignore_errors=True)
+
+    def _refuse(self, force: bool) -> None:
+        if (self.place / self._main).exists() and not force:
+            raise BadUsage(f'{self.place / self._main} exists; give another folder with --output, '
+                           'or --force to replace it')
+
+    def _exchangeable(self) -> bool:
+        """Return whether the folder is ours alone, and nobody of this process is in it."""
+        if not self.place.is_dir():
+            return True
+        return self.place != Path.cwd() and all(
+            name in self._ours or any(name.startswith(f'.{our}.') for our in self._ours)
+            for name in os.listdir(self.place))
+
+    def _exchange(self, new: Path, force: bool) -> None:
+        with locked(self.place.parent), uninterrupted():
+            self._refuse(force)
+            try:
+                disk(os.rename, new, self.place)      # nothing, or an empty folder, is there
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                disk(_swap, new, self.place)
+            sync_folder(self.place.parent)
+
+    def _file_by_file(self, new: Path, texts: Mapping[str, str], force: bool) -> None:
+        with locked(self.place.parent), uninterrupted():
+            self._refuse(force)
+            for name in sorted(self._ours, key=self._main.__ne__):
+                (self.place / name).unlink(missing_ok=True)
+            for name in sorted(texts, key=self._main.__eq__):
+                disk(os.rename, new / name, self.place / name)
+            sync_folder(self.place)
+
+
+def _which(path: Path) -> tuple[int, int]:
+    about = path.stat()
+    return about.st_ino, about.st_mtime_ns
+
+
+def _swap(one: Path, other: Path) -> None:
+    """Exchange two folders in one step where the system can, else in two."""
+    rename: Callable | None = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    names = [os.fsencode(path) for path in (one, other)]
+    if rename is not None:
+        if rename(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE) == 0:
+            return
+        code = ctypes.get_errno()
+        if code not in (errno.EINVAL, errno.ENOSYS):      # a file system that cannot
+            raise OSError(code, os.strerror(code), str(other))
+    aside = one.with_name(f'{one.name}{ASIDE}')
+    os.rename(other, aside)
+    try:
+        os.rename(one, other)
+    except OSError:
+        os.rename(aside, other)
+        raise
+    os.rename(aside, one)

@@ -1,0 +1,27 @@
+"""The Imu's frame in the files for TF: as set, else as its messages say, where ROS takes that."""
+
+from dataclasses import replace
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.config import Config, with_settings
+from odocal_ros.outside import is_frame, one_line
+from odocal_ros.reasons import Code, Reason
+
+IMU_FRAME = 'imu_link'      # REP-145, where nobody names one
+
+
+def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
+    """
+    Return both with the Imu's frame in force.
+
+    frame : of the Imu's headers, as somebody sent it; a note tells where it is not taken.
+    """
+    if config.frames.imu or not frame:
+        return calibration, config
+    taken = frame.lstrip('/')       # as ROS 1 wrote it
+    taken = taken if is_frame(taken) else IMU_FRAME
+    if taken != frame:
+        note = Reason(Code.FRAME_REPLACED, f"the Imu's messages name the frame "
+                      f"'{one_line(frame[:60])}', which TF does not take; {taken} is written")
+        calibration = replace(calibration, reasons=(*calibration.reasons, note))
+    return calibration, with_settings(config, {'frames.imu': taken})

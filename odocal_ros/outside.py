@@ -1,0 +1,66 @@
+"""
+Names from outside (frames, topics, types, joints, files): the one door for what others chose.
+
+Whoever writes such a name puts it through the function of his format; a frame is taken only where
+ROS takes it, since files that are acted on name it.
+"""
+
+import re
+import shlex
+
+# what may stand raw in a line: no control, no half of a surrogate pair, nothing that turns writing
+UNSEEN = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\u2060-\u206f'
+                    '\ufeff\ufff9-\ufffb\ud800-\udfff]')
+VERDICT_STYLE = re.compile('(\x1b\\[(?:1;3[123]|0)m)')     # of our own on a terminal
+FRAME = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_./-]{0,199}')
+
+
+def one_line(text: object) -> str:
+    """Return text as one line, what cannot be seen in it shown as an escape sequence."""
+    return _seen(str(text))
+
+
+def said_by(error: BaseException) -> str:
+    """Return the text of an error as one line."""
+    return one_line(' '.join(str(error).split()))
+
+
+def for_terminal(text: str) -> str:
+    """Return lines for a terminal: nothing in them moves its cursor or sets its state."""
+    parts = VERDICT_STYLE.split(text)
+    parts[::2] = ['\n'.join(map(_seen, part.split('\n'))) for part in parts[::2]]
+    return ''.join(parts)
+
+
+def _seen(text: str) -> str:
+    return UNSEEN.sub(lambda match: match[0].encode('unicode_escape').decode(), text)
+
+
+def is_frame(name: str) -> bool:
+    """Return whether a frame name is one that tf2 takes, safe in every file that names it."""
+    return FRAME.fullmatch(name) is not None
+
+
+def for_comment(text: str) -> str:
+    """Return lines as comment lines of YAML, a shell or a table."""
+    return ''.join(f'# {one_line(line)}\n' for line in text.split('\n'))
+
+
+def for_table(text: str) -> str:
+    """Return text as a cell that no spreadsheet takes for a formula."""
+    return f"'{text}" if text.startswith(('=', '+', '-', '@')) else text
+
+
+def for_xml_comment(text: str) -> str:
+    """Return lines for the inside of an XML comment, which no ``--`` may be in."""
+    return re.sub('-(?=-)', '- ', '\n'.join(map(one_line, text.split('\n'))))
+
+
+def for_launch(words: list[str]) -> str:
+    """Return the words of a command as an attribute of a launch file: nothing is substituted."""
+    return re.sub(r'([\\$"\'])', r'\\\1', for_shell(words))
+
+
+def for_shell(words: list[str]) -> str:
+    """Return the words of a command as a shell takes them, each as it is."""
+    return shlex.join(map(one_line, words))

@@ -1,0 +1,111 @@
+"""
+Files and folders that are on the disk whole or not at all: the one way to it.
+
+Every step that a disk can refuse goes through ``disk``, so that tests can refuse each in turn.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+import fcntl
+import os
+from pathlib import Path
+import signal
+import threading
+from typing import BinaryIO
+
+PART = '.part'                # of files being written: no ending that a result's or a bag's have
+
+
+class Disk:
+    """What may fail, one call a step."""
+
+    def __call__(self, step: Callable, *values):
+        """Do a step of the operating system."""
+        return step(*values)
+
+
+disk = Disk()
+
+
+class WholeFile:
+    """A file being written, each write a step."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        return disk(self._file.write, data)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[WholeFile]:
+    """Open a file that is there, whole and safe on the disk, after the block, or not at all."""
+    part = path.with_name(f'.{path.name}{PART}')
+    try:
+        with disk(open, part, 'wb') as file:
+            yield WholeFile(file)
+            disk(file.flush)
+            disk(os.fsync, file.fileno())
+        disk(os.rename, part, path)
+        sync_folder(path.parent)
+    except BaseException:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, safe on the disk when this returns."""
+    with whole_file(path) as file:
+        file.write(text.encode())
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        disk(os.fsync, handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
+    """
+    Hold a folder against others who ask for it this way; gives whether it is held.
+
+    No file is left of it, and it ends with the process. Where there are no locks, as on some
+    network disks, it counts as held.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except PermissionError:
+        yield True
+        return
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        except OSError:
+            pass
+        yield True
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait until the block is over."""
+    if threading.current_thread() is not threading.main_thread():
+        yield       # only the main thread hears of it
+        return
+    came: list = []
+    before = signal.signal(signal.SIGINT, lambda *values: came.append(values))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came and callable(before):
+            before(*came[0])

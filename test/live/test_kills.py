@@ -1,0 +1,23 @@
+"""A node killed while it computes, writes its files and draws: whole results or none."""
+
+from kills import drive, killed_at_files, wrong
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope='module')
+def driven(domain):
+    return drive()
+
+
+@pytest.mark.parametrize(('stage', 'moment_s'), [
+    *(('stop', m) for m in np.random.default_rng(12).uniform(0.0, 4.0, 3).round(3)),
+    *(('save', m) for m in np.random.default_rng(13).uniform(0.0, 0.4, 3).round(3))])
+def test_a_node_killed_at_its_files_leaves_whole_ones(driven, tmp_path, stage, moment_s):
+    left = killed_at_files(driven, stage, moment_s, tmp_path)
+    assert left.half == []
+    assert left.latest
+    code, result, said = left.journal
+    assert code in (0, 1), said
+    assert result is not None
+    assert wrong(left) == []
