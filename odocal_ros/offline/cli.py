@@ -76,20 +76,29 @@ def main(argv=None) -> int:
         what = error.filename or 'output'
         print(f'odocal: {what}: {error.strerror or error}', file=sys.stderr)
         return WRONG_USE
+    except MemoryError:
+        print('odocal: memory ran out; close other programs, or replay a part: a shorter bag or '
+              '--leg A:B', file=sys.stderr)
+        return WRONG_USE
     except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
         return _internal(error)
 
 
 def _internal(error) -> int:
     import traceback
-    with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt',
-                                     delete=False) as f:
-        f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n')
-        traceback.print_exception(error, file=f)
-    first = (str(error).splitlines() or [''])[0]
+    path = trace_file(''.join(traceback.format_exception(error)))
+    first = (str(error).splitlines() or [''])[0][:200]
     print(f'odocal: internal error ({type(error).__name__}: {first}); '
-          f'please report it with {f.name}', file=sys.stderr)
+          f'please report it with {path}', file=sys.stderr)
     return INTERNAL
+
+
+def trace_file(text: str) -> str:
+    """Write what a developer needs to a file of its own; return its path."""
+    with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt', delete=False,
+                                     encoding='utf-8', errors='backslashreplace') as f:
+        f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n{text}')
+    return f.name
 
 
 if __name__ == '__main__':

@@ -52,8 +52,10 @@ def run(args) -> int:
     if (output / 'calibration.json').exists() and not args.force:
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
+    from odocal_ros.calib.failed import traces
     from odocal_ros.config import with_settings
     from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
+    from odocal_ros.offline.cli import trace_file
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.pipeline import combine
     paths, again = once([Path(bag) for bag in args.bags])
@@ -88,6 +90,9 @@ def run(args) -> int:
     if not config.frames.imu and imu_frame:
         config = with_settings(config, {'frames.imu': imu_frame})
     legs, inputs = told_apart(used, legs, inputs)
+    for name, trace in traces(legs):
+        print(f'odocal: method {name} broke; please report it with {trace_file(trace)}',
+              file=sys.stderr)
     calibration = combine(legs, config)
     return _report(calibration, config, inputs, output, args)
 
