@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, read_chunks, whole_file, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
-from odocal_ros.bagio.recover import Channel
 
 TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
 

@@ -5,6 +5,7 @@ Only for files that sqlite itself cannot read to the end.
 """
 
 from collections.abc import Container, Iterator
+from functools import partial
 import mmap
 from pathlib import Path
 import struct
@@ -34,21 +35,37 @@ class Leaves:
         """Return the number of the first row of a page of messages, None for other pages."""
         if self._map[page * self._size] != LEAF:
             return None
-        for row, _, _, _ in self._rows_of(page, header_only=True):
+        for row, _, _, _ in self._rows_of(page):
             return row
         return None
 
-    def rows(self, keys: Container[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (topic_id, timestamp, data) of some topics in the order they were written."""
-        last = -1
-        for page in self._pages:
-            for row, key, time_ns, data in self._rows_of(page):
-                if row > last:               # a stale copy of a page holds rows told already
-                    last = row
-                    if key in keys:
-                        yield key, time_ns, data
+    def rows(self, keys: Container[int] | None, last: int = -1
+             ) -> Iterator[tuple[int, int, bytes]]:
+        """
+        Yield (topic_id, timestamp, data) of some topics in the order they were written.
 
-    def _rows_of(self, page: int, header_only: bool = False):
+        keys : topics, None: of all, without their data.   last : rows up to it are not told.
+        """
+        left = 2 * len(self._map)            # bytes: no two rows share a page for large ones
+        for page in self._pages:
+            for row, key, time_ns, payload in self._rows_of(page):
+                if row <= last:              # a stale copy of a page holds rows told already
+                    continue
+                data = b''
+                if keys is not None and key in keys:
+                    try:
+                        data = payload()
+                    except (ValueError, IndexError, struct.error):
+                        continue             # its overflow pages are gone
+                    left -= len(data)
+                    if left < 0:
+                        return
+                last = row
+                if keys is None or key in keys:
+                    yield key, time_ns, data
+
+    def _rows_of(self, page: int):
+        """Yield (row, topic_id, timestamp, what gives the data) of a page."""
         data = self._map[page * self._size:(page + 1) * self._size]
         count = struct.unpack_from('>H', data, 3)[0]
         for i in range(min(count, (self._size - 8) // 2)):
@@ -57,13 +74,17 @@ class Leaves:
                 size, at = _varint(data, at)
                 row, at = _varint(data, at)
                 key, time_ns, skip = _record(data, at)
-                blob = b'' if header_only else self._payload(data, at, size)[skip:]
             except (ValueError, IndexError, struct.error):
-                continue                     # not a row of messages, or its pages are gone
-            yield row, key, time_ns, blob
+                continue                     # not a row of messages
+            yield row, key, time_ns, partial(self._data, data, at, size, skip)
+
+    def _data(self, data: bytes, at: int, size: int, skip: int) -> bytes:
+        return self._payload(data, at, size)[skip:]
 
     def _payload(self, data: bytes, at: int, size: int) -> bytes:
         """Return a row's bytes, those on overflow pages too."""
+        if size > len(self._map):
+            raise ValueError('larger than the file')
         largest = self._usable - 35
         if size <= largest:
             return data[at:at + size]
@@ -90,6 +111,8 @@ class Leaves:
 def _record(data: bytes, at: int) -> tuple[int, int, int]:
     """Return topic, time and where the data begin in a row of messages; ValueError if not one."""
     length, pos = _varint(data, at)
+    if length > 10 * COLUMNS:      # a varint has nine bytes at most
+        raise ValueError('not a message')
     kinds = []
     while pos < at + length:
         kind, pos = _varint(data, pos)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.bagio.segments import SegmentedBag, write_text
 from odocal_ros.live.journal_space import claim, make_room
 

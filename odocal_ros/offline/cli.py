@@ -17,6 +17,7 @@ COMMANDS = {
     'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
+LONGEST = 2000       # characters of a sentence: a bag may hold a name of any length
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -64,7 +65,8 @@ def main(argv=None) -> int:
         sys.stdout.flush()       # here, where a full disk can still be told
         return code
     except OdocalError as error:
-        print(f'odocal: {error}' if not isinstance(error, _Usage) else error, file=sys.stderr)
+        text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
+        print(text if len(text) <= LONGEST else f'{text[:LONGEST]} ...', file=sys.stderr)
         return WRONG_USE
     except KeyboardInterrupt:
         print('odocal: interrupted, nothing written', file=sys.stderr)
