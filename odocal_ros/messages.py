@@ -25,6 +25,7 @@ from odocal_ros.samples import (
     VelocitySamples,
 )
 
+HOPELESS = 20_000    # messages that gave nothing, after which odd ones are not looked at
 RAD_PER_DEG = math.pi / 180
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
@@ -151,11 +152,15 @@ class Reader:
         except OdocalError:
             raise
         except Exception as error:   # rclpy and rosbags each have their own way to fail
-            self.trouble = f'cannot be deserialised as {self.msgtype}: {error}'
+            why = ' '.join(str(error).split())[:200]
+            self.trouble = f'cannot be deserialised as {self.msgtype}: {why}'
             return None
 
     def _one(self, out, i, raw, deserialize) -> bool:
         """Read one message into row i; False: it gives none."""
+        if self.unreadable > HOPELESS:      # trying costs a hundred times what reading does
+            self.unreadable += 1
+            return False
         view = self._view(raw, deserialize)
         if view is None:
             self.unreadable += 1

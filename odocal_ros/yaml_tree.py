@@ -28,9 +28,13 @@ def loader(aliases: bool = False):
                     None, None, f'nested deeper than {DEPTH} levels', mark)
             self.depth += 1
             try:
-                return super().compose_node(parent, index)
+                node = super().compose_node(parent, index)
             finally:
                 self.depth -= 1
+            if isinstance(node, yaml.MappingNode) and not all(
+                    isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+                raise yaml.composer.ComposerError(None, None, 'a key that is no text', mark)
+            return node
     return Plain
 
 

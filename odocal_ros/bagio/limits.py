@@ -12,8 +12,9 @@ RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
 UNPACKED = 2**26             # bytes that a bag may always unpack to, and
 RATIO = 40                   # more for each of its own; sensors' messages pack to a tenth
 TEXT = 2**20                 # bytes of a YAML file
-DEFINITION = 2**18           # characters of a message definition
-ELEMENTS = 100_000           # values in a fixed array of one, or characters in its strings
+DEFINITION = 2**16           # characters of a message definition
+ELEMENTS = 100_000           # values in the fixed arrays of one message
+SECONDS = 20                 # to understand a definition
 LATEST_NS = 2**62            # the year 2116: a later time of a message is none
 
 

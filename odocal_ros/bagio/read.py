@@ -13,7 +13,7 @@ from odocal_ros.bagio.limits import is_file
 from odocal_ros.bagio.parts import Batch, group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
-from odocal_ros.errors import BadBag, BadData, BadUsage
+from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import Reader
 from odocal_ros.reasons import Code, Reason
 
@@ -149,7 +149,7 @@ class Bag:
             for time_ns, raw in zip(*batch[topic], strict=True):
                 try:
                     message = deserialize(raw)
-                except BadData:
+                except (OdocalError, MemoryError):
                     raise
                 except Exception:   # one damaged message is no reason to lose the others
                     continue

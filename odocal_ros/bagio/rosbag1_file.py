@@ -6,7 +6,7 @@ from typing import Any
 
 from odocal_ros.bagio.channels import Channel, Recording
 from odocal_ros.bagio.limits import Allowance, LATEST_NS, LimitReached
-from odocal_ros.errors import BadBag, BadData
+from odocal_ros.errors import BadBag, OdocalError
 
 PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 
@@ -69,7 +69,7 @@ class Rosbag1File(Recording):
                 raise self._unreadable(error) from None
             try:
                 raw = bytes(self._convert(raw, channel))
-            except (BadData, MemoryError):
+            except (OdocalError, MemoryError):
                 raise
             except Exception:   # a damaged message: readers count it
                 raw = b''

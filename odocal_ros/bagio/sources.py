@@ -8,7 +8,14 @@ import shutil
 import sqlite3
 
 from odocal_ros.bagio.channels import possible
-from odocal_ros.bagio.limits import Allowance, is_file, LATEST_NS, read_text, zstd_module
+from odocal_ros.bagio.limits import (
+    Allowance,
+    is_file,
+    LATEST_NS,
+    LimitReached,
+    read_text,
+    zstd_module,
+)
 from odocal_ros.bagio.numbered import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
 from odocal_ros.yaml_tree import loader
@@ -128,8 +135,10 @@ def _read_metadata(path: Path) -> Known:
         return Known(trouble=f'{path}: is a pipe, a device or a folder, so it is not used')
     try:
         return _known(yaml.load(read_text(path), Loader=loader(aliases=True)))
-    except OSError:
+    except (OSError, MemoryError):
         raise
+    except LimitReached as error:
+        return Known(trouble=f'{error}; it is not used')
     except Exception as error:      # of any kind: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] or type(error).__name__
         return Known(trouble=f'{path}: cannot be understood ({why}), so it is not used')

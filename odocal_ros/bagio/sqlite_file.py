@@ -61,7 +61,8 @@ class SqliteFile(Recording):
             return left < 0
         self._db.set_progress_handler(stop, STEPS)
         try:
-            yield from self._db.execute(sql, values)
+            for row in self._db.execute(sql, values):  # noqa: UP028 that would close the cursor
+                yield row
         except sqlite3.Error as error:
             raise Damaged('pages of it are damaged' if left >= 0 else
                           'its tables run in circles') from error
