@@ -6,6 +6,10 @@ from odocal_ros.reasons import Code, Reason
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
 BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15}
+TINY = 1e-100        # nor does any sensor mean this, but zero
+CLUMP = 3            # rows beyond any sensor, each within NEAR rows of the one before, are a clump
+NEAR = 50            # rows: a page or a packed block of a recording is about so many
+DAMAGED = 0.01       # of the rows beyond any sensor: so many are a damaged recording
 TURN_STEP = 0.8      # rad/s, least bound from row to row that may be a glitch
 FORCE_STEP = 50.0    # m/s^2, the same: potholes stay
 SPEED_STEP = 0.3     # of the top speed, the same
@@ -23,9 +27,29 @@ def beyond(name, column):
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
     with np.errstate(invalid='ignore'):
-        usable = np.abs(column) <= BEYOND.get(name, np.inf)
+        size = np.abs(column)
+        usable = (size <= BEYOND.get(name, np.inf)) & ((size >= TINY) | (size == 0))
     usable &= np.isfinite(column)
     return ~usable.all(axis=tuple(range(1, column.ndim)))
+
+
+def about_clumps(wild):
+    """
+    Tell which rows stand in or about a clump of rows that are beyond any sensor.
+
+    Where a recording is damaged, what shows is a part of what is wrong: rows beside it are wrong
+    by less than a sensor's range.
+
+    wild : (n,) bool.   Returns (n,) bool, the clumps and to either side as many rows as twice the
+    widest stretch in them that looks sound.
+    """
+    suspect = np.zeros(len(wild), bool)
+    at = np.flatnonzero(wild)
+    for group in np.split(at, np.flatnonzero(np.diff(at) > NEAR) + 1):
+        if len(group) >= CLUMP:
+            wide = 2 * int(np.diff(group).max())
+            suspect[max(group[0] - wide, 0):group[-1] + wide + 1] = True
+    return suspect
 
 
 def alone(t, x, least):

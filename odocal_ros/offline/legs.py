@@ -59,7 +59,7 @@ def _edge(text, whole):
     try:
         seconds = Decimal(text)
         if seconds.is_finite():
-            if abs(seconds) >= LATEST_NS // 10**9:
+            if seconds.copy_abs() >= LATEST_NS // 10**9:
                 raise BadUsage(f'--leg {whole}: {text[:40]} is no time of a recording: beyond the '
                                'year 2116')
             return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH

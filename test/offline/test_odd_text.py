@@ -20,7 +20,8 @@ TEXTS = [
     '!!python/object/apply:os.system [true]', '&a {b: *a}', '&a [*a]', '[' * 3000, '{' * 3000,
     '- ' * 3000 + 'x', '9' * 400, '9' * 5000, '1e400', '.inf', '!!binary x', '!!timestamp 1',
     '!foo bar', '? [a]\n: b', '!!int x', '0x' + 'f' * 400, '0' + '7' * 500, '"\\uD800"',
-    '!!set {1}', '*nothing', '<<: *x', '%YAML 9.9', '\t', '1:60:60', '!!null {}', 'a: b: c', '| \n x', '\x07']
+    '!!set {1}', '*nothing', '<<: *x', '%YAML 9.9', '\t', '1:60:60', '!!null {}', 'a: b: c',
+    '| \n x', '\x07']
 
 
 @pytest.fixture(scope='module')
@@ -82,7 +83,8 @@ def test_files_of_any_text(tmp_path, bag, capsys, text):
 
 @pytest.mark.parametrize('text', [*TEXTS, '[' * 3000 + ']' * 3000])
 @pytest.mark.parametrize('name', ['leg.min_distance', 'imu.lever_arm', 'frames.imu',
-                                  'wheels.levels', 'output.formats', 'method', 'reference.start', 'no.such'])
+                                  'wheels.levels', 'output.formats', 'method',
+                                  'reference.start', 'no.such'])
 def test_settings_of_any_text(name, text):
     with suppress(OdocalError):
         parse_set(f'{name}={text}')
