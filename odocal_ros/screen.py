@@ -172,7 +172,7 @@ def _finite(samples, slot, leg, found):
         column = getattr(samples, name)
         odd = beyond(name, column)
         finite &= ~odd
-        wild |= odd & ~np.isnan(column).any(axis=tuple(range(1, column.ndim)))
+        wild |= odd & np.isfinite(column).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
