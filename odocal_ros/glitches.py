@@ -7,7 +7,7 @@ from odocal_ros.reasons import Code, Reason
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
 BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15}
 TINY = 1e-100        # nor does any sensor mean this, but zero
-CLUMP = 3            # rows beyond any sensor, each within NEAR rows of the one before, are a clump
+CLUMP = 5            # rows beyond any sensor, each within NEAR rows of the one before, are a clump
 NEAR = 50            # rows: a page or a packed block of a recording is about so many
 DAMAGED = 0.01       # of the rows beyond any sensor: so many are a damaged recording
 TURN_STEP = 0.8      # rad/s, least bound from row to row that may be a glitch

@@ -68,8 +68,8 @@ def test_what_a_clump_is():
     assert not about_clumps(wild).any()
     wild[[100, 400, 800]] = True
     assert not about_clumps(wild).any()              # alone
-    wild[[410, 414]] = True                          # 400, 410, 414: ten apart at most
-    assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(380, 435))
+    wild[[405, 410, 414, 419]] = True                # 400 to 419: five apart at most
+    assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(390, 430))
     assert not about_clumps(np.zeros(0, bool)).any()
 
 
