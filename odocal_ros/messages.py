@@ -229,7 +229,8 @@ def _fix(stamps, received, position, covariance, known, status) -> FixSamples:
 
 def _velocity(stamps, received, velocity_n, *covariance) -> VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    return VelocitySamples(stamps, received, velocity_n, np.where(variance > 0, variance, 0.0))
+    told = (variance > 0) & (variance < 1e12)       # else unknown
+    return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
 
 
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0, 8))

@@ -16,7 +16,15 @@ from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
 from odocal_ros.fix_screen import usable_fixes
-from odocal_ros.glitches import about_clumps, beyond, DAMAGED, frozen, imu_glitches, speed_glitches
+from odocal_ros.glitches import (
+    about_clumps,
+    beyond,
+    DAMAGED,
+    frozen,
+    imu_glitches,
+    oriented,
+    speed_glitches,
+)
 from odocal_ros.leg import Leg
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -95,6 +103,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
+    imu, heading = oriented(imu), oriented(heading)
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)

@@ -1,6 +1,7 @@
 """A rosbag1 file, through rosbags: with bounds on what its index and its chunks may claim."""
 
 from collections.abc import Callable, Iterator, Mapping
+import io
 from pathlib import Path
 from typing import Any
 
@@ -88,11 +89,26 @@ def _decompressors() -> dict[str, Callable]:
 def _reader(path: Path) -> Any:
     """Return a reader of rosbags whose index holds no more than the file."""
     from rosbags.rosbag1 import Reader
+    most = path.stat().st_size
+
+    class Bounded(io.BufferedReader):
+        """Asks for no memory that the file cannot fill."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            """Return so many bytes, or as many as a file has."""
+            return super().read(min(size, most) if size and size > 0 else size)
+
+    class File(type(path)):     # type: ignore[misc]
+        """A path whose file is so bounded."""
+
+        def open(self, *_) -> io.BufferedReader:      # type: ignore[override]
+            """Open the file for reading."""
+            return Bounded(io.FileIO(self))
 
     class Counted(Reader):
         """Counts what it reads of the index."""
 
-        left = path.stat().st_size
+        left = most
 
         def read_index_data(self, pos: int, indexes: dict) -> None:
             """Read the entries of a connection in a chunk."""
@@ -102,4 +118,4 @@ def _reader(path: Path) -> Any:
             self.left -= self.bio.tell() - begin
             if self.left < 0:
                 raise ValueError('its index runs in circles')
-    return Counted(path)
+    return Counted(File(path))

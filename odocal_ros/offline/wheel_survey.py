@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.bagio import cdr
+from odocal_ros.glitches import beyond
 from odocal_ros.odometer_types import JOINTS
 
 TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
@@ -49,7 +50,7 @@ class Values:
                                     key=lambda entry: sum(len(t) for t, _ in entry[1]))
         stamp_ns = np.concatenate([t for t, _ in blocks])
         value = np.concatenate([v for _, v in blocks])
-        keep = np.append(True, np.diff(stamp_ns) > 0) & np.isfinite(value).all(axis=1)
+        keep = np.append(True, np.diff(stamp_ns) > 0) & ~beyond('value', value)
         stamp_ns, value = stamp_ns[keep], value[keep]
         if len(stamp_ns) < 3:
             return []
