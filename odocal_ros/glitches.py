@@ -7,8 +7,8 @@ import numpy as np
 from odocal_ros.reasons import Code, Reason
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
-BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0,
-          'latitude': 1e4, 'longitude': 1e4, 'height': 1e15, 'covariance_n': 1e30}
+BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
+LARGEST = 1e300      # of any other value: sums and products with it stay finite
 UNIT = 2.0           # times one, either way: a quaternion of another length is no attitude
 WIDEST = 1e12        # rad^2, no driver's way of saying unknown is beyond it
 TINY = 1e-100        # nor does any sensor mean this, but zero
@@ -33,17 +33,16 @@ def beyond(name, column):
         return np.zeros(len(column), bool)
     with np.errstate(invalid='ignore'):
         size = np.abs(column)
-        usable = (size <= BEYOND[name]) & ((size >= TINY) | (size == 0))
+        usable = (size <= BEYOND.get(name, LARGEST)) & ((size >= TINY) | (size == 0))
     return ~usable.all(axis=tuple(range(1, column.ndim)))
 
 
 def oriented(samples):
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
-    none = beyond('q_ni', samples.q_ni) | ~(np.abs(samples.yaw_variance) <= WIDEST)
-    q_ni = np.where(none[:, None], 0.0, samples.q_ni)
-    length = np.linalg.norm(q_ni, axis=1)
-    none |= (length < 1 / UNIT) | (length > UNIT)
-    if not (none & ~np.isnan(samples.yaw_variance)).any():
+    wild = beyond('q_ni', samples.q_ni)
+    length = np.linalg.norm(np.where(wild[:, None], 0.0, samples.q_ni), axis=1)
+    none = (length < 1 / UNIT) | (length > UNIT) | (np.abs(samples.yaw_variance) > WIDEST)
+    if not (wild | none & ~np.isnan(samples.yaw_variance)).any():
         return samples
     return replace(samples, q_ni=np.where(none[:, None], 0.0, samples.q_ni),
                    yaw_variance=np.where(none, np.nan, samples.yaw_variance))
