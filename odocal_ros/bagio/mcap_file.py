@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 import heapq
-import mmap
 from operator import itemgetter
 from pathlib import Path
 import struct
@@ -10,10 +9,13 @@ from typing import NamedTuple
 import zlib
 
 from odocal_ros.bagio.channels import Channel, FORMATS, Message, Recording
+from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.bagio.limits import Allowance, Damaged, LATEST_NS, LimitReached
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 8, 11
+USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
+MOST_CUT = 2**26        # bytes taken of a chunk that the file ends in
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD = struct.Struct('<QQQQ')
 END = 9 + 20 + len(MAGIC)      # of the footer
@@ -45,9 +47,8 @@ class McapFile(Recording):
         self._allowance = allowance
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._places: list[Place] = []
-        self._file = path.open('rb')
+        self._file = FileBytes(path)
         try:
-            self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
             self._open()
         except BaseException:
             self.close()
@@ -67,10 +68,10 @@ class McapFile(Recording):
 
     def _index(self) -> bool:
         """Read the index; False: the file has none."""
-        data = self._map
+        data = self._file
         if data[-len(MAGIC):] != MAGIC or data[-END:-END + 9] != RECORD.pack(FOOTER, 20):
             raise Damaged('cut off')
-        start, _, crc = struct.unpack_from('<QQI', data, len(data) - END + 9)
+        start, _, crc = struct.unpack('<QQI', data[-END + 9:-len(MAGIC)])
         if not start:
             return False
         if not len(MAGIC) <= start <= len(data) - END:
@@ -142,13 +143,14 @@ class McapFile(Recording):
 
     def _of(self, place: Place, wanted: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; none of one that is damaged."""
-        op, size = RECORD.unpack_from(self._map, place.at)
+        record = self._file[place.at:place.at + place.size]
         try:
+            op, size = RECORD.unpack_from(record)
             if op != CHUNK or size != place.size - 9:
                 raise Damaged(CHUNK_DAMAGED)
-            found = self._chunk(self._map[place.at + 9:place.at + place.size])
-        except Damaged as error:
-            self.damage = self.damage or str(error)
+            found = self._chunk(record[9:])
+        except (Damaged, struct.error) as error:
+            self.damage = self.damage or _said(error)
             return []
         return [entry for entry in found if entry[1] in wanted]
 
@@ -160,17 +162,16 @@ class McapFile(Recording):
 
     def _walk(self) -> Iterator[Entry]:
         """Yield every message from the first record on, chunk by chunk."""
-        for op, body, whole in _records(self._map, len(MAGIC)):
+        for op, body, whole in _records(self._file, len(MAGIC)):
             try:
                 if op == CHUNK:
                     yield from self._chunk(body, cut=not whole)
-                elif op == MESSAGE and whole:
+                elif op == MESSAGE:
                     yield self._message(body)
-                elif op in (SCHEMA, CHANNEL) and whole:
+                elif op in (SCHEMA, CHANNEL):
                     self._learn(op, body)
             except (Damaged, struct.error, UnicodeDecodeError) as error:
-                self.damage = self.damage or (
-                    str(error) if isinstance(error, Damaged) else 'a damaged record')
+                self.damage = self.damage or _said(error)
 
     def _message(self, body: bytes) -> Entry:
         key, _, time_ns, _ = MESSAGE_HEAD.unpack_from(body)
@@ -243,17 +244,23 @@ class McapFile(Recording):
 
     def close(self) -> None:
         """Let go of the file."""
-        if hasattr(self, '_map'):
-            self._map.close()
         self._file.close()
+
+
+def _said(error: Exception) -> str:
+    return str(error) if isinstance(error, Damaged) else 'a damaged record'
 
 
 def _records(data, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
     """Yield the records of a section, up to the footer, and whether they are whole."""
-    while at + 9 <= len(data) and data[at] != FOOTER:
-        op, size = RECORD.unpack_from(data, at)
+    while at + 9 <= len(data):
+        op, size = RECORD.unpack(data[at:at + 9])
+        if op == FOOTER:
+            return
         stop = at + 9 + size
-        yield op, data[at + 9:stop], stop <= len(data)
+        whole = stop <= len(data)
+        if op in USED and whole or op == CHUNK:      # the last chunk too where the file is cut off
+            yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not whole else stop], whole
         at = stop
 
 

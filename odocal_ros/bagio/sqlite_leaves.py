@@ -6,9 +6,10 @@ Only for files that sqlite itself cannot read to the end.
 
 from collections.abc import Container, Iterator
 from functools import partial
-import mmap
 from pathlib import Path
 import struct
+
+from odocal_ros.bagio.file_bytes import FileBytes
 
 LEAF = 0x0D
 COLUMNS = 4                       # id (NULL: it is the row number), topic_id, timestamp, data
@@ -19,21 +20,22 @@ class Leaves:
     """The leaf pages of the table of messages that are in the file."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open('rb')
-        self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
-        size = struct.unpack_from('>H', self._map, 16)[0]
+        self._map = FileBytes(path)
+        head = self._map[:100]
+        size = struct.unpack_from('>H', head, 16)[0]
         self._size = 65536 if size == 1 else size
         if self._size < 512:
             raise ValueError('no page size')
-        self._usable = self._size - self._map[20]
+        self._usable = self._size - head[20]
         pages = len(self._map) // self._size
-        self.cut = len(self._map) < struct.unpack_from('>I', self._map, 28)[0] * self._size
+        self.cut = len(self._map) < struct.unpack_from('>I', head, 28)[0] * self._size
         found = ((self._first_row(page), page) for page in range(1, pages))
         self._pages = [page for row, page in sorted((r, p) for r, p in found if r is not None)]
 
     def _first_row(self, page: int) -> int | None:
         """Return the number of the first row of a page of messages, None for other pages."""
-        if self._map[page * self._size] != LEAF:
+        at = page * self._size
+        if self._map[at:at + 1] != bytes([LEAF]):
             return None
         for row, _, _, _ in self._rows_of(page):
             return row
@@ -97,15 +99,15 @@ class Leaves:
             start = (page - 1) * self._size
             if page < 2 or start + self._size > len(self._map):
                 raise ValueError('overflow page missing')
-            page = struct.unpack_from('>I', self._map, start)[0]
-            parts.append(self._map[start + 4:start + self._usable][:size - have])
+            whole = self._map[start:start + self._usable]
+            page = struct.unpack_from('>I', whole)[0]
+            parts.append(whole[4:4 + size - have])
             have += len(parts[-1])
         return b''.join(parts)
 
     def close(self) -> None:
         """Let go of the file."""
         self._map.close()
-        self._file.close()
 
 
 def _record(data: bytes, at: int) -> tuple[int, int, int]:
