@@ -7,6 +7,7 @@ from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
 
 HEIGHT = 1e5         # m, beyond it a fix is at no real position
+ALIKE = 1e-3         # correlations above and below the diagonal
 ABOUT_START = 11     # fixes about the start mark that the origin is amid
 AWAY = 1e6           # m from where most fixes are, the same
 SMALLEST = 1e-6      # m, a sigma below it, and
@@ -94,7 +95,9 @@ def _proper(matrices):
         sigma = np.sqrt(variance)
         unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
     unit[~sane] = np.eye(matrices.shape[1])
-    return sane & (np.linalg.eigvalsh((unit + np.swapaxes(unit, 1, 2)) / 2)[:, 0] > INDEPENDENT)
+    # one that is not symmetric is damaged: which half holds, nobody knows
+    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ALIKE).all(axis=(1, 2))
+    return sane & (np.linalg.eigvalsh(unit)[:, 0] > INDEPENDENT)
 
 
 def origin_amid(t_fix, geodetic) -> Origin:

@@ -22,6 +22,7 @@ def made():
     [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],    # a correlation of two
     [[1.0, 1 - 1e-9, 0.0], [1 - 1e-9, 1.0, 0.0], [0.0, 0.0, 1.0]],
     [[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]],    # only with the height
+    [[2.0, 0.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 9.0]],    # not symmetric
     np.diag([1e-300, 1e-300, 1.0]), np.diag([1e300, 1.0, 1.0]), np.full((3, 3), 5e-324)])
 def test_a_covariance_that_is_none(made, matrix):
     leg = made.leg()
