@@ -6,6 +6,7 @@ from pathlib import Path
 from odocal_ros.bagio.limits import is_file
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.errors import BadUsage
+from odocal_ros.leg import SLOTS
 
 BLOCK = 'odocal_journal'
 
@@ -41,6 +42,5 @@ def journal_notes(bag: Path) -> JournalNotes | None:
         raise BadUsage(f'{path}: is a pipe, a device or a folder; remove it to replay the bag')
     from odocal_ros.config_file import read_journal_file
     settings, about = read_journal_file(path, BLOCK)
-    return JournalNotes(path, settings, {key.removeprefix('topics.'): value
-                                         for key, value in about.items()
-                                         if key.startswith('topics.')})
+    topics = {slot: about[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in about}
+    return JournalNotes(path, settings, topics)
