@@ -11,7 +11,7 @@ from odocal_ros.errors import BadBag
 RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
 UNPACKED = 2**26             # bytes that a bag may always unpack to, and
 RATIO = 40                   # more for each of its own; sensors' messages pack to a tenth
-TEXT = 2**20                 # bytes of a YAML file
+TEXT = 2**19                 # bytes of a YAML file
 DEFINITION = 2**16           # characters of a message definition
 ELEMENTS = 100_000           # values in the fixed arrays of one message
 SECONDS = 20                 # to understand a definition
@@ -78,6 +78,7 @@ class Allowance:
         """
         most = self.left if size is None else min(size, self.left)
         if not packing:
+            self.take(len(data))
             return data
         parts, have = [], 0
         while data and have <= most:

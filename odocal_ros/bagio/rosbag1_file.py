@@ -1,6 +1,7 @@
 """A rosbag1 file, through rosbags: with bounds on what its index and its chunks may claim."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 import io
 from pathlib import Path
 from typing import Any
@@ -43,9 +44,8 @@ class Rosbag1File(Recording):
         for at, chunk in reader.chunks.items():
             packing = PACKINGS[next(name for name, known in _decompressors().items()
                                     if known is chunk.decompressor)]
-            reader.chunks[at] = chunk._replace(decompressor=lambda data, packing=packing: (
-                self._allowance.take(len(data)) or data if not packing
-                else self._allowance.unpack(packing, data)))
+            reader.chunks[at] = chunk._replace(decompressor=partial(
+                self._allowance.unpack, packing))
         return reader
 
     def _unreadable(self, error: Exception) -> BadBag:
@@ -98,10 +98,10 @@ def _reader(path: Path) -> Any:
             """Return so many bytes, or as many as a file has."""
             return super().read(min(size, most) if size and size > 0 else size)
 
-    class File(type(path)):     # type: ignore[misc]
+    class File(type(Path())):     # type: ignore[misc]
         """A path whose file is so bounded."""
 
-        def open(self, *_) -> io.BufferedReader:      # type: ignore[override]
+        def open(self, *_) -> io.BufferedReader:
             """Open the file for reading."""
             return Bounded(io.FileIO(self))
 

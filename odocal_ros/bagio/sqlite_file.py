@@ -105,12 +105,10 @@ class SqliteFile(Recording):
         self.damage = 'cut off' if self._leaves.cut else str(error)
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        if self._leaves:
-            rows = ((key, time_ns) for key, time_ns, _ in self._leaves.rows(None))
-        else:
-            rows = self._query('SELECT topic_id, timestamp FROM messages')
+        rows: Iterator[tuple] = self._leaves.rows(None) if self._leaves else self._query(
+            'SELECT topic_id, timestamp, NULL FROM messages')
         before = -1
-        for key, time_ns in rows:
+        for key, time_ns, _ in rows:
             if isinstance(key, int) and key in self._channels and possible(time_ns):
                 self._sorted &= time_ns >= before
                 before = time_ns

@@ -82,7 +82,7 @@ def _sides(t, s, rolls, imu) -> list[str]:
     k = len(rolls)
     none = [''] * k
     # by damaged stamps a recording may last for years
-    grid = np.arange(t[0], t[-1], CELL) if t[-1] - t[0] < MOST_DAYS * 86400 else []
+    grid = np.arange(t[0], t[-1], CELL) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return none
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
