@@ -10,16 +10,12 @@ from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.facing import axes_reasons, facing
-from odocal_ros.calib.failed import failed
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
-from odocal_ros.calib.smoother.outcome import refused as smoother_refused
-from odocal_ros.calib.two_point import unsolved
-from odocal_ros.calib.wheels.result import refused as wheels_refused
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
-from odocal_ros.errors import OdocalError
 from odocal_ros.fix_screen import origin_amid
+from odocal_ros.leg_methods import METHODS, run_method
 from odocal_ros.leg_tracks import check_of, tracks
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
@@ -27,10 +23,6 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
-from odocal_ros.slow_slip import held
-from odocal_ros.smoother_run import smoother
-from odocal_ros.two_point_run import two_point
-from odocal_ros.wheels_run import wheels
 
 # methods that begin with the alignment: what it had to say is said of them
 ALIGNED = ('two_point', 'wheels')
@@ -39,14 +31,6 @@ FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.REVERSING_UNSIGNED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
-
-
-# in order of running; two_point, the operator's own marks, is always computed and shown
-METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
-# what each gives where it refuses: (inputs, reason) to MethodResult
-UNKNOWN = {'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
-           'wheels': wheels_refused,
-           'smoother': lambda inputs, why: smoother_refused((why,), inputs.scale_unit)}
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -95,7 +79,7 @@ class LegRun:
         self._prepare()
         methods, paths = {}, {}
         for name in self._asked():
-            method, paths[name] = self._run(name)
+            method, paths[name] = run_method(name, self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))
@@ -114,18 +98,6 @@ class LegRun:
             m, details=m.details | check_of(self, paths[name])) for name, m in methods.items()}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
                           deciding=deciding(self.config.method), **shown)
-
-    def _run(self, name):
-        """Return a method's result and path; what breaks in it costs this method, not the leg."""
-        found = len(self.reasons)
-        try:
-            method, path = METHODS[name](self)
-            return held(method, self), path
-        except (OdocalError, MemoryError):
-            raise
-        except Exception as error:
-            del self.reasons[found:]       # what it said of the data may be as wrong
-            return failed(lambda why: UNKNOWN[name](self.inputs, why), name, error), None
 
     def _asked(self):
         """Return the methods to run: those asked for, of auto those that the leg can carry."""

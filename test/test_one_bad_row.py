@@ -6,7 +6,7 @@ from drives import changed, drive, everything_said, settings
 import numpy as np
 import pytest
 
-from odocal_ros import leg_run
+from odocal_ros import leg_methods
 from odocal_ros.calib.failed import traces
 from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
@@ -46,7 +46,7 @@ def test_a_fault_in_a_method_costs_that_method(made, monkeypatch, broken):
     def breaks(run):
         run.reasons.append('half a finding')
         raise np.linalg.LinAlgError('Singular\nmatrix')
-    monkeypatch.setitem(leg_run.METHODS, broken, breaks)
+    monkeypatch.setitem(leg_methods.METHODS, broken, breaks)
     result = calibrate(leg, config)
     reason, = (r for r in result.methods[broken].reasons if r.code is Code.METHOD_FAILED)
     assert f'method {broken} broke: LinAlgError (Singular matrix) in breaks' in reason.text

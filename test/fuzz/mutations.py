@@ -34,7 +34,7 @@ def some_place(rng, size):
     return size - 1 - rng.randrange(min(size, 4096)) if kind < 0.5 else rng.randrange(size)
 
 
-def spoil(rng, data, places=None):
+def spoil(rng, data):
     """Change bytes anywhere: bits, numbers, runs, cuts, doubles."""
     data = bytearray(data)
     for _ in range(rng.choice([1, 1, 2, 4, 16])):
@@ -63,15 +63,29 @@ def spoil(rng, data, places=None):
     return data
 
 
+def without_checksums(rng, bag):
+    """Return the file of a bag, an mcap file mostly as those have it that write no checksums."""
+    file = file_of(bag)
+    data = bytearray(file.read_bytes())
+    if data.startswith(MAGIC) and rng.random() < 0.7:
+        at = len(MAGIC)
+        while data[at] != 2:
+            if data[at] == CHUNK:
+                data[at + 33:at + 37] = bytes(4)
+            at += 9 + int.from_bytes(data[at + 1:at + 9], 'little')
+        file.write_bytes(data)
+    return file
+
+
 def raw(rng, bag):
     """Change bytes of the file."""
-    file = file_of(bag)
+    file = without_checksums(rng, bag)
     file.write_bytes(spoil(rng, file.read_bytes()))
 
 
 def clump(rng, bag):
     """Overwrite a few bytes of one chunk, as a disk or a copy does."""
-    file = file_of(bag)
+    file = without_checksums(rng, bag)
     data = bytearray(file.read_bytes())
     at = rng.randrange(len(data))
     for place in range(at, min(at + 400, len(data)), rng.randrange(10, 60)):

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from odocal_ros import leg_run
+from odocal_ros import leg_methods
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
 from odocal_ros.sim.options import SimOptions
@@ -25,7 +25,7 @@ def bag(tmp_path_factory):
 def test_a_method_that_breaks_leaves_a_trace_file(bag, tmp_path, monkeypatch, capsys):
     def breaks(run):
         raise ZeroDivisionError('by nothing')
-    monkeypatch.setitem(leg_run.METHODS, 'smoother', breaks)
+    monkeypatch.setitem(leg_methods.METHODS, 'smoother', breaks)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
     code = main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--quiet'])
     line, = capsys.readouterr().err.strip().splitlines()
