@@ -1,36 +1,37 @@
-"""An mcap file (mcap.dev/spec): by its index, or record by record where that is gone or wrong."""
+"""An mcap file: by its index, or record by record where that is gone or wrong."""
 
 from collections.abc import Iterator, Mapping
 import heapq
 from operator import itemgetter
 from pathlib import Path
 import struct
-from typing import NamedTuple
 import zlib
 
 from odocal_ros.bagio.channels import Channel, FORMATS, Message, Recording
 from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.bagio.limits import Allowance, Damaged, LATEST_NS, LimitReached
+from odocal_ros.bagio.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    CHUNK_INDEX,
+    END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    Place,
+    place_of,
+    RECORD,
+    records_of,
+    SCHEMA,
+    STATISTICS,
+    statistics_of,
+    text_at,
+)
 
-MAGIC = b'\x89MCAP0\r\n'
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 8, 11
-USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
-MOST_CUT = 2**26        # bytes taken of a chunk that the file ends in
-RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
-INDEX_HEAD = struct.Struct('<QQQQ')
-END = 9 + 20 + len(MAGIC)      # of the footer
 CHUNK_DAMAGED, INDEX_DAMAGED = 'a damaged chunk', 'a damaged index'
 Entry = tuple[int, int, bytes]     # time, channel, message
-
-
-class Place(NamedTuple):
-    """A chunk by the index: its times, where its record stands, whose messages it holds."""
-
-    start_ns: int
-    end_ns: int
-    at: int
-    size: int
-    channels: frozenset[int]
 
 
 class McapFile(Recording):
@@ -79,13 +80,13 @@ class McapFile(Recording):
         if crc and zlib.crc32(data[start:-len(MAGIC) - 4]) != crc:
             raise Damaged(INDEX_DAMAGED)
         found = None
-        for op, body, _ in _records(data[start:-END]):
+        for op, body, _ in records_of(data[start:-END]):
             if op in (SCHEMA, CHANNEL):
                 self._learn(op, body)
             elif op == CHUNK_INDEX:
-                self._places.append(_place(body))
+                self._places.append(place_of(body))
             elif op == STATISTICS:
-                found = _statistics(body)
+                found = statistics_of(body)
         if found is None or found[0] and not (self._places and self._schemas):
             return False
         count, start_ns, end_ns, counts = found
@@ -162,7 +163,7 @@ class McapFile(Recording):
 
     def _walk(self) -> Iterator[Entry]:
         """Yield every message from the first record on, chunk by chunk."""
-        for op, body, whole in _records(self._file, len(MAGIC)):
+        for op, body, whole in records_of(self._file, len(MAGIC)):
             try:
                 if op == CHUNK:
                     yield from self._chunk(body, cut=not whole)
@@ -183,7 +184,7 @@ class McapFile(Recording):
         """Return the messages of a chunk by time; or Damaged. ``cut``: the file ends in it."""
         try:
             start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
-            packing, at = _text(body, CHUNK_HEAD.size)
+            packing, at = text_at(body, CHUNK_HEAD.size)
             (packed,) = struct.unpack_from('<Q', body, at)
             data = body[at + 8:at + 8 + packed]
             records = self._allowance.unpack(packing, data, size)
@@ -231,13 +232,13 @@ class McapFile(Recording):
         """Note a schema or a channel."""
         (key,) = struct.unpack_from('<H', body)
         if op == SCHEMA:
-            name, at = _text(body, 2)
-            form, at = _text(body, at)
-            text, _ = _text(body, at)
+            name, at = text_at(body, 2)
+            form, at = text_at(body, at)
+            text, _ = text_at(body, at)
             self._schemas[key] = name, (FORMATS.get(form, ''), text)
         elif key not in self._channels:
-            topic, at = _text(body, 4)
-            form, _ = _text(body, at)
+            topic, at = text_at(body, 4)
+            form, _ = text_at(body, at)
             (schema,) = struct.unpack_from('<H', body, 2)
             name, definition = self._schemas.get(schema, ('', ('', '')))
             self._channels[key] = Channel(topic, name, 0, form, definition)
@@ -249,35 +250,3 @@ class McapFile(Recording):
 
 def _said(error: Exception) -> str:
     return str(error) if isinstance(error, Damaged) else 'a damaged record'
-
-
-def _records(data, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the records of a section, up to the footer, and whether they are whole."""
-    while at + 9 <= len(data):
-        op, size = RECORD.unpack(data[at:at + 9])
-        if op == FOOTER:
-            return
-        stop = at + 9 + size
-        whole = stop <= len(data)
-        if op in USED and whole or op == CHUNK:      # the last chunk too where the file is cut off
-            yield op, data[at + 9:min(stop, at + 9 + MOST_CUT) if not whole else stop], whole
-        at = stop
-
-
-def _place(body: bytes) -> Place:
-    start_ns, end_ns, at, size = INDEX_HEAD.unpack_from(body)
-    (length,) = struct.unpack_from('<I', body, INDEX_HEAD.size)
-    pairs = body[INDEX_HEAD.size + 4:INDEX_HEAD.size + 4 + length]
-    return Place(start_ns, end_ns, at, size,
-                 frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)))
-
-
-def _statistics(body: bytes) -> tuple[int, int, int, dict[int, int]]:
-    """Return the number of messages, their first and last time, and the number by channel."""
-    count, *_, start_ns, end_ns, length = struct.unpack_from('<QHIIIIQQI', body)
-    return count, start_ns, end_ns, dict(struct.iter_unpack('<HQ', body[46:46 + length]))
-
-
-def _text(body: bytes, at: int) -> tuple[str, int]:
-    (size,) = struct.unpack_from('<I', body, at)
-    return body[at + 4:at + 4 + size].decode(), at + 4 + size

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import ros_bags
 
-from odocal_ros.bagio.mcap_file import CHUNK, McapFile
+from odocal_ros.bagio.mcap_file import McapFile
+from odocal_ros.bagio.mcap_records import CHUNK
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.config import Config
 from odocal_ros.errors import BadBag, BadData

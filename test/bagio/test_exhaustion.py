@@ -11,7 +11,7 @@ from ros_bags import T0
 
 from odocal_ros.bagio import definitions
 from odocal_ros.bagio.limits import LimitReached, RAISE, zstd_module
-from odocal_ros.bagio.mcap_file import MAGIC
+from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
 

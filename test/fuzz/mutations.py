@@ -7,7 +7,7 @@ import struct
 import yaml
 
 from odocal_ros.bagio.limits import zstd_module
-from odocal_ros.bagio.mcap_file import CHUNK, MAGIC
+from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
 
 INTEGERS = [0, 1, -1, 2, 127, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
             2**63 - 1, 2**63, 2**64 - 1]
