@@ -36,7 +36,7 @@ setup(
         'numpy>=1.26',
         'pyproj>=3.6',
         'PyYAML>=6',
-        'rosbags>=0.11',
+        'rosbags>=0.11,<0.12',
         'scipy>=1.11',
         'tqdm>=4',
     ],

@@ -9,8 +9,10 @@ those of YAML 1.1 (``1e-3`` is a number, ``1_000`` is text).
 from pathlib import Path
 import re
 
+from odocal_ros.bagio.limits import read_text
 from odocal_ros.config import Config, SETTINGS, with_settings
 from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.yaml_tree import composed
 
 NODE = '/calibrator'
 PARAMETERS = 'ros__parameters'
@@ -20,6 +22,7 @@ NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_descri
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
+LONGEST = 100        # characters of a number
 DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
 
@@ -36,13 +39,20 @@ def read_config_file(path: Path) -> dict[str, object]:
         a wrong value; the text tells file and line.
 
     """
-    path = Path(path)
+    return _settings(Path(path), _root(Path(path)))
+
+
+def _root(path: Path):
+    """Return the root node of a parameter file."""
     try:
-        root = _composed(path.read_text(encoding='utf-8'), str(path))
+        return composed(read_text(path), str(path))
     except OSError as error:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); check --config') from None
     except UnicodeDecodeError:
         raise BadConfig(f'{path}: not a text file; want a ROS parameter file (YAML)') from None
+
+
+def _settings(path: Path, root) -> dict[str, object]:
     blocks = _blocks(root, '')
     ours = [block for key, block in blocks.items() if _means_us(key)]
     if not ours:
@@ -54,6 +64,15 @@ def read_config_file(path: Path) -> dict[str, object]:
         if not NOT_OURS.match(name):
             values[name] = _checked(name, _value(node), f'{path}, line {_line(node)}: ')
     return values
+
+
+def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[str, str]]:
+    """Return the settings of a journal's file, and what a block of its own says, as text."""
+    root = _root(path)
+    about = list(_blocks(root, '').get(block, ()))
+    return _settings(path, root), {
+        name: node.value for part in about for name, node in _leaves(part, '')
+        if isinstance(node.value, str)}
 
 
 def parse_set(text: str) -> tuple[str, object]:
@@ -73,24 +92,13 @@ def parse_set(text: str) -> tuple[str, object]:
     if not equals or not name:
         raise BadUsage(f'--set {text}: want key=value, as in --set leg.min_distance=50')
     try:
-        node = _composed(value, f'--set {name}')
+        node = composed(value, f'--set {name}')
     except BadConfig as error:
         raise BadUsage(str(error)) from None
     if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):
         return name, _checked(name, value.strip(), '--set ')      # a joint may be named 0 or on
     where = '--set ' if name in SETTINGS else '--set: '           # then the setting's name
     return name, _checked(name, '' if node is None else _value(node), where)
-
-
-def _composed(text, where):
-    import yaml
-    try:
-        return yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        line = f', line {mark.line + 1}' if mark else ''
-        problem = getattr(error, 'problem', None) or ' '.join(str(error).split())
-        raise BadConfig(f'{where}{line}: not valid YAML: {problem}') from None
 
 
 def _is_quoted(node):
@@ -128,6 +136,8 @@ def _blocks(node, prefix) -> dict[str, list]:
 
 def _means_us(key: str) -> bool:
     """Return whether a node key, with the wildcards * and **, matches /calibrator."""
+    if len(key) > LONGEST:
+        return False
     parts = {'**': r'(?:/\w+)*', '*': r'/\w+'}
     pattern = ''.join(parts.get(p, '/' + re.escape(p)) for p in key.strip('/').split('/'))
     return re.fullmatch(pattern, NODE) is not None
@@ -157,8 +167,12 @@ def scalar(text: str) -> bool | int | float | str:
     """Return a plain scalar as rcl types it (measured on rcl 9.2)."""
     if text in TRUE or text in FALSE:
         return text in TRUE
+    if len(text) > LONGEST:
+        return text
     if whole := WHOLE.fullmatch(text):
-        return int(text, 16 if whole[1] else 8 if whole[2] else 10)
+        number = int(text, 16 if whole[1] else 8 if whole[2] else 10)
+        if -2**63 <= number < 2**63:
+            return number
     dotted = DOTTED.fullmatch(text)
     try:
         return float(dotted[1] + dotted[2] if dotted else text) if '_' not in text else text

@@ -7,8 +7,12 @@ from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
 
 HEIGHT = 1e5         # m, beyond it a fix is at no real position
+ALIKE = 1e-3         # correlations above and below the diagonal
 ABOUT_START = 11     # fixes about the start mark that the origin is amid
 AWAY = 1e6           # m from where most fixes are, the same
+SMALLEST = 1e-6      # m, a sigma below it, and
+LARGEST = 1e8        # m, beyond it, says nothing
+INDEPENDENT = 1e-6   # least eigenvalue of the correlations: below it an axis adds nothing
 
 
 def usable_fixes(fix, sent, gnss):
@@ -68,19 +72,32 @@ def covariances(fix, default_sigma):
     """
     Return covariances with the unknown ones replaced, and which those are.
 
-    Unknown is type 0, zero or less, not finite; where only the height's part is, it is taken from
-    the level part.
+    Unknown is type 0, zero or less, not finite, or no covariance at all (a correlation of one or
+    more); where only the height's part is, it is taken from the level part.
     """
     covariance = fix.covariance_n.copy()
-    diagonal = np.diagonal(covariance, axis1=1, axis2=2)
-    level = np.isfinite(covariance[:, :2, :2]).all(axis=(1, 2)) & (diagonal[:, :2] > 0).all(axis=1)
-    unknown = ~level | (fix.covariance_type == 0)
-    flat = unknown | ~(np.isfinite(covariance).all(axis=(1, 2)) & (diagonal[:, 2] > 0))
+    unknown = ~_proper(covariance[:, :2, :2]) | (fix.covariance_type == 0)
+    flat = unknown | ~_proper(covariance)
     covariance[unknown] = np.eye(3) * default_sigma**2
     covariance[flat, 2, :] = covariance[flat, :, 2] = 0.0
     # satellites are above only: a height is about twice as bad
     covariance[flat, 2, 2] = 4 * np.maximum(covariance[flat, 0, 0], covariance[flat, 1, 1])
     return covariance, unknown
+
+
+def _proper(matrices):
+    """Tell which matrices are covariances that can be inverted: (n, k, k) to (n,) bool."""
+    variance = np.diagonal(matrices, axis1=1, axis2=2)
+    # products and roots of what is beyond any receiver would overflow
+    sane = (np.isfinite(matrices) & (np.abs(matrices) < LARGEST**2)).all(axis=(1, 2))
+    sane &= (variance > SMALLEST**2).all(axis=1)
+    with np.errstate(all='ignore'):
+        sigma = np.sqrt(variance)
+        unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
+    unit[~sane] = np.eye(matrices.shape[1])
+    # one that is not symmetric is damaged: which half holds, nobody knows
+    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ALIKE).all(axis=(1, 2))
+    return sane & (np.linalg.eigvalsh(unit)[:, 0] > INDEPENDENT)
 
 
 def origin_amid(t_fix, geodetic) -> Origin:

@@ -1,11 +1,20 @@
 """Values no sensor means: beyond any range, or alone against all their neighbours."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.reasons import Code, Reason
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
-BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15}
+BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
+LARGEST = 1e300      # of any other value: sums and products with it stay finite
+UNIT = 2.0           # times one, either way: a quaternion of another length is no attitude
+WIDEST = 1e12        # rad^2, no driver's way of saying unknown is beyond it
+TINY = 1e-100        # nor does any sensor mean this, but zero
+CLUMP = 5            # rows beyond any sensor, each within NEAR rows of the one before, are a clump
+NEAR = 50            # rows: a page or a packed block of a recording is about so many
+DAMAGED = 0.01       # of the rows beyond any sensor: so many are a damaged recording
 TURN_STEP = 0.8      # rad/s, least bound from row to row that may be a glitch
 FORCE_STEP = 50.0    # m/s^2, the same: potholes stay
 SPEED_STEP = 0.3     # of the top speed, the same
@@ -23,9 +32,39 @@ def beyond(name, column):
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
     with np.errstate(invalid='ignore'):
-        usable = np.abs(column) <= BEYOND.get(name, np.inf)
-    usable &= np.isfinite(column)
+        size = np.abs(column)
+        usable = (size <= BEYOND.get(name, LARGEST)) & ((size >= TINY) | (size == 0))
     return ~usable.all(axis=tuple(range(1, column.ndim)))
+
+
+def oriented(samples):
+    """Return Imu or heading rows without the orientations that are none; variance NaN there."""
+    wild = beyond('q_ni', samples.q_ni)
+    length = np.linalg.norm(np.where(wild[:, None], 0.0, samples.q_ni), axis=1)
+    none = (length < 1 / UNIT) | (length > UNIT) | (np.abs(samples.yaw_variance) > WIDEST)
+    if not (wild | none & ~np.isnan(samples.yaw_variance)).any():
+        return samples
+    return replace(samples, q_ni=np.where(none[:, None], 0.0, samples.q_ni),
+                   yaw_variance=np.where(none, np.nan, samples.yaw_variance))
+
+
+def about_clumps(wild):
+    """
+    Tell which rows stand in or about a clump of rows that are beyond any sensor.
+
+    Where a recording is damaged, what shows is a part of what is wrong: rows beside it are wrong
+    by less than a sensor's range.
+
+    wild : (n,) bool.   Returns (n,) bool, the clumps and to either side as many rows as twice the
+    widest stretch in them that looks sound.
+    """
+    suspect = np.zeros(len(wild), bool)
+    at = np.flatnonzero(wild)
+    for group in np.split(at, np.flatnonzero(np.diff(at) > NEAR) + 1):
+        if len(group) >= CLUMP:
+            wide = 2 * int(np.diff(group).max())
+            suspect[max(group[0] - wide, 0):group[-1] + wide + 1] = True
+    return suspect
 
 
 def alone(t, x, least):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from odocal_ros.errors import BadData
 from odocal_ros.samples import (
     FixSamples,
     HeadingSamples,
@@ -29,6 +30,8 @@ EMPTY = {
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
+AFTER_NS = 600 * 10**9   # a first row later than that after a mark tells nothing of it
+MOST_DAYS = 7          # of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
 
 
@@ -115,7 +118,18 @@ class LegRecorder:
 
         Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
         interpolated at the mark; later ones are not, however late the leg is closed.
+
+        Raises
+        ------
+        BadData
+            The marks are days apart: what is computed second by second would not end.
+
         """
+        days = (stop_ns - start_ns) / 86400e9
+        if days > MOST_DAYS:
+            raise BadData(f'the leg lasts {days:.0f} days by the stamps of its rows: a clock was '
+                          'set while it was recorded, or they are damaged; mark a part of it by '
+                          '--leg A:B')
         first_ns = start_ns - round(preroll * 1e9)
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,
@@ -129,7 +143,7 @@ def _key(samples) -> np.ndarray:
 
 def _cut(samples, first_ns: int, stop_ns: int):
     key = _key(samples)
-    after = key[key > stop_ns]
+    after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)
     return samples if keep.all() else take(samples, keep)

@@ -15,6 +15,7 @@ from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
 from odocal_ros.fix_screen import origin_amid
+from odocal_ros.leg_methods import METHODS, run_method
 from odocal_ros.leg_tracks import check_of, tracks
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
@@ -22,10 +23,6 @@ from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import imu_gap
-from odocal_ros.slow_slip import held
-from odocal_ros.smoother_run import smoother
-from odocal_ros.two_point_run import two_point
-from odocal_ros.wheels_run import wheels
 
 # methods that begin with the alignment: what it had to say is said of them
 ALIGNED = ('two_point', 'wheels')
@@ -34,10 +31,6 @@ FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.REVERSING_UNSIGNED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
-
-
-# in order of running; two_point, the operator's own marks, is always computed and shown
-METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -86,8 +79,7 @@ class LegRun:
         self._prepare()
         methods, paths = {}, {}
         for name in self._asked():
-            method, paths[name] = METHODS[name](self)
-            method = held(method, self)
+            method, paths[name] = run_method(name, self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))

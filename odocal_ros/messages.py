@@ -25,6 +25,7 @@ from odocal_ros.samples import (
     VelocitySamples,
 )
 
+HOPELESS = 20_000    # messages that gave nothing, after which odd ones are not looked at
 RAD_PER_DEG = math.pi / 180
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
@@ -151,11 +152,15 @@ class Reader:
         except OdocalError:
             raise
         except Exception as error:   # rclpy and rosbags each have their own way to fail
-            self.trouble = f'cannot be deserialised as {self.msgtype}: {error}'
+            why = ' '.join(str(error).split())[:200]
+            self.trouble = f'cannot be deserialised as {self.msgtype}: {why}'
             return None
 
     def _one(self, out, i, raw, deserialize) -> bool:
         """Read one message into row i; False: it gives none."""
+        if self.unreadable > HOPELESS:      # trying costs a hundred times what reading does
+            self.unreadable += 1
+            return False
         view = self._view(raw, deserialize)
         if view is None:
             self.unreadable += 1
@@ -224,7 +229,8 @@ def _fix(stamps, received, position, covariance, known, status) -> FixSamples:
 
 def _velocity(stamps, received, velocity_n, *covariance) -> VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    return VelocitySamples(stamps, received, velocity_n, np.where(variance > 0, variance, 0.0))
+    told = (variance > 0) & (variance < 1e12)       # else unknown
+    return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
 
 
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0, 8))

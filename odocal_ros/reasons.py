@@ -31,6 +31,8 @@ class Code(Enum):
     FIXES_UNUSABLE = REJECT, ('Wait for a valid position; loosen gnss.min_status or '
                               'gnss.max_sigma if these fixes are good.')
     BAD_ROWS_DROPPED = NOTE, 'Mend the driver that sends them; the other rows were used.'
+    ROWS_DAMAGED = CAUTION, ('Copy the recording again from where it was made, or drive again; '
+                             'the rows about the damage were left out.')
     STAMPS_NOT_RISING = NOTE, 'Mend the clock of the sender; the rows in order were used.'
     IMU_GAP = REJECT, ('Mend the Imu stream (QoS depth, CPU load, cable), or mark a leg beside '
                        'the gap; leg.max_gap is the limit.')
@@ -134,6 +136,7 @@ class Code(Enum):
                                'widened. Check slip, lever arms, delays and the sky.')
     METHOD_REJECTED = CAUTION, ('Look up in docs/reasons.md what to do about the code named; the '
                                 'values are by another method, which may not see it.')
+    METHOD_FAILED = REJECT, 'Report it with the trace file; the other methods are not touched.'
     METHODS_DISAGREE = CAUTION, ('See the values side by side; the likely cause is named. Drive '
                                  'again with stops at both marks and turns in between.')
     # several legs, several calibrations

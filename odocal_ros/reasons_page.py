@@ -38,6 +38,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or a value that no sensor '
         'gives, stand alone far from their neighbours, or are fixes far from all others. They '
         'were left out.',
+        Code.ROWS_DAMAGED: 'So many messages of a topic hold values beyond any sensor, or so '
+        'close together, that the recording itself is damaged. Those beside them may be wrong '
+        'without showing it, so the rows about each clump were left out too.',
         Code.STAMPS_NOT_RISING: 'Stamps of one topic repeat or step back. The fewest messages '
         'were left out that leave the rest in order.',
         Code.IMU_GAP: 'The Imu is silent, or repeats one value, for longer than `leg.max_gap`. '
@@ -164,6 +167,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.METHOD_REJECTED: 'A method that goes before another, or alone tells left from right '
         'wheel, found that its values are not to be used; its first reason is given. The result '
         'is by the others.',
+        Code.METHOD_FAILED: 'A method came upon something that it was not written for and broke '
+        'off. Its values are unknown; the leg and the other methods go on. The command names a '
+        'file with the trace.',
         Code.METHODS_DISAGREE: 'Two methods give values for the same leg that differ by more than '
         'three sigmas of their difference.',
     },

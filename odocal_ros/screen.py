@@ -16,7 +16,15 @@ from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
 from odocal_ros.fix_screen import usable_fixes
-from odocal_ros.glitches import beyond, frozen, imu_glitches, speed_glitches
+from odocal_ros.glitches import (
+    about_clumps,
+    beyond,
+    DAMAGED,
+    frozen,
+    imu_glitches,
+    oriented,
+    speed_glitches,
+)
 from odocal_ros.leg import Leg
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -95,6 +103,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
+    imu, heading = oriented(imu), oriented(heading)
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
@@ -167,9 +176,12 @@ def _finite(samples, slot, leg, found):
     if slot in ('fix_velocity', 'heading'):
         needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
     stamped = samples.stamp_ns > 0
-    finite = np.ones(len(stamped), bool)
+    finite, wild = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
     for name in needed:
-        finite &= ~beyond(name, getattr(samples, name))
+        column = getattr(samples, name)
+        odd = beyond(name, column)
+        finite &= ~odd
+        wild |= odd & np.isfinite(column).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
@@ -179,7 +191,13 @@ def _finite(samples, slot, leg, found):
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
-    good = stamped & finite
+    suspect = about_clumps(wild)
+    if suspect.any() or wild.sum() > DAMAGED * len(wild):
+        found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
+                            'messages hold values beyond any sensor; '
+                            f'{int((suspect & stamped & finite).sum())} more about them were '
+                            'dropped too'))
+    good = stamped & finite & ~suspect
     return samples if good.all() else take(samples, good)
 
 

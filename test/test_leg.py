@@ -4,7 +4,9 @@ from dataclasses import fields
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
+import pytest
 
+from odocal_ros.errors import BadData
 from odocal_ros.leg import LegRecorder, SLOTS
 from odocal_ros.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
 
@@ -116,3 +118,12 @@ def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
     recorder.clear()
     assert recorder.newest_ns('imu') == 0
     assert len(recorder.rows('imu').stamp_ns) == 0
+
+
+def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():
+    late = 10**9 * 86400 * 4000
+    recorder = LegRecorder()
+    recorder.feed('odometer', OdometerSamples([10, 20, 30 + late], [10, 20, 30 + late], [1, 2, 3]))
+    assert recorder.close(5, 25).odometer.value.tolist() == [1, 2]
+    with pytest.raises(BadData, match='the leg lasts 4000 days'):
+        recorder.close(5, 40 + late)

@@ -339,3 +339,15 @@ def test_two_wheels_give_their_mean(made):
     _, codes, _ = said(replace(two.leg(), odometer_right=changed(
         two.odometer_right, stamp_ns=lambda a: a * 0)))
     assert Code.NO_ODOMETER in codes
+
+
+@pytest.mark.parametrize('q', [1e200, np.nan, 5e-324, 0.0, 7.0])
+@pytest.mark.parametrize('variance', [0.01, np.nan, 1e300])
+def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
+    bad = changed(leg.imu, q_ni=lambda a: a.__setitem__(slice(40, 60), q),
+                  yaw_variance=lambda a: a.__setitem__(slice(40, 60), variance))
+    with np.errstate(all='raise'):
+        inputs, _, _ = said(replace(leg, imu=bad))
+    assert not np.isfinite(inputs.yaw_variance[40:60]).any()
+    assert np.abs(np.nan_to_num(inputs.q_ni)).max() <= 7.0
+    assert len(inputs.t_imu) == len(leg.imu.stamp_ns)

@@ -15,8 +15,9 @@ import zlib
 
 import numpy as np
 
-from odocal_ros.bagio.recover import CHANNEL, Channel, CHUNK, FOOTER, MCAP_MAGIC, MESSAGE, SCHEMA
-from odocal_ros.bagio.sources import zstd_module
+from odocal_ros.bagio.channels import Channel
+from odocal_ros.bagio.limits import zstd_module
+from odocal_ros.bagio.mcap_records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, SCHEMA
 from odocal_ros.whole import whole_file, WholeFile
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 1, 7, 8, 11, 15
@@ -102,7 +103,7 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
                 + _text('ros2msg' if c.definition[0] else '') + _text(c.definition[1]))
         + _record(CHANNEL, struct.pack('<HH', key, key) + _text(c.topic) + _text(c.serialization)
                   + struct.pack('<I', 0)) for key, c in channels.items())
-    at = file.write(MCAP_MAGIC + _record(HEADER, _text('ros2') + _text('odocal_ros')) + described)
+    at = file.write(MAGIC + _record(HEADER, _text('ros2') + _text('odocal_ros')) + described)
     indexes, counts, start_ns, end_ns = [], Counter(dict.fromkeys(channels, 0)), 2**63 - 1, 0
     for chunk in chunks:
         indexes.append(_chunk_index(chunk, at))
@@ -116,7 +117,7 @@ def _fill(file: WholeFile, channels: Mapping[int, Channel], chunks: Iterable[Chu
                              len(indexes), start_ns, end_ns, len(tallies)) + tallies
     summary = described + _record(STATISTICS, statistics) + b''.join(indexes)
     footer = struct.pack('<QQI', at + len(end), 0, 0)
-    return at + file.write(end + summary + _record(FOOTER, footer) + MCAP_MAGIC)
+    return at + file.write(end + summary + _record(FOOTER, footer) + MAGIC)
 
 
 def _chunk_index(chunk: Chunk, at: int) -> bytes:
@@ -139,7 +140,7 @@ def _chunk_body(record: bytes) -> tuple[int, int, int, int, str, int]:
 def read_chunks(path: Path) -> Iterator[Chunk]:
     """Yield the chunks of a file that ``write_file`` wrote, one at a time."""
     with path.open('rb') as file:
-        file.seek(len(MCAP_MAGIC))
+        file.seek(len(MAGIC))
         record = b''
         while head := file.read(9):
             op, size = struct.unpack('<BQ', head)

@@ -5,15 +5,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 import hashlib
 import heapq
-from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 import tempfile
 
-from odocal_ros.bagio.parts import Batch, BLOCK, group, Part
+from odocal_ros.bagio.limits import is_file
+from odocal_ros.bagio.parts import Batch, group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
-from odocal_ros.errors import BadBag, BadData, BadUsage
+from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import Reader
 from odocal_ros.reasons import Code, Reason
 
@@ -149,7 +149,7 @@ class Bag:
             for time_ns, raw in zip(*batch[topic], strict=True):
                 try:
                     message = deserialize(raw)
-                except BadData:
+                except (OdocalError, MemoryError):
                     raise
                 except Exception:   # one damaged message is no reason to lose the others
                     continue
@@ -175,11 +175,7 @@ def _merged(parts: list[Part], topics: Mapping[str, str]) -> Iterator[Batch]:
         yield from parts[0].batches(topics)
         return
     stream = heapq.merge(*(part.stream(topics) for part in parts), key=itemgetter(1))
-    while True:
-        batch: Batch = {}
-        group(islice(stream, BLOCK), batch)
-        if not batch:
-            return
+    while batch := group(stream):
         yield batch
 
 
@@ -219,9 +215,10 @@ class open_bag:
                          'can be read; convert it with ros2 bag convert')
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
         parts, lost = [], []
+        total = sum(path.stat().st_size for path in source.files if is_file(path))
         for path in source.files:
             try:
-                part = Part(path, *unpack(path, folder), types.cdr_from_ros1)
+                part = Part(path, *unpack(path, folder, total), total, types.cdr_from_ros1)
             except BadBag as error:
                 lost.append(error)
                 continue

@@ -7,8 +7,18 @@ import re
 import shutil
 import sqlite3
 
+from odocal_ros.bagio.channels import possible
+from odocal_ros.bagio.limits import (
+    Allowance,
+    is_file,
+    LATEST_NS,
+    LimitReached,
+    read_text,
+    zstd_module,
+)
 from odocal_ros.bagio.numbered import JOURNAL, without_joined
 from odocal_ros.errors import BadBag
+from odocal_ros.yaml_tree import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
@@ -53,39 +63,38 @@ def find(path: Path) -> Source:
     if path.is_dir():
         return _folder(path)
     beside = path.parent / 'metadata.yaml'
-    known = _read_metadata(beside)[0] if beside.exists() else {}
-    mine = [item for item in known.get('files') or () if Path(item['path']).name == path.name]
-    if not mine and _file_names(known) == [path.name]:
-        mine = [known]
-    return Source(_stem(path), (path,), whole=_span(mine[0]) if mine else None,
-                  foreign=_foreign(known) if path.name in _file_names(known) else '')
+    known = _read_metadata(beside) if beside.exists() else Known()
+    if path.name not in known.names:
+        return Source(_stem(path), (path,))
+    whole = dict(known.of_file).get(path.name) or (
+        known.whole if known.names == (path.name,) else None)
+    return Source(_stem(path), (path,), whole=whole, foreign=known.foreign)
 
 
 def _folder(path: Path) -> Source:
-    name = path.resolve().name
-    notes: list[str] = []
-    known: dict = {}
-    if (path / 'metadata.yaml').exists():
-        known, trouble = _read_metadata(path / 'metadata.yaml')
-        notes += [trouble] * bool(trouble)
-    wanted = _file_names(known)
-    files = [path / file for file in wanted if (path / file).exists()]
-    lost = [file for file in wanted if not (path / file).exists()]
+    beside = path / 'metadata.yaml'
+    known = _read_metadata(beside) if beside.exists() else None
+    wanted = known.names if known else ()
+    notes = [known.trouble] if known and known.trouble else []
+    files = [path / file for file in wanted if is_file(path / file)]
+    lost = [file for file in wanted if not is_file(path / file)]
     if lost and files:
         notes.append(f'{path}: {len(lost)} of {len(wanted)} files named in metadata.yaml are '
                      f'missing ({", ".join(lost)}); the others are read')
     if not files:
-        files = sorted((f for f in path.iterdir() if f.name.endswith(ENDINGS)), key=_by_number)
+        files = sorted((f for f in path.iterdir() if f.name.endswith(ENDINGS) and is_file(f)),
+                       key=_by_number)
         if (path / JOURNAL).exists():
             files = without_joined(files)
         if not files:
             raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint(path)}')
-        what = 'names no file that is here' if known else 'is missing'
-        notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
-                     f'{"s" * (len(files) > 1)} in name order')
-    spans = tuple((Path(item['path']).name, _span(item)) for item in known.get('files') or ())
-    return Source(name, tuple(files), tuple(notes), _span(known) if known else None,
-                  tuple((file, span) for file, span in spans if span), _foreign(known))
+        what = 'names no file that is here' if wanted else 'is missing'
+        if known is None or wanted:
+            notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
+                         f'{"s" * (len(files) > 1)} in name order')
+    known = known or Known()
+    return Source(path.resolve().name, tuple(files), tuple(notes), known.whole, known.of_file,
+                  known.foreign)
 
 
 def _hint(path: Path) -> str:
@@ -108,52 +117,70 @@ def _stem(path: Path) -> str:
     return name or path.name
 
 
-def _read_metadata(path: Path) -> tuple[dict, str]:
-    """Return the metadata, or {} and what is wrong with it."""
+@dataclass(frozen=True)
+class Known:
+    """What metadata.yaml says; ``trouble`` is what is wrong with it where it cannot be used."""
+
+    names: tuple[str, ...] = ()
+    whole: Span | None = None
+    of_file: tuple[tuple[str, Span], ...] = ()
+    foreign: str = ''
+    trouble: str = ''
+
+
+def _read_metadata(path: Path) -> Known:
+    """Return what a metadata.yaml says; all that a text can have wrong is found here."""
     import yaml
+    if not is_file(path):
+        return Known(trouble=f'{path}: is a pipe, a device or a folder, so it is not used')
     try:
-        known = yaml.safe_load(path.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
-        if not isinstance(known, dict):
-            raise ValueError('no mapping')
-        _span(known), _file_names(known)
-        return known, ''
-    except (yaml.YAMLError, ValueError, KeyError, TypeError) as error:
-        why = ' '.join(str(error).split())[:100]
-        return {}, f'{path}: cannot be understood ({why}), so it is not used'
+        return _known(yaml.load(read_text(path), Loader=loader(aliases=True)))
+    except (OSError, MemoryError):
+        raise
+    except LimitReached as error:
+        return Known(trouble=f'{error}; it is not used')
+    except Exception as error:      # of any kind: types, numbers, nesting, encoding
+        why = ' '.join(str(error).split())[:100] or type(error).__name__
+        return Known(trouble=f'{path}: cannot be understood ({why}), so it is not used')
 
 
-def _file_names(known: dict) -> list[str]:
-    return [Path(name).name for name in known.get('relative_file_paths') or ()]
+def _known(content: dict) -> Known:
+    known = content['rosbag2_bagfile_information']
+    files = known.get('files') or ()
+    spans = ((Path(file['path']).name, _span(file)) for file in files)
+    formats = {str(topic['topic_metadata'].get('serialization_format', 'cdr'))
+               for topic in known.get('topics_with_message_count') or ()}
+    return Known(
+        tuple(Path(name).name for name in known.get('relative_file_paths') or ()),
+        _span(known), tuple((name, span) for name, span in spans if span),
+        '' if 'cdr' in formats else ', '.join(sorted(formats)))
 
 
 def _span(known: dict) -> Span | None:
     """Return the end and the count that metadata tell, of a bag or one file."""
     if not known.get('message_count') or 'starting_time' not in known:
         return None
-    return Span(int(known['starting_time']['nanoseconds_since_epoch'])
-                + int(known['duration']['nanoseconds']), int(known['message_count']))
+    end_ns = (int(known['starting_time']['nanoseconds_since_epoch'])
+              + int(known['duration']['nanoseconds']))
+    count = int(known['message_count'])
+    if not (possible(end_ns) and 0 <= count < LATEST_NS):
+        raise ValueError('times or counts that are none')
+    return Span(end_ns, count)
 
 
-def _foreign(known: dict) -> str:
-    """Return a serialization format other than cdr, where all topics have one."""
-    topics = known.get('topics_with_message_count') or ()
-    formats = {topic['topic_metadata'].get('serialization_format', 'cdr') for topic in topics}
-    return '' if 'cdr' in formats or not formats else ', '.join(sorted(formats))
-
-
-def unpack(path: Path, folder: Path) -> tuple[Path, str]:
+def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
     """
     Return a plain file with a bag's content, and its kind ('.mcap', '.db3', '.bag').
 
     Compressed files, and databases with changes still in a -wal file beside them, are unpacked
-    into ``folder``; the user's files stay as they are.
+    into ``folder``; the user's files stay as they are. ``total`` is the size of the whole bag.
     """
     kind = kind_of(path)
     if kind == '.zstd':
-        path = _decompressed(path, folder)
+        path = _decompressed(path, folder, Allowance(path, total))
         kind = kind_of(path)
     wal = path.with_name(path.name + '-wal')
-    if kind == '.db3' and wal.exists() and wal.stat().st_size:
+    if kind == '.db3' and is_file(wal) and wal.stat().st_size:
         path = _with_wal(path, wal, folder)
     if path.suffix != kind:
         link = folder / f'{path.name}{kind}'
@@ -164,6 +191,8 @@ def unpack(path: Path, folder: Path) -> tuple[Path, str]:
 
 def kind_of(path: Path) -> str:
     """Return what a file is by its first bytes, or raise BadBag."""
+    if path.exists() and not is_file(path):
+        raise BadBag(f'{path}: is a pipe, a device or a folder, no file of a bag; give the file')
     with path.open('rb') as file:
         head = file.read(16)
     for magic, kind in MAGIC.items():
@@ -174,21 +203,22 @@ def kind_of(path: Path) -> str:
                  'file')
 
 
-def _decompressed(path: Path, folder: Path) -> Path:
+def _decompressed(path: Path, folder: Path, allowance: Allowance) -> Path:
     """Decompress as much of a file as is there."""
     zstd = zstd_module()
     target = folder / path.name.removesuffix('.zstd')
     with path.open('rb') as packed, target.open('wb') as out:
-        frame = zstd.ZstdDecompressor()    # gives what there is of a file that is cut off
-        while data := packed.read(2**18):
-            while data:
-                if frame.eof:
-                    frame = zstd.ZstdDecompressor()
-                try:
-                    out.write(frame.decompress(data))
-                except zstd.ZstdError:     # damaged: what came out is recovered like a cut file
-                    return target
-                data = frame.unused_data if frame.eof else b''
+        frame, data = zstd.ZstdDecompressor(), b''   # gives what there is of a file cut off
+        while data or not (frame.needs_input or frame.eof) or (data := packed.read(2**18)):
+            if frame.eof:
+                frame = zstd.ZstdDecompressor()
+            try:
+                piece = frame.decompress(data, 2**20)
+            except zstd.ZstdError:     # damaged: what came out is recovered like a cut file
+                return target
+            allowance.take(len(piece))
+            out.write(piece)
+            data = frame.unused_data if frame.eof else b''
     return target
 
 
@@ -204,15 +234,6 @@ def _with_wal(path: Path, wal: Path, folder: Path) -> Path:
     except sqlite3.DatabaseError:
         shutil.copyfile(path, target)     # a -wal of another file: without it, then
     return target
-
-
-def zstd_module():
-    """Return the zstd module that rosbags uses: the standard library's from Python 3.14 on."""
-    from importlib import import_module
-    try:
-        return import_module('compression.zstd')
-    except ModuleNotFoundError:
-        return import_module('backports.zstd')
 
 
 def names(paths: Sequence[Path]) -> str:

@@ -5,9 +5,11 @@ Only for files that sqlite itself cannot read to the end.
 """
 
 from collections.abc import Container, Iterator
-import mmap
+from functools import partial
 from pathlib import Path
 import struct
+
+from odocal_ros.bagio.file_bytes import FileBytes
 
 LEAF = 0x0D
 COLUMNS = 4                       # id (NULL: it is the row number), topic_id, timestamp, data
@@ -18,37 +20,54 @@ class Leaves:
     """The leaf pages of the table of messages that are in the file."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open('rb')
-        self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
-        size = struct.unpack_from('>H', self._map, 16)[0]
+        self._map = FileBytes(path)
+        head = self._map[:100]
+        size = struct.unpack_from('>H', head, 16)[0]
         self._size = 65536 if size == 1 else size
         if self._size < 512:
             raise ValueError('no page size')
-        self._usable = self._size - self._map[20]
+        self._usable = self._size - head[20]
         pages = len(self._map) // self._size
-        self.cut = len(self._map) < struct.unpack_from('>I', self._map, 28)[0] * self._size
+        self.cut = len(self._map) < struct.unpack_from('>I', head, 28)[0] * self._size
         found = ((self._first_row(page), page) for page in range(1, pages))
         self._pages = [page for row, page in sorted((r, p) for r, p in found if r is not None)]
 
     def _first_row(self, page: int) -> int | None:
         """Return the number of the first row of a page of messages, None for other pages."""
-        if self._map[page * self._size] != LEAF:
+        at = page * self._size
+        if self._map[at:at + 1] != bytes([LEAF]):
             return None
-        for row, _, _, _ in self._rows_of(page, header_only=True):
+        for row, _, _, _ in self._rows_of(page):
             return row
         return None
 
-    def rows(self, keys: Container[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (topic_id, timestamp, data) of some topics in the order they were written."""
-        last = -1
-        for page in self._pages:
-            for row, key, time_ns, data in self._rows_of(page):
-                if row > last:               # a stale copy of a page holds rows told already
-                    last = row
-                    if key in keys:
-                        yield key, time_ns, data
+    def rows(self, keys: Container[int] | None, last: int = -1
+             ) -> Iterator[tuple[int, int, bytes]]:
+        """
+        Yield (topic_id, timestamp, data) of some topics in the order they were written.
 
-    def _rows_of(self, page: int, header_only: bool = False):
+        keys : topics, None: of all, without their data.   last : rows up to it are not told.
+        """
+        left = 2 * len(self._map)            # bytes: no two rows share a page for large ones
+        for page in self._pages:
+            for row, key, time_ns, payload in self._rows_of(page):
+                if row <= last:              # a stale copy of a page holds rows told already
+                    continue
+                data = b''
+                if keys is not None and key in keys:
+                    try:
+                        data = payload()
+                    except (ValueError, IndexError, struct.error):
+                        continue             # its overflow pages are gone
+                    left -= len(data)
+                    if left < 0:
+                        return
+                last = row
+                if keys is None or key in keys:
+                    yield key, time_ns, data
+
+    def _rows_of(self, page: int):
+        """Yield (row, topic_id, timestamp, what gives the data) of a page."""
         data = self._map[page * self._size:(page + 1) * self._size]
         count = struct.unpack_from('>H', data, 3)[0]
         for i in range(min(count, (self._size - 8) // 2)):
@@ -57,13 +76,17 @@ class Leaves:
                 size, at = _varint(data, at)
                 row, at = _varint(data, at)
                 key, time_ns, skip = _record(data, at)
-                blob = b'' if header_only else self._payload(data, at, size)[skip:]
             except (ValueError, IndexError, struct.error):
-                continue                     # not a row of messages, or its pages are gone
-            yield row, key, time_ns, blob
+                continue                     # not a row of messages
+            yield row, key, time_ns, partial(self._data, data, at, size, skip)
+
+    def _data(self, data: bytes, at: int, size: int, skip: int) -> bytes:
+        return self._payload(data, at, size)[skip:]
 
     def _payload(self, data: bytes, at: int, size: int) -> bytes:
         """Return a row's bytes, those on overflow pages too."""
+        if size > len(self._map):
+            raise ValueError('larger than the file')
         largest = self._usable - 35
         if size <= largest:
             return data[at:at + size]
@@ -76,20 +99,22 @@ class Leaves:
             start = (page - 1) * self._size
             if page < 2 or start + self._size > len(self._map):
                 raise ValueError('overflow page missing')
-            page = struct.unpack_from('>I', self._map, start)[0]
-            parts.append(self._map[start + 4:start + self._usable][:size - have])
+            whole = self._map[start:start + self._usable]
+            page = struct.unpack_from('>I', whole)[0]
+            parts.append(whole[4:4 + size - have])
             have += len(parts[-1])
         return b''.join(parts)
 
     def close(self) -> None:
         """Let go of the file."""
         self._map.close()
-        self._file.close()
 
 
 def _record(data: bytes, at: int) -> tuple[int, int, int]:
     """Return topic, time and where the data begin in a row of messages; ValueError if not one."""
     length, pos = _varint(data, at)
+    if length > 10 * COLUMNS:      # a varint has nine bytes at most
+        raise ValueError('not a message')
     kinds = []
     while pos < at + length:
         kind, pos = _varint(data, pos)

@@ -3,7 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+from odocal_ros.bagio.definitions import parsed, within
+from odocal_ros.bagio.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 from odocal_ros.errors import BadData
+
+DEPTH = 50       # of messages in messages
 
 
 class Types:
@@ -46,27 +50,40 @@ class Types:
         return self._store
 
     def _register(self, msgtype: str) -> None:
-        from rosbags.typesys import get_types_from_msg
         form, text = self._definitions.get(msgtype, ('', ''))
         if not form:
             raise BadData(f'{msgtype} is no standard message type and the bag holds no definition '
                           'of it: record with a current rosbag2 (mcap), or use another topic')
+        check(len(text), DEFINITION, f"{msgtype}: the bag's definition of it", 'characters')
         try:
-            found = get_types_from_msg(text, msgtype) if form == 'msg' else _from_idl(text)
-            self._store.register({name: fields for name, fields in found.items()
-                                  if name not in self._store.fielddefs})
+            with within(SECONDS * factor()):
+                known = self._store.fielddefs
+                found = {name: fields for name, fields in parsed(msgtype, form, text).items()
+                         if name not in known}
+                check(_elements(msgtype, known | found), ELEMENTS, f'{msgtype}: a message of it',
+                      'values')
+                self._store.register(found)
+        except (MemoryError, LimitReached):
+            raise
         except Exception as error:   # a parser's errors
-            why = ' '.join(str(error).split())[:100]
+            why = ' '.join(str(error).split())[:100] or type(error).__name__
             raise BadData(f"{msgtype}: the bag's definition of it cannot be understood ({why}); "
                           'use another topic') from None
 
 
-def _from_idl(text: str) -> dict:
-    from rosbags.typesys import get_types_from_idl
-    bar = '=' * 80 + '\n'
-    if not text.startswith(f'{bar}IDL: '):
-        return get_types_from_idl(text)
-    found: dict = {}
-    for part in text.split(bar)[1:]:
-        found.update(get_types_from_idl(part.split('\n', 1)[1]))
-    return found
+def _elements(msgtype: str, fielddefs: dict, depth: int = 0) -> int:
+    """Return how many values the fixed arrays of a message make, at least."""
+    if depth > DEPTH:
+        raise ValueError('it holds itself')
+
+    def of(field) -> int:
+        kind, what = field
+        if kind.name == 'NAME':
+            return _elements(what, fielddefs, depth + 1)
+        return of(what[0]) * what[1] if kind.name == 'ARRAY' else 1
+    total = 0
+    for _, field in fielddefs[msgtype][1]:
+        total += of(field)
+        if total > ELEMENTS * factor():
+            break
+    return total

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 import shutil
 import tempfile
+import zlib
 
 import numpy as np
 
@@ -15,6 +16,7 @@ STORAGES = ('mcap', 'sqlite3', 'rosbag1')
 COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
 BLOCK = 20_000         # messages packed at a time, to bound memory
 BLOCK_BYTES = 2**26    # the same for topics of large messages
+CRC_AT = 9 + 24        # in a chunk record of mcap
 LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 
@@ -115,9 +117,25 @@ def _write_rosbag2(path, topics, storage, compression, progress):
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with writer:
+        if storage == 'mcap':
+            _with_checksums(writer.storage)
         connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]
         for which, time_ns, raw in _merged(topics, progress):
             writer.write(connections[which], time_ns, raw)
+
+
+def _with_checksums(storage) -> None:
+    """Have rosbags' mcap storage, which writes zeros, give each chunk its checksum."""
+    close_chunk = storage.close_chunk
+
+    def close_with_checksum() -> None:
+        crc, begin = zlib.crc32(storage.chunk.bio.getbuffer()), storage.bio.tell()
+        close_chunk()
+        end = storage.bio.tell()
+        storage.bio.seek(begin + CRC_AT)
+        storage.bio.write(crc.to_bytes(4, 'little'))
+        storage.bio.seek(end)
+    storage.close_chunk = close_with_checksum
 
 
 def _write_rosbag1(path, topics, storage, compression, progress):

@@ -6,9 +6,9 @@ from pathlib import Path
 import shutil
 from typing import TextIO
 
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.live.journal_space import claim, clear_empty, make_room
 from odocal_ros.whole import write_text

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import queue
 import threading
 
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, pack
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.live.definitions import definition_of
 from odocal_ros.live.journal_leg import in_order, LegJournal, Plan
 

@@ -18,6 +18,7 @@ COMMANDS = {
     'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
+LONGEST = 2000       # characters of a sentence: a bag may hold a name of any length
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -65,7 +66,8 @@ def main(argv=None) -> int:
         sys.stdout.flush()       # here, where a full disk can still be told
         return code
     except OdocalError as error:
-        warn(str(error) if isinstance(error, _Usage) else f'odocal: {error}')
+        text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
+        warn(text if len(text) <= LONGEST else f'{text[:LONGEST]} ...')
         return WRONG_USE
     except KeyboardInterrupt as stopped:
         warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')
@@ -77,20 +79,29 @@ def main(argv=None) -> int:
         what = error.filename or 'output'
         warn(f'odocal: {what}: {error.strerror or error}')
         return WRONG_USE
+    except MemoryError:
+        warn('odocal: memory ran out; close other programs, or replay a part: a shorter bag or '
+             '--leg A:B')
+        return WRONG_USE
     except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
         return _internal(error)
 
 
 def _internal(error) -> int:
     import traceback
-    with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt',
-                                     delete=False) as f:
-        f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n')
-        traceback.print_exception(error, file=f)
-    first = (str(error).splitlines() or [''])[0]
+    path = trace_file(''.join(traceback.format_exception(error)))
+    first = (str(error).splitlines() or [''])[0][:200]
     warn(f'odocal: internal error ({type(error).__name__}: {first}); '
-         f'please report it with {f.name}')
+         f'please report it with {path}')
     return INTERNAL
+
+
+def trace_file(text: str) -> str:
+    """Write what a developer needs to a file of its own; return its path."""
+    with tempfile.NamedTemporaryFile('w', prefix='odocal_trace_', suffix='.txt', delete=False,
+                                     encoding='utf-8', errors='backslashreplace') as f:
+        f.write(f'odocal_ros {__version__}, Python {sys.version}\n{" ".join(sys.argv)}\n\n{text}')
+    return f.name
 
 
 if __name__ == '__main__':

@@ -9,6 +9,7 @@ from odocal_ros.bagio import cdr
 from odocal_ros.bagio.read import Bag, TopicInfo
 from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
+from odocal_ros.glitches import beyond
 from odocal_ros.leg import LegRecorder
 from odocal_ros.messages import FIX, IMU, make_reader, Reader
 from odocal_ros.odometer_types import TYPES as ODOMETERS
@@ -17,6 +18,7 @@ from odocal_ros.offline.inspection_drive import closed, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
 from odocal_ros.offline.wheel_survey import FIELDS as LISTS, in_words, suggested, Values
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.samples import take
 
 
 class _Tap:
@@ -131,8 +133,10 @@ def _wheels(taps, mapping, config, topics) -> list[str]:
     open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
     imu = taps[mapping['imu']].recorder.rows('imu') if mapping.get('imu') in taps else None
     turn = None
+    if imu is not None:
+        imu = take(imu, ~(beyond('f_i', imu.f_i) | beyond('w_i', imu.w_i)))
     if imu is not None and len(imu.stamp_ns):
-        up_i = np.nanmedian(imu.f_i, axis=0)
+        up_i = np.median(imu.f_i, axis=0)
         turn = imu.stamp_ns, imu.w_i @ (up_i / max(np.linalg.norm(up_i), 1e-9))
     for facts in topics:
         tap = taps.get(facts['name'])

@@ -7,7 +7,7 @@ import numpy as np
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.sanity import imu_sanity, MAX_RATE
 from odocal_ros.config import Config
-from odocal_ros.errors import BadUsage
+from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.leg import LegRecorder
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.legs import EACH_STOP, find_legs, LegSpan, marked_legs
@@ -39,7 +39,11 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
         (first, last), = find_legs(recorder, bag, [LegSpan(None, None)], [], config)
     except BadUsage:
         first, last = 0, -1
-    leg = recorder.close(first, last, preroll=0.0)
+    try:
+        leg = recorder.close(first, last, preroll=0.0)
+    except BadData as error:
+        findings.append(Reason(Code.CLOCKS_DIFFER, str(error)))
+        return []
     inputs, reasons = screen(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:

@@ -3,7 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from odocal_ros.bagio.limits import is_file
 from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.errors import BadUsage
+from odocal_ros.leg import SLOTS
 
 BLOCK = 'odocal_journal'
 
@@ -35,12 +38,9 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     path = (bag if bag.is_dir() else bag.parent) / JOURNAL
     if not path.exists():
         return None
-    import yaml
-
-    from odocal_ros.config_file import read_config_file
-    settings = read_config_file(path)
-    whole = yaml.safe_load(path.read_text(encoding='utf-8'))
-    about = ((whole.get(BLOCK) or {}).get('ros__parameters')) or {}
-    topics = {key.removeprefix('topics.'): str(value) for key, value in about.items()
-              if str(key).startswith('topics.')}
+    if not is_file(path):
+        raise BadUsage(f'{path}: is a pipe, a device or a folder; remove it to replay the bag')
+    from odocal_ros.config_file import read_journal_file
+    settings, about = read_journal_file(path, BLOCK)
+    topics = {slot: about[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in about}
     return JournalNotes(path, settings, topics)

@@ -6,6 +6,7 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
+from odocal_ros.bagio.limits import LATEST_NS
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
@@ -58,6 +59,9 @@ def _edge(text, whole):
     try:
         seconds = Decimal(text)
         if seconds.is_finite():
+            if seconds.copy_abs() >= LATEST_NS // 10**9:
+                raise BadUsage(f'--leg {whole}: {text[:40]} is no time of a recording: beyond the '
+                               'year 2116')
             return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
     except InvalidOperation:
         pass
@@ -68,7 +72,10 @@ def _edge(text, whole):
                        'for seconds, A/B for dates') from None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000, False
+    whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    if abs(whole_ns) >= LATEST_NS:
+        raise BadUsage(f'--leg {whole}: {text} is no time of a recording')
+    return whole_ns, False
 
 
 def marked_legs(bag) -> list[tuple[int, int]]:

@@ -55,7 +55,9 @@ def run(args) -> int:
     if (output / 'calibration.json').exists() and not args.force:     # said before the work
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
+    from odocal_ros.calib.failed import traces
     from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
+    from odocal_ros.offline.cli import trace_file
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.output.frames import framed
     from odocal_ros.pipeline import combine
@@ -89,6 +91,8 @@ def run(args) -> int:
         _tell(args, f'{", ".join(unlike)}: not the same in all journals; each leg is computed '
               f'with its own, limits and files are by those of {used[-1].name}')
     legs, inputs = told_apart(used, legs, inputs)
+    for name, trace in traces(legs):
+        warn(f'odocal: method {name} broke; please report it with {trace_file(trace)}')
     calibration, config = framed(combine(legs, config), config, imu_frame)
     return _report(calibration, config, inputs, output, args)
 

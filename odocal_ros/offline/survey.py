@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.sanity import G
+from odocal_ros.glitches import beyond, oriented
 from odocal_ros.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 
 GAP = 5.0             # in median intervals: longer is a gap
@@ -41,8 +42,9 @@ def timing(samples, start_ns: int, headerless: bool) -> dict:
 
 def imu(samples: ImuSamples) -> dict:
     """Return what an Imu topic shows of gravity, units and orientation."""
-    f_i = samples.f_i[np.isfinite(samples.f_i).all(axis=1)]
-    w_i = samples.w_i[np.isfinite(samples.w_i).all(axis=1)]
+    samples = oriented(samples)
+    f_i = samples.f_i[~beyond('f_i', samples.f_i)]
+    w_i = samples.w_i[~beyond('w_i', samples.w_i)]
     mean = np.median(f_i, axis=0) if len(f_i) else np.zeros(3)
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
@@ -68,7 +70,7 @@ def imu(samples: ImuSamples) -> dict:
 
 def odometer(samples: OdometerSamples, form: OdometerForm) -> dict:
     """Return what an odometer topic counts."""
-    finite = samples.value[np.isfinite(samples.value)]
+    finite = samples.value[~beyond('value', samples.value)]
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
             'first': _number(finite[:1]), 'last': _number(finite[-1:]),
             'least': _number(np.sort(finite)[:1]), 'most': _number(np.sort(finite)[-1:]),
@@ -83,11 +85,11 @@ def fixes(samples: FixSamples) -> dict:
     """Return status and quality of fixes."""
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
-        & np.isfinite(covariance).all(axis=1)
+        & ~beyond('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    place = np.isfinite(samples.latitude) & np.isfinite(samples.longitude) \
+    place = ~beyond('latitude', samples.latitude) & ~beyond('longitude', samples.longitude) \
         & ((samples.latitude != 0) | (samples.longitude != 0))
-    heights = samples.height[place & np.isfinite(samples.height)]
+    heights = samples.height[place & ~beyond('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {
         'status': dict(zip(map(str, values.tolist()), counts.tolist(), strict=True)),

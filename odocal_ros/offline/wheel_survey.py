@@ -3,6 +3,8 @@
 import numpy as np
 
 from odocal_ros.bagio import cdr
+from odocal_ros.glitches import beyond
+from odocal_ros.leg import MOST_DAYS
 from odocal_ros.odometer_types import JOINTS
 
 TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
@@ -49,7 +51,7 @@ class Values:
                                     key=lambda entry: sum(len(t) for t, _ in entry[1]))
         stamp_ns = np.concatenate([t for t, _ in blocks])
         value = np.concatenate([v for _, v in blocks])
-        keep = np.append(True, np.diff(stamp_ns) > 0) & np.isfinite(value).all(axis=1)
+        keep = np.append(True, np.diff(stamp_ns) > 0) & ~beyond('value', value)
         stamp_ns, value = stamp_ns[keep], value[keep]
         if len(stamp_ns) < 3:
             return []
@@ -79,7 +81,8 @@ def _sides(t, s, rolls, imu) -> list[str]:
     """Return 'left' or 'right' of each wheel that the gyro tells: the outer one runs farther."""
     k = len(rolls)
     none = [''] * k
-    grid = np.arange(t[0], t[-1], CELL)
+    # by damaged stamps a recording may last for years
+    grid = np.arange(t[0], t[-1], CELL) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return none
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))

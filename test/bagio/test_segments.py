@@ -11,10 +11,10 @@ import ros_messages as make
 from rosbags import rosbag2
 
 from odocal_ros.bagio import chunks, segments
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack, read_chunks, write_file
 from odocal_ros.bagio.numbered import JOURNAL, part_name, whole_name
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.errors import BadBag
 from odocal_ros.whole import PART

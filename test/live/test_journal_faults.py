@@ -7,10 +7,10 @@ from faults import Refusing
 import pytest
 
 from odocal_ros.bagio import segments
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.live.journal_leg import LegJournal, Plan
 from odocal_ros.live.journal_space import clear_empty
 

@@ -9,10 +9,10 @@ import ros_bags
 import ros_messages as make
 
 from odocal_ros.bagio import segments
+from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import pack
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.bagio.recover import Channel
 from odocal_ros.config import Config, flat, with_settings
 from odocal_ros.live import journal_leg, journal_writer
 from odocal_ros.live.definitions import _in_msg, definition_of

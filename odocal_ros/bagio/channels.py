@@ -1,0 +1,84 @@
+"""What all files of a bag have: topics, messages, and how many of each were found."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from odocal_ros.bagio.limits import LATEST_NS
+
+FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic of a bag file; ``definition`` is (format 'msg', 'idl' or '', text)."""
+
+    topic: str
+    msgtype: str
+    count: int = 0
+    serialization: str = 'cdr'
+    definition: tuple[str, str] = ('', '')
+
+
+class Message(NamedTuple):
+    """One message as recorded: the first has the shape of what rosbags yields."""
+
+    channel: Channel
+    time_ns: int
+    raw: bytes
+
+
+class Recording:
+    """
+    A file of a bag: its channels by number, their counts, first and last time.
+
+    ``damage`` says what is wrong with it, empty if nothing is; found while reading, it is told
+    only after that.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.damage = path, ''
+        self.start_ns, self.end_ns, self.count = 2**63 - 1, 0, 0
+        self._channels: dict[int, Channel] = {}
+
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
+        """Yield the messages of some topics (name -> type): channel, time and bytes."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Let go of the file."""
+        raise NotImplementedError
+
+    def _scan(self) -> Iterator[tuple[int, int]]:
+        """Yield the channel and the time of every message."""
+        raise NotImplementedError
+
+    def _count(self) -> None:
+        """Count what is there, message by message."""
+        counts: Counter = Counter()
+        start_ns, end_ns = 2**63 - 1, 0
+        for key, time_ns in self._scan():
+            counts[key] += 1
+            start_ns, end_ns = min(start_ns, time_ns), max(end_ns, time_ns)
+        self._tell(counts, start_ns, end_ns)
+
+    def _tell(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
+        self.start_ns, self.end_ns = start_ns, end_ns
+        self._channels = {key: replace(channel, count=counts.get(key, 0))
+                          for key, channel in self._channels.items()}
+        self.count = sum(channel.count for channel in self._channels.values())
+
+    @property
+    def channels(self) -> list[Channel]:
+        """Return the topics, each with the number of messages found."""
+        return list(self._channels.values())
+
+    def _wanted(self, topics: Mapping[str, str]) -> dict[int, Channel]:
+        return {k: c for k, c in self._channels.items() if topics.get(c.topic) == c.msgtype}
+
+
+def possible(time_ns: object) -> bool:
+    """Tell whether a bag time can be one."""
+    return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS

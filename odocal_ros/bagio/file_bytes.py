@@ -1,0 +1,33 @@
+"""A file as bytes: not mapped, since a page of a map that the disk cannot give kills a process."""
+
+import os
+from pathlib import Path
+
+
+class FileBytes:
+    """The bytes of a file by place, as far as they are there when it is opened."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = path.open('rb')
+        self._size = os.fstat(self._file.fileno()).st_size
+
+    def __len__(self) -> int:
+        """Return the size."""
+        return self._size
+
+    def __getitem__(self, place: slice) -> bytes:
+        """Return the bytes of a slice of step 1; OSError names the file."""
+        start, stop, _ = place.indices(self._size)
+        try:
+            parts = []
+            while start < stop and (part := os.pread(self._file.fileno(), stop - start, start)):
+                parts.append(part)
+                start += len(part)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from None
+        return parts[0] if len(parts) == 1 else b''.join(parts)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()

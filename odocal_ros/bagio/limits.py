@@ -1,0 +1,138 @@
+"""What reading may take, whatever a file claims: every bound, and how a user raises them."""
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import stat
+from typing import Any
+
+from odocal_ros.errors import BadBag
+
+RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
+UNPACKED = 2**26             # bytes that a bag may always unpack to, and
+RATIO = 40                   # more for each of its own; sensors' messages pack to a tenth
+TEXT = 2**19                 # bytes of a YAML file
+DEFINITION = 2**16           # characters of a message definition
+ELEMENTS = 100_000           # values in the fixed arrays of one message
+SECONDS = 20                 # to understand a definition
+LATEST_NS = 2**62            # the year 2116: a later time of a message is none
+
+
+class LimitReached(BadBag):
+    """A file asks for more than its size can explain."""
+
+
+class Damaged(Exception):
+    """A part of a file is not what it was when it was written; what it says goes into notes."""
+
+
+def factor() -> float:
+    """Return by how much the user raises the limits, 1 unasked."""
+    try:
+        return max(float(os.environ.get(RAISE, '')), 1.0)
+    except ValueError:
+        return 1.0
+
+
+def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
+    """Raise LimitReached where an amount is above a limit; ``what`` tells of which file."""
+    limit *= factor()
+    if amount > limit:
+        raise LimitReached(f'{what} takes more than {limit:.0f} {unit}, the limit for it; if it '
+                           f'is sound, set {RAISE}=10 in the environment for ten times as much')
+
+
+class Allowance:
+    """
+    Bytes that a file of a bag may unpack to in one pass.
+
+    path : of the file as recorded.   total : bytes of all files of its bag.
+    """
+
+    def __init__(self, path: Path, total: int) -> None:
+        packed = path.stat().st_size
+        self._what = f'{path}: unpacked, it'
+        self.most = int(UNPACKED * packed / max(total, packed, 1) + RATIO * packed)
+        self._used = 0
+
+    def again(self) -> None:
+        """Begin another pass."""
+        self._used = 0
+
+    def take(self, count: int) -> None:
+        """Count bytes that came out; raise LimitReached beyond what is allowed."""
+        self._used += count
+        check(self._used, self.most, self._what)
+
+    @property
+    def left(self) -> int:
+        """Return how many bytes may still come."""
+        return int(self.most * factor()) - self._used
+
+    def unpack(self, packing: str, data: bytes, size: int | None = None) -> bytes:
+        """
+        Return what compressed data hold, as much as came out of a stream that is cut off.
+
+        packing : '', 'zstd', 'lz4' or 'bz2'.   size : bytes that it is said to be, if it is.
+        Raises LimitReached, or what the decompressor raises on damage.
+        """
+        most = self.left if size is None else min(size, self.left)
+        if not packing:
+            self.take(len(data))
+            return data
+        parts, have = [], 0
+        while data and have <= most:
+            stream = opener(packing)()
+            parts.append(stream.decompress(data, most + 1 - have))
+            have += len(parts[-1])
+            data = stream.unused_data if stream.eof else b''
+        self.take(have)
+        if size is not None and have > size:
+            raise Damaged('a chunk is larger than it says')
+        return b''.join(parts)
+
+
+def opener(packing: str) -> Callable[[], Any]:
+    """Return the class of a decompressor with ``decompress(data, max_length)``; or Damaged."""
+    if packing == 'zstd':
+        return zstd_module().ZstdDecompressor
+    if packing == 'lz4':
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+        return LZ4FrameDecompressor
+    if packing == 'bz2':
+        from bz2 import BZ2Decompressor
+        return BZ2Decompressor
+    raise Damaged(f'compression {packing[:20]!r} is not known')
+
+
+def zstd_module():
+    """Return the zstd module that rosbags uses: the standard library's from Python 3.14 on."""
+    from importlib import import_module
+    try:
+        return import_module('compression.zstd')
+    except ModuleNotFoundError:
+        return import_module('backports.zstd')
+
+
+def is_file(path: Path) -> bool:
+    """Tell whether a path is a regular file: a pipe or a device may never end, or wait."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def read_text(path: Path) -> str:
+    """
+    Return the text of a YAML file, of a pipe too if the user names one.
+
+    Raises
+    ------
+    LimitReached, OSError, UnicodeDecodeError
+
+    """
+    most = int(TEXT * factor())
+    with path.open('rb') as file:
+        data = file.read(most + 1)
+    check(len(data), TEXT, f'{path}: the text')
+    return data.decode()

@@ -1,0 +1,121 @@
+"""A rosbag1 file, through rosbags: with bounds on what its index and its chunks may claim."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+import io
+from pathlib import Path
+from typing import Any
+
+from odocal_ros.bagio.channels import Channel, Recording
+from odocal_ros.bagio.limits import Allowance, LATEST_NS, LimitReached
+from odocal_ros.errors import BadBag, OdocalError
+
+PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
+
+
+class Rosbag1File(Recording):
+    """
+    A file of ROS 1.
+
+    rosbags takes as much for its index, and from each chunk, as the file says; what it reads of
+    the index is counted here, and its decompressors are replaced.
+    """
+
+    def __init__(self, path: Path, allowance: Allowance, convert: Callable) -> None:
+        super().__init__(path)
+        self._convert, self._allowance = convert, allowance
+        try:
+            self._reader = self._opened(path)
+        except (PermissionError, MemoryError, BadBag):
+            raise
+        except Exception as error:   # rosbags and what it stands on fail in many ways
+            raise self._unreadable(error) from None
+        found = self._reader.connections
+        self._channels = {c.id: Channel(c.topic, c.msgtype, c.msgcount, 'ros1', (
+            c.msgdef.format.name.lower(), c.msgdef.data)) for c in found}
+        self.count = sum(c.msgcount for c in found)
+        self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        if self.count and not 0 <= self.start_ns <= self.end_ns < LATEST_NS:
+            raise self._unreadable(ValueError('its times are none'))
+
+    def _opened(self, path: Path) -> Any:
+        reader = _reader(path)
+        reader.open()
+        for at, chunk in reader.chunks.items():
+            packing = PACKINGS[next(name for name, known in _decompressors().items()
+                                    if known is chunk.decompressor)]
+            reader.chunks[at] = chunk._replace(decompressor=partial(
+                self._allowance.unpack, packing))
+        return reader
+
+    def _unreadable(self, error: Exception) -> BadBag:
+        why = ' '.join(str(error).split()).rstrip('.')[:200] or type(error).__name__
+        return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
+
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
+        """Yield the messages of some topics (name -> type) by time, as CDR."""
+        connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
+        if not connections:      # rosbags would take none as all
+            return
+        self._allowance.again()
+        stream = self._reader.messages(connections=connections)
+        while True:
+            try:
+                channel, time_ns, raw = next(stream)
+            except StopIteration:
+                return
+            except (MemoryError, LimitReached):
+                raise
+            except Exception as error:
+                raise self._unreadable(error) from None
+            try:
+                raw = bytes(self._convert(raw, channel))
+            except (OdocalError, MemoryError):
+                raise
+            except Exception:   # a damaged message: readers count it
+                raw = b''
+            yield channel, time_ns, raw
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._reader.close()
+
+
+def _decompressors() -> dict[str, Callable]:
+    from rosbags.rosbag1 import reader
+    return reader.decompressors
+
+
+def _reader(path: Path) -> Any:
+    """Return a reader of rosbags whose index holds no more than the file."""
+    from rosbags.rosbag1 import Reader
+    most = path.stat().st_size
+
+    class Bounded(io.BufferedReader):
+        """Asks for no memory that the file cannot fill."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            """Return so many bytes, or as many as a file has."""
+            return super().read(min(size, most) if size and size > 0 else size)
+
+    class File(type(Path())):     # type: ignore[misc]
+        """A path whose file is so bounded."""
+
+        def open(self, *_) -> io.BufferedReader:
+            """Open the file for reading."""
+            return Bounded(io.FileIO(self))
+
+    class Counted(Reader):
+        """Counts what it reads of the index."""
+
+        left = most
+
+        def read_index_data(self, pos: int, indexes: dict) -> None:
+            """Read the entries of a connection in a chunk."""
+            assert self.bio
+            begin = self.bio.tell()
+            super().read_index_data(pos, indexes)
+            self.left -= self.bio.tell() - begin
+            if self.left < 0:
+                raise ValueError('its index runs in circles')
+    return Counted(File(path))

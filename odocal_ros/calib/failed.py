@@ -1,0 +1,28 @@
+"""A method that broke: its fault as data, for the door to write to a file."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+import traceback
+
+from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.reasons import Code, Reason
+
+TRACE = 'trace'      # of the details: what a developer needs
+
+
+def failed(unknown: Callable[[Reason], MethodResult], name: str,
+           error: Exception) -> MethodResult:
+    """Return the result of a method that raised: what it gives where it refuses, and the trace."""
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    said = ' '.join(str(error).split())[:200]
+    reason = Reason(Code.METHOD_FAILED, f'method {name} broke: {type(error).__name__}'
+                    f'{f" ({said})" if said else ""} in {where.name}, line {where.lineno}')
+    return replace(unknown(reason), details={TRACE: ''.join(traceback.format_exception(error))})
+
+
+def traces(legs: Iterable[LegResult]) -> Iterator[tuple[str, str]]:
+    """Yield (method, trace) of each method that broke."""
+    for leg in legs:
+        for name, method in leg.methods.items():
+            if TRACE in method.details:
+                yield name, method.details[TRACE]

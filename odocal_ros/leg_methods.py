@@ -1,0 +1,35 @@
+"""The methods of a leg: their order, and what becomes of one that breaks."""
+
+from odocal_ros.calib.failed import failed
+from odocal_ros.calib.smoother.outcome import refused as smoother_refused
+from odocal_ros.calib.two_point import unsolved
+from odocal_ros.calib.wheels.result import refused as wheels_refused
+from odocal_ros.errors import OdocalError
+from odocal_ros.slow_slip import held
+from odocal_ros.smoother_run import smoother
+from odocal_ros.two_point_run import two_point
+from odocal_ros.wheels_run import wheels
+
+# in order of running; two_point, the operator's own marks, is always computed and shown
+METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
+# what each gives where it refuses: (inputs, reason) to MethodResult
+UNKNOWN = {'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
+           'wheels': wheels_refused,
+           'smoother': lambda inputs, why: smoother_refused((why,), inputs.scale_unit)}
+
+
+def run_method(name, run):
+    """
+    Run a method on a leg; what breaks in it costs this method, not the leg.
+
+    run : LegRun, prepared.   Returns MethodResult, and the antenna's path, None where refused.
+    """
+    found = len(run.reasons)
+    try:
+        method, path = METHODS[name](run)
+        return held(method, run), path
+    except (OdocalError, MemoryError):
+        raise
+    except Exception as error:
+        del run.reasons[found:]       # what it said of the data may be as wrong
+        return failed(lambda why: UNKNOWN[name](run.inputs, why), name, error), None

@@ -1,0 +1,50 @@
+"""YAML from outside as a tree: nested and linked no deeper than a person would write it."""
+
+from functools import cache
+
+from odocal_ros.errors import BadConfig
+
+DEPTH = 30       # of mappings and lists in each other
+
+
+@cache
+def loader(aliases: bool = False):
+    """Return a safe loader that refuses what is nested too deep, and ``*links`` unless asked."""
+    import yaml
+
+    class Plain(yaml.SafeLoader):
+        """Composes with a bound."""
+
+        depth = 0
+
+        def compose_node(self, parent, index):
+            """Compose a node and what is in it."""
+            mark = self.peek_event().start_mark
+            if not aliases and self.check_event(yaml.AliasEvent):
+                raise yaml.composer.ComposerError(
+                    None, None, 'links (*name) are not taken here, nor by ROS', mark)
+            if self.depth >= DEPTH:
+                raise yaml.composer.ComposerError(
+                    None, None, f'nested deeper than {DEPTH} levels', mark)
+            self.depth += 1
+            try:
+                node = super().compose_node(parent, index)
+            finally:
+                self.depth -= 1
+            if isinstance(node, yaml.MappingNode) and not all(
+                    isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+                raise yaml.composer.ComposerError(None, None, 'a key that is no text', mark)
+            return node
+    return Plain
+
+
+def composed(text: str, where: str):
+    """Return the root node of a text (None: it is empty), or raise BadConfig that tells where."""
+    import yaml
+    try:
+        return yaml.compose(text, Loader=loader())
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, 'problem_mark', None)
+        line = f', line {mark.line + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or ' '.join(str(error).split())
+        raise BadConfig(f'{where}{line}: not valid YAML: {problem}') from None

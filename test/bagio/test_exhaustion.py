@@ -1,0 +1,202 @@
+"""Files that ask for more than their size can explain: a sentence, in bounded time and memory."""
+
+import os
+import sqlite3
+import struct
+import tracemalloc
+
+import pytest
+import ros_bags
+from ros_bags import T0
+
+from odocal_ros.bagio import definitions
+from odocal_ros.bagio.limits import LimitReached, RAISE, zstd_module
+from odocal_ros.bagio.mcap_records import MAGIC
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.errors import BadBag, BadData
+
+MOST = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
+
+
+def record(op, body):
+    return struct.pack('<BQ', op, len(body)) + body
+
+
+def text(what):
+    return struct.pack('<I', len(what)) + what.encode()
+
+
+def zeros(mebibytes):
+    """Return zstd of so many MiB of zeros: 1 GiB is 32 kB."""
+    packer = zstd_module().ZstdCompressor()
+    return b''.join([packer.compress(bytes(2**20)) for _ in range(mebibytes)]) + packer.flush()
+
+
+def mcap(path, packed, size, times=1, index=True):
+    """Write an mcap file whose index names one chunk many times."""
+    described = (record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Imu') + text('ros2msg')
+                        + text(''))
+                 + record(4, struct.pack('<HH', 1, 1) + text('/imu') + text('cdr') + bytes(4)))
+    head = MAGIC + record(1, text('ros2') + text('x')) + described
+    chunk = record(6, struct.pack('<QQQI', 1, 9, size, 0) + text('zstd')
+                   + struct.pack('<Q', len(packed)) + packed)
+    entry = record(8, struct.pack('<QQQQIHQQ', 1, 9, len(head), len(chunk), 10, 1, 0, 0)
+                   + text('zstd') + struct.pack('<QQ', len(packed), size))
+    statistics = record(11, struct.pack('<QHIIIIQQIHQ', 5, 1, 1, 0, 0, times, 1, 9, 10, 1, 5))
+    data = head + chunk + record(15, bytes(4))
+    footer = struct.pack('<QQI', len(data) if index else 0, 0, 0)
+    path.write_bytes(data + (described + statistics + entry * times) * index
+                     + record(2, footer) + MAGIC)
+    return path
+
+
+def peak(path, topic=''):
+    """Open a bag and read a topic; return the most memory it took and what was said."""
+    tracemalloc.start()
+    said = ''
+    try:
+        with open_bag(path) as bag:
+            for _ in bag.messages(topic or next(iter(bag.topics))):
+                pass
+    except (BadBag, BadData) as error:
+        said = str(error)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return most, said
+
+
+@pytest.fixture(scope='module')
+def bomb():
+    return zeros(2048)
+
+
+@pytest.mark.parametrize('kind', ['chunk', 'scan', 'file', 'message'])
+def test_a_stream_that_unpacks_to_2_gib(tmp_path, bomb, kind):
+    path = tmp_path / 'bag.mcap'
+    if kind == 'file':
+        path.write_bytes(bomb)
+    elif kind == 'message':
+        path = ros_bags.write(tmp_path / 'bag', [('/imu', T0, bomb)], 'sqlite3',
+                              types={'/imu': 'sensor_msgs/msg/Imu'})
+    else:
+        mcap(path, bomb, 2**31, index=kind == 'chunk')
+    most, said = peak(path)
+    assert most < MOST
+    assert 'unpacked, it takes more than' in said
+    assert f'set {RAISE}=10' in said
+
+
+def test_the_limit_can_be_raised(tmp_path, monkeypatch):
+    path = tmp_path / 'bag.mcap'
+    packed = zeros(100)
+    mcap(path, packed, 100 * 2**20)
+    assert peak(path)[1]
+    monkeypatch.setenv(RAISE, '10')
+    assert 'takes more than' not in peak(path)[1]
+
+
+def test_an_index_that_names_a_chunk_many_times(tmp_path):
+    message = record(5, struct.pack('<HIQQ', 1, 0, 5, 5))
+    packed = zstd_module().compress(message * 100_000)
+    path = mcap(tmp_path / 'bag.mcap', packed, 3_100_000, times=1000)
+    with open_bag(path) as bag:
+        assert bag.topics['/imu'].count == 100_000      # it is not believed
+
+
+@pytest.mark.parametrize('sql', [
+    ['CREATE VIEW {t} AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT '
+     'x AS id, 1 AS topic_id, x AS timestamp, zeroblob(100000000) AS data, x AS topic_type, x AS '
+     'encoding, x AS encoded_message_definition, x AS name, x AS type, x AS serialization_format '
+     'FROM c'],
+    ['CREATE TABLE {t} (id INTEGER PRIMARY KEY, topic_id, timestamp, data GENERATED ALWAYS AS '
+     '(zeroblob(900000000)), name, type, serialization_format, topic_type, encoding, '
+     'encoded_message_definition GENERATED ALWAYS AS (zeroblob(900000000)))',
+     'INSERT INTO {t} (topic_id, timestamp) VALUES (1, 5)']])
+@pytest.mark.parametrize('table', ['messages', 'topics', 'message_definitions'])
+def test_a_schema_that_makes_rows_of_its_own(tmp_path, table, sql):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
+    db = sqlite3.connect(path / 'bag.db3')
+    db.execute(f'ALTER TABLE {table} RENAME TO before')
+    for line in sql:
+        db.execute(line.format(t=table))
+    db.commit()
+    db.close()
+    assert peak(path)[0] < MOST
+
+
+def test_pages_that_lead_back_to_themselves(tmp_path):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
+    file = path / 'bag.db3'
+    db = sqlite3.connect(file)
+    db.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, zeroblob(?))',
+                   [(T0, 200_000)] * 3)
+    db.commit()
+    db.close()
+    data = bytearray(file.read_bytes())
+    size = int.from_bytes(data[16:18], 'big')
+    loops = 0
+    for page in range(1, len(data) // size):
+        at = page * size
+        if data[at:at + 4] == (page + 2).to_bytes(4, 'big') and not any(data[at + 4:at + size]):
+            data[at:at + 4] = (page + 1).to_bytes(4, 'big')
+            loops += 1
+    assert loops > 10
+    file.write_bytes(data)
+    assert peak(path)[0] < MOST
+
+
+DEFINITIONS = {
+    'array': ('ros2msg', 'string[100000000] x\n'),
+    'arrays in arrays': ('ros2msg', 'b/C[1000] x\n' + '=' * 80 + '\nMSG: b/C\nint8[1000] y\n'),
+    'idl array': ('ros2idl', 'module a { module msg { const long N = 100000000; '
+                             'struct B { string x[N]; }; }; };'),
+    'computed': ('ros2idl', 'module a { module msg { const long N = 1 << 10000000000; '
+                            'struct B { string x[N]; }; }; };'),
+    'long': ('ros2msg', '\n'.join(f'int32 x{i}' for i in range(20_000))),
+    'deep': ('ros2idl', 'module a { module msg { const long N = ' + '(' * 500 + '1' + ')' * 500
+             + '; struct B { long x; }; }; };'),
+    'itself': ('ros2msg', 'a/B x\n')}
+
+
+@pytest.mark.parametrize('kind', DEFINITIONS)
+def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr('odocal_ros.bagio.types.SECONDS', 3)
+    path = ros_bags.write(tmp_path / 'bag', [('/x', T0, b'\0\1\0\0' + bytes(40))], 'sqlite3',
+                          types={'/x': 'std_msgs/msg/String'})
+    db = sqlite3.connect(path / 'bag.db3')
+    db.execute("UPDATE topics SET type = 'a/msg/B'")
+    db.execute("UPDATE message_definitions SET topic_type = 'a/msg/B', encoding = ?, "
+               'encoded_message_definition = ?', DEFINITIONS[kind])
+    db.commit()
+    db.close()
+    most, said = peak(path)
+    assert most < MOST
+    assert 'takes more than' in said or 'cannot be understood' in said
+
+
+def test_annotations_cost_nothing():
+    strings = '"a (b" ' * 20_000
+    found = definitions.parsed('a/msg/B', 'idl', f'module a {{ module msg {{ @verbatim(text='
+                               f'{strings}) @x struct B {{ @y(z=(1)) long x; /* ( */ }}; }}; }};')
+    assert [name for name, _ in found['a/msg/B'][1]] == ['x']
+
+
+def test_what_is_no_file(tmp_path):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5))
+    os.mkfifo(path / 'x.mcap')
+    (path / 'metadata.yaml').unlink()
+    (path / 'metadata.yaml').symlink_to('/dev/zero')
+    with open_bag(path) as bag:
+        assert len(bag.files) == 1
+        assert 'a device' in bag.notes[0]
+    for one in (path / 'x.mcap', '/dev/zero'):
+        with pytest.raises(BadBag, match='a pipe, a device'), open_bag(one):
+            pass
+
+
+def test_a_text_that_does_not_end(tmp_path):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5))
+    (path / 'metadata.yaml').write_text('#' * 2**22)
+    with open_bag(path) as bag:
+        assert 'takes more than' in bag.notes[0]
+    assert issubclass(LimitReached, BadBag)

@@ -1,0 +1,92 @@
+"""What we touch inside of rosbags, which is 0.x: this fails where another version changes it."""
+
+from importlib.metadata import version
+import inspect
+import re
+
+import pytest
+import ros_bags
+from rosbags import rosbag1
+from rosbags.rosbag1 import reader
+from rosbags.rosbag2 import storage_mcap
+from test_damage import chunks_of
+
+from odocal_ros.bagio import rosbag1_file, write
+from odocal_ros.bagio.limits import Allowance, LimitReached
+from odocal_ros.bagio.parts import Part
+from odocal_ros.errors import BadBag
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.scenarios import simulate
+
+
+def test_the_version_is_one_that_was_looked_at():
+    assert re.match(r'0\.11\.', version('rosbags'))
+
+
+def test_the_reader_of_rosbag1_is_as_we_take_it(tmp_path):
+    assert set(reader.decompressors) == set(rosbag1_file.PACKINGS)
+    assert set(reader.Chunk._fields) == {'datasize', 'datapos', 'decompressor'}
+    assert list(inspect.signature(rosbag1.Reader.read_index_data).parameters) == [
+        'self', 'pos', 'indexes']
+    bag = rosbag1.Writer(tmp_path / 'a.bag')
+    bag.set_compression(bag.CompressionFormat.BZ2)
+    with bag:
+        topic = bag.add_connection('/imu', 'sensor_msgs/msg/Imu', typestore=ros_bags.make.store())
+        for i in range(3):
+            raw = ros_bags.make.cdr(ros_bags.make.imu(ros_bags.T0 + i))
+            bag.write(topic, ros_bags.T0 + i,
+                      ros_bags.make.store().cdr_to_ros1(raw, 'sensor_msgs/msg/Imu'))
+    taken = []
+
+    class Counted(Allowance):
+        def unpack(self, packing, data, size=None):
+            taken.append(packing)
+            return super().unpack(packing, data, size)
+    file = rosbag1_file.Rosbag1File(tmp_path / 'a.bag', Counted(tmp_path / 'a.bag', 1),
+                                    lambda raw, _: raw)
+    assert len(list(file.messages({'/imu': 'sensor_msgs/msg/Imu'}))) == 3
+    assert taken == ['bz2']
+    file.close()
+
+
+def test_a_rosbag1_whose_index_runs_in_circles(tmp_path, monkeypatch):
+    path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
+    given, found = rosbag1.Reader.read_chunk_info, []
+
+    def always_the_first(self):
+        found[:] = found or [given(self)]
+        return found[0]
+    monkeypatch.setattr(rosbag1.Reader, 'read_chunk_info', always_the_first)
+    data = bytearray(path.read_bytes())
+    at = data.index(b'chunk_count=') + len(b'chunk_count=')
+    data[at:at + 4] = (1000).to_bytes(4, 'little')
+    path.write_bytes(data)
+    with pytest.raises(BadBag, match='runs in circles'):
+        Part(path, path, '.bag', len(data), print)
+
+
+def test_a_rosbag1_that_unpacks_to_more_than_it_may(tmp_path, monkeypatch):
+    path = ros_bags.write(tmp_path / 'a.bag', ros_bags.drive(1.0), 'rosbag1')
+    part = Part(path, path, '.bag', 2**40, lambda raw, _: raw)
+    part._allowance.most = 1000
+    with pytest.raises(LimitReached):
+        list(part.batches({'/imu/data': 'sensor_msgs/msg/Imu'}))
+    part.close()
+
+
+@pytest.mark.parametrize('compression', ['none', 'storage'])
+def test_the_mcap_writer_takes_our_checksums(tmp_path, compression):
+    assert 'write_uint32(rec, 0)' in inspect.getsource(storage_mcap.McapWriter.close_chunk)
+    drive = simulate(SimOptions(scenario='straight', duration=180.0))
+    path = write.write_bag(tmp_path / 'bag', write.drive_topics(drive), 'mcap', compression)
+    data = (path / 'bag.mcap').read_bytes()
+    places = chunks_of(data)
+    assert places
+    for at, size in places:
+        end = at + 9 + 28 + 4 + int.from_bytes(data[at + 37:at + 41], 'little') + 8
+        records = storage_mcap.decompress(          # checks it
+            data[end:at + size], 'zstd' * (compression == 'storage'),
+            int.from_bytes(data[at + 25:at + 33], 'little'),
+            int.from_bytes(data[at + 33:at + 37], 'little'))
+        assert records
+        assert data[at + 33:at + 37] != bytes(4)

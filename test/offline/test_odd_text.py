@@ -1,0 +1,104 @@
+"""Text of any kind in metadata.yaml, journal.yaml, --config, --set and --leg: one sentence."""
+
+from contextlib import suppress
+import random
+import shutil
+
+import pytest
+import ros_bags
+import yaml
+
+from odocal_ros.config_file import parse_set
+from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.offline.cli import main
+from odocal_ros.offline.legs import parse_leg
+
+ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
+       {}, {'a': 1}, [None], -1e308, '1' * 5000, {'nanoseconds': []}, b'\xff']
+HEAD = '/**:\n  ros__parameters:\n    '
+TEXTS = [
+    '!!python/object/apply:os.system [true]', '&a {b: *a}', '&a [*a]', '[' * 3000, '{' * 3000,
+    '- ' * 3000 + 'x', '9' * 400, '9' * 5000, '1e400', '.inf', '!!binary x', '!!timestamp 1',
+    '!foo bar', '? [a]\n: b', '!!int x', '0x' + 'f' * 400, '0' + '7' * 500, '"\\uD800"',
+    '!!set {1}', '*nothing', '<<: *x', '%YAML 9.9', '\t', '1:60:60', '!!null {}', 'a: b: c',
+    '| \n x', '\x07']
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return a bag of ten seconds."""
+    return ros_bags.write(tmp_path_factory.mktemp('odd') / 'bag', ros_bags.drive())
+
+
+def said(capsys, *argv):
+    """Run a command: 0, 1 or 2, and no more than one line on stderr from exit 2; return both."""
+    code = main([*map(str, argv)])
+    errors = capsys.readouterr().err
+    assert code in (0, 1, 2), errors
+    assert code != 2 or len(errors.strip().splitlines()) == 1, errors
+    return code, errors
+
+
+def test_metadata_of_any_type(tmp_path, bag, capsys):
+    """Each value of the tree in turn is something else, or gone."""
+    path = shutil.copytree(bag, tmp_path / 'bag')
+    whole = yaml.safe_load((bag / 'metadata.yaml').read_text())
+
+    def places(node, way=()):
+        yield way
+        items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(
+            node, list) else ()
+        for key, inner in items:
+            yield from places(inner, (*way, key))
+    rng = random.Random(1)
+    for way in list(places(whole))[1:]:
+        for odd in rng.sample(ODD, 3):
+            tree = yaml.safe_load((bag / 'metadata.yaml').read_text())
+            node = tree
+            for key in way[:-1]:
+                node = node[key]
+            node[way[-1]] = odd
+            (path / 'metadata.yaml').write_text(yaml.safe_dump(tree))
+            said(capsys, 'inspect', path)
+
+
+@pytest.mark.parametrize('text', TEXTS)
+def test_files_of_any_text(tmp_path, bag, capsys, text):
+    path = shutil.copytree(bag, tmp_path / 'bag')
+    (path / 'metadata.yaml').write_text(f'rosbag2_bagfile_information: {text}')
+    said(capsys, 'inspect', path)
+    shutil.copy(bag / 'metadata.yaml', path)
+    config = tmp_path / 'config.yaml'
+    for form in ('{}', HEAD + '{}', HEAD + 'leg.min_distance: {}', HEAD + 'frames.imu: {}',
+                 HEAD + 'imu.lever_arm: [1, {}]', HEAD + '{}: 3'):
+        config.write_text(form.format(text))
+        said(capsys, 'inspect', bag, '--config', config)
+    for form in (HEAD + 'leg.min_distance: 50.0\nodocal_journal:\n  ros__parameters: {}',
+                 HEAD + 'leg.min_distance: 50.0\nodocal_journal:\n  ros__parameters:\n'
+                 '    topics.imu: {}'):
+        (path / 'journal.yaml').write_text(form.format(text))
+        said(capsys, 'replay', path, '--output', tmp_path / 'out', '--force', '--quiet')
+    (path / 'journal.yaml').unlink()
+
+
+@pytest.mark.parametrize('text', [*TEXTS, '[' * 3000 + ']' * 3000])
+@pytest.mark.parametrize('name', ['leg.min_distance', 'imu.lever_arm', 'frames.imu',
+                                  'wheels.levels', 'output.formats', 'method',
+                                  'reference.start', 'no.such'])
+def test_settings_of_any_text(name, text):
+    with suppress(OdocalError):
+        parse_set(f'{name}={text}')
+
+
+@pytest.mark.parametrize('text', [
+    '1e400:2', ':1e400', '1e999999999:', '-1e30:', 'nan:', 'inf:inf', '9' * 5000 + ':', '1:2:3',
+    '9999-12-31/', '0001-01-01T00:00:00+23:59/', '٣:٤', '\0:', '1_0:2e', '/', '//', 'each-stop:'])
+def test_legs_of_any_text(text):
+    with suppress(BadUsage):
+        span = parse_leg(text)
+        assert all(edge is None or abs(edge) < 2**62 for edge in (span.start_ns, span.stop_ns))
+
+
+def test_a_sentence_ends_somewhere(capsys):
+    _, errors = said(capsys, 'inspect', 'x' * 50_000)
+    assert len(errors) < 2200

@@ -1,0 +1,84 @@
+"""Rows of a damaged recording: those that show, and those beside them that do not."""
+
+from dataclasses import replace
+import warnings
+
+from drives import changed, drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.glitches import about_clumps
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code, Verdict
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+
+
+def garbage(rng, column, first, last):
+    """Overwrite rows with random bits, as a block that unpacks wrongly has them."""
+    raw = rng.integers(0, 256, column[first:last].nbytes, np.uint8)
+    column[first:last] = raw.view(np.float64).reshape(column[first:last].shape)
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('share', [0.002, 0.02, 0.1])
+def test_a_block_of_garbage_is_never_accepted(made, seed, share):
+    leg, rng = made.leg(), np.random.default_rng(seed)
+    n = len(leg.imu.stamp_ns)
+    first = int(rng.integers(0, n * (1 - share)))
+    last = first + int(n * share)
+    bad = changed(leg.imu, w_i=lambda c: garbage(rng, c, first, last),
+                  f_i=lambda c: garbage(rng, c, first, last))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        result = calibrate(replace(leg, imu=bad), settings(made, method='auto'))
+    assert result.verdict is not Verdict.ACCEPTED
+    assert Code.ROWS_DAMAGED in everything_said(result)
+
+
+def test_mild_neighbours_go_with_their_clump(made):
+    """One row of twenty shows; the others are off by what a sensor might say."""
+    leg, rng = made.leg(), np.random.default_rng(5)
+
+    def wrong(column):
+        column[4000:4600] += rng.normal(0, 0.05, (600, 3))
+        column[4000:4600:20] = 1e200
+    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wrong)),
+                       settings(made, method='auto'))
+    assert result.imu_samples <= len(leg.imu.stamp_ns) - 600
+    assert result.verdict is not Verdict.ACCEPTED
+
+
+def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
+    leg = made.leg()
+
+    def gaps(column):
+        column[::50] = np.nan
+    said = everything_said(calibrate(replace(leg, imu=changed(leg.imu, w_i=gaps)),
+                                     settings(made)))
+    assert Code.BAD_ROWS_DROPPED in said
+    assert Code.ROWS_DAMAGED not in said
+
+
+def test_what_a_clump_is():
+    wild = np.zeros(1000, bool)
+    assert not about_clumps(wild).any()
+    wild[[100, 400, 800]] = True
+    assert not about_clumps(wild).any()              # alone
+    wild[[405, 410, 414, 419]] = True                # 400 to 419: five apart at most
+    assert np.flatnonzero(about_clumps(wild)).tolist() == list(range(390, 430))
+    assert not about_clumps(np.zeros(0, bool)).any()
+
+
+@pytest.mark.parametrize('value', [5e-324, -1e-310, 1e-200])
+def test_subnormal_odometer(made, value):
+    leg = made.leg()
+    form = replace(leg.form, quantity='rate', modulus=0, scale_unit='1')
+    odometer = replace(leg.odometer, value=np.full(len(leg.odometer.stamp_ns), value))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        result = calibrate(replace(leg, odometer=odometer, form=form), settings(made))
+    assert result.verdict is Verdict.REJECTED

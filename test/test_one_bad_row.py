@@ -1,0 +1,63 @@
+"""A row or a method that breaks costs itself, never the leg."""
+
+from dataclasses import replace
+
+from drives import changed, drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros import leg_methods
+from odocal_ros.calib.failed import traces
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.reasons import Code, Verdict
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=200.0, imu_grade='industrial', seed=4)
+
+
+@pytest.mark.parametrize('matrix', [
+    np.ones((3, 3)),                                        # E and N fully correlated
+    [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],    # a correlation of two
+    [[1.0, 1 - 1e-9, 0.0], [1 - 1e-9, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    [[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]],    # only with the height
+    [[2.0, 0.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 9.0]],    # not symmetric
+    np.diag([1e-300, 1e-300, 1.0]), np.diag([1e300, 1.0, 1.0]), np.full((3, 3), 5e-324)])
+def test_a_covariance_that_is_none(made, matrix):
+    leg = made.leg()
+
+    def one(covariance):
+        covariance[len(covariance) // 2] = matrix
+    config = settings(made, method='auto')
+    whole = calibrate(leg, config)
+    result = calibrate(replace(leg, fix=changed(leg.fix, covariance_n=one)), config)
+    assert Code.METHOD_FAILED not in everything_said(result)
+    for name in ('smoother', 'two_point'):
+        mine, other = (r.methods[name].estimates['scale_factor'] for r in (result, whole))
+        assert mine.value == pytest.approx(other.value, abs=other.sigma)   # one fix of many
+
+
+@pytest.mark.parametrize('broken', ['two_point', 'smoother'])
+def test_a_fault_in_a_method_costs_that_method(made, monkeypatch, broken):
+    leg, config = made.leg(), settings(made, method='auto')
+    whole = calibrate(leg, config)
+
+    def breaks(run):
+        run.reasons.append('half a finding')
+        raise np.linalg.LinAlgError('Singular\nmatrix')
+    monkeypatch.setitem(leg_methods.METHODS, broken, breaks)
+    result = calibrate(leg, config)
+    reason, = (r for r in result.methods[broken].reasons if r.code is Code.METHOD_FAILED)
+    assert f'method {broken} broke: LinAlgError (Singular matrix) in breaks' in reason.text
+    assert 'half a finding' not in result.reasons
+    (name, trace), = traces([result])
+    assert name == broken
+    assert 'Traceback' in trace
+    other, = {'two_point', 'smoother'} - {broken}
+    assert result.methods[other].estimates == whole.methods[other].estimates
+    # two legs of it, too: the combination knows what is missing
+    later = replace(result, start_ns=result.stop_ns, stop_ns=2 * result.stop_ns - result.start_ns)
+    both = combine([result, later], config)
+    assert both.estimates['scale_factor'].method == other
+    assert both.verdict is not Verdict.REJECTED
