@@ -31,6 +31,7 @@ from odocal_ros.calib.smoother.state import (
     ODO_ARM,
     ODO_DELAY,
     Priors,
+    SIZES,
     State,
 )
 from odocal_ros.grades import Grade, grade_as_seen
@@ -163,9 +164,8 @@ def imperfect_sigmas(grade, duration):
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
-    imu = np.repeat([grade.gyro_scale_error, grade.gyro_by_force, grade.accel_scale_error, axes],
-                    [2, 6, 3, 2])
-    return np.r_[imu, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 3e-3, 5e-3]
+    return np.repeat([grade.gyro_scale_error, axes, grade.gyro_by_force, grade.accel_scale_error,
+                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 3e-3, 5e-3], SIZES)
 
 
 def _priors(config, grade, leg) -> Priors:

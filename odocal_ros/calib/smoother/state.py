@@ -26,35 +26,40 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
              'odometer_delay', 'gnss_delay', 'heading_offset', 'gyro_scale_z',
-             'gyro_scale_x', 'gyro_scale_y', 'gyro_x_by_force_x', 'gyro_x_by_force_y',
-             'gyro_y_by_force_x', 'gyro_y_by_force_y', 'gyro_z_by_force_x', 'gyro_z_by_force_y',
+             'gyro_scale_x', 'gyro_scale_y',
+             'gyro_axis_xy', 'gyro_axis_yx', 'gyro_axis_zx', 'gyro_axis_zy',
+             'gyro_x_by_force_x', 'gyro_x_by_force_y', 'gyro_y_by_force_x', 'gyro_y_by_force_y',
+             'gyro_z_by_force_x', 'gyro_z_by_force_y',
              'accelerometer_scale_x', 'accelerometer_scale_y', 'accelerometer_scale_z',
-             'accelerometer_axis_xy', 'accelerometer_axis_zx', 'fix_lag_square',
-             'scale_by_speed', 'scale_by_time', 'scale_by_acceleration', 'squat', 'sideslip')
+             'accelerometer_axis_xy', 'accelerometer_axis_zx', 'accelerometer_axis_zy',
+             'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_acceleration',
+             'squat', 'sideslip')
 LN_K, YAW, PITCH = 0, 1, 2
 ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY = 9, 10
 HEADING = 11                 # error of the outside heading, the same through the leg, rad
 # Errors of the Imu: of what a signal measures, the part that an axis has too much. Each column:
 # the axis it enters, and the signal, of (w_x, w_y, w_z, f_x, f_y) and of (f_x, f_y, f_z). The
-# others of the 18 are a bias (f_z), are zero by the definition of the axes (z: about which the
-# gyro feels a turn on level ground; x: the direction of a push that the y accelerometer does not
-# feel), or act through slopes alone.
-GYRO, GYRO_SCALE = slice(12, 21), 12
-GYRO_AXIS, GYRO_SIGNAL = (2, 0, 1, 0, 0, 1, 1, 2, 2), (2, 0, 1, 3, 4, 3, 4, 3, 4)
-ACCEL = slice(21, 26)
-ACCEL_AXIS, ACCEL_SIGNAL = (0, 1, 2, 0, 2), (0, 1, 2, 1, 0)
-FIX_LAG2 = 26                # s^2, square of the time constant by which a receiver smooths
+# others of the 18 are a bias (f_z into x and y), or zero by the definition of the axes (z: about
+# which the gyro feels a turn on level ground; x: the direction of a push that the y accelerometer
+# does not feel).
+GYRO, GYRO_SCALE = slice(12, 25), 12
+GYRO_AXIS = (2, 0, 1, 0, 1, 2, 2, 0, 0, 1, 1, 2, 2)
+GYRO_SIGNAL = (2, 0, 1, 1, 0, 0, 1, 3, 4, 3, 4, 3, 4)
+ACCEL = slice(25, 31)
+ACCEL_AXIS, ACCEL_SIGNAL = (0, 1, 2, 0, 2, 2), (0, 1, 2, 1, 0, 1)
+FIX_LAG2 = 31                # s^2, square of the time constant by which a receiver smooths
 # relative change of the scale with the square of the speed (as its slope at FAST, 1 / (m/s)), with
 # time, 1 / s, and forward acceleration, 1 / (m/s^2), from their means by travel
-BY_SPEED, BY_TIME, BY_FORCE = 27, 28, 29
+BY_SPEED, BY_TIME, BY_FORCE = 32, 33, 34
 FAST = 20.0                  # m/s
-SQUAT, SIDESLIP = 30, 31     # rad per m/s^2: the forward axis by forward and by left acceleration
+SQUAT, SIDESLIP = 35, 36     # rad per m/s^2: the forward axis by forward and by left acceleration
 # what a good vehicle has not: all from here on, but for the gyro's scale, which every turn tells
-IMPERFECT = slice(13, 32)
-# kinds of these, each there or not: gyro scales, gyro by force, accelerometer scales, axes, ...
-KINDS = (slice(0, 2), slice(2, 8), slice(8, 11), slice(11, 13),
-         *(slice(i, i + 1) for i in range(13, 19)))
+IMPERFECT = slice(13, 37)
+# kinds of these, each there or not, as ``imperfect_sigmas`` has them: gyro scales, axes and by
+# force, accelerometer scales and axes, the others one by one
+SIZES = (2, 4, 6, 3, 3, 1, 1, 1, 1, 1, 1)
+KINDS = tuple(slice(sum(SIZES[:i]), sum(SIZES[:i + 1])) for i in range(len(SIZES)))
 M = len(CONSTANTS)
 
 
