@@ -20,14 +20,16 @@ from odocal_ros.calib.predict import Sigmas
 from odocal_ros.calib.smoother import bound, imperfect, problem, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.remarks import FLOOR
 from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadConfig
+from odocal_ros.grades import GRADES
 from odocal_ros.reasons import Code
 
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}
-USUAL = problem.imperfect_sigmas(Config(), 600.0)
+USUAL = problem.imperfect_sigmas(GRADES['consumer'], 600.0)
 
 
 def sigmas_of(method):
@@ -59,7 +61,7 @@ def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(opti
     sigmas = figures(drive, config, tau)
     problem = Problem.of(leg, config)
     true = bound(leg, config, truth(drive, config, leg), planned_levels(problem, sigmas))
-    sigma = np.sqrt(np.diag(true))[:3]
+    sigma = np.hypot(np.sqrt(np.diag(true))[:3], FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
     # elsewhere: 5 % of what rests tell
     np.testing.assert_allclose(sigmas_of(predict_smoother(planned(drive), sigmas)) / sigma, 1.0,
