@@ -116,7 +116,8 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
         monkeypatch.setattr(module, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
-        assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(table, rel=0.10)
+        assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(
+            np.hypot(table, 1e6 * FLOOR[0]), rel=0.10)
 
 
 @pytest.fixture

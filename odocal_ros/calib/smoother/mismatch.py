@@ -13,6 +13,7 @@ ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
 SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
 OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said to be wrong
 WIDEN = 2.0            # factor on the sigmas where the model does not hold
+MOST_WIDEN = 3.0       # the same of an Imu that is shaken: the more, the less its colour is known
 
 
 def mismatch(problem, fit, neighbours, config):
@@ -20,7 +21,7 @@ def mismatch(problem, fit, neighbours, config):
     reasons: list[Reason] = []
     told, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     level = fit.levels.roots()
-    shaken = [name for name in ('gyro', 'accel') if level[name] > WORSE * own[name]]
+    shaken = max(level[name] / own[name] for name in ('gyro', 'accel'))
     worse = [f'{what} {level[name] / told[name]:.1f} times' for name, what in (
         ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
         if level[name] > WORSE * told[name]]
@@ -32,7 +33,7 @@ def mismatch(problem, fit, neighbours, config):
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
                               f'({", ".join(worse)}); estimated from the drive instead'))
     widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
-    if shaken:      # what shakes a vehicle is not white, and how it is coloured is not known
+    if shaken > WORSE:      # what shakes a vehicle is not white, and its colour is not known
         odd.append('the Imu errs more than its grade, in ways that are not white noise')
     share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
@@ -45,7 +46,7 @@ def mismatch(problem, fit, neighbours, config):
                    f'{max(level["side"], level["side_turn"]):.2f} m in a second')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
-        widen = WIDEN
+        widen = max(WIDEN, min(np.sqrt(shaken), MOST_WIDEN))
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd)))
     return widen, reasons
 
