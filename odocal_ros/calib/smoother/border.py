@@ -15,7 +15,7 @@ def border_of(fit, configured) -> Border:
 
     configured : (M,) values of the settings that constants are corrections to.
     """
-    at, priors = fit.weighted.eq.state.constants, fit.weighted.eq.priors
+    at, priors = fit.weighted.state.constants, fit.weighted['priors'].priors
     weight = 1 / priors.constants**2
     return Border(
         CONSTANTS, at + configured, fit.solved.reduced - np.diag(weight),
