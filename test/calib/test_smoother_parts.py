@@ -21,6 +21,7 @@ from odocal_ros.calib.smoother.state import (
     P,
     PHI,
     SLOW,
+    SPEED_OFFSET,
     WITH_SLOW,
 )
 from odocal_ros.config import with_settings
@@ -50,6 +51,7 @@ def shaken():
     step[:, PHI.start:BG.stop] *= 0.1
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
+    c[SPEED_OFFSET] = 0.0
     c[IMPERFECT] *= [1, 1, *[0.1] * 6, 1, 1, 1, 1, 0.0, 0.1, 0.003, 0.0, 0.0]
     return problem, state.moved(step, c)
 

@@ -31,6 +31,7 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     PITCH,
     SIDESLIP,
+    SPEED_OFFSET,
     SQUAT,
     V,
     YAW,
@@ -56,6 +57,13 @@ def gravity_n(position_n, origin):
     latitude, longitude, height = origin.to_geodetic(position_n).T
     up_e = C_en(latitude, longitude)[..., 2]
     return -gravity(latitude, height)[:, None] * (up_e @ C_en(origin.latitude, origin.longitude))
+
+
+def means_by_way(sums, state):
+    """Return the mean speed, m/s, and time, s, of a leg, each metre counted alike."""
+    way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
+    t, total = (state.t[1:] + state.t[:-1]) / 2, max(way.sum(), 1e-9)
+    return (way / sums.T) @ way / total, t @ way / total
 
 
 class Motion:
@@ -86,6 +94,9 @@ class Motion:
         if np.any(change[0]):
             way = way + turn(intervals.S_by, change[0])
         self.way = turn(half @ self.C, way) + self._faster() * change[1]
+        self.unsaid = self._unsaid(leg.travel.coarse)
+        if self.unsaid is not None:
+            self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
         p, v = state.p_n, state.v_n
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
@@ -110,14 +121,22 @@ class Motion:
         state, T, c = self.state, self.T, self.state.constants
         gained = np.diff(state.v_n, axis=0) / T
         self.accel_v = turn(np.swapaxes(self.C @ state.C_bv, 1, 2), gained)
-        way = np.linalg.norm(self.sums.S @ self.f, axis=1)
-        t = (state.t[1:] + state.t[:-1]) / 2
-        total = max(way.sum(), 1e-9)
-        self.from_mean = np.stack([x - (x @ way) / total for x in (way / T[:, 0], t)], -1)
+        speed, t = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0], (
+            state.t[1:] + state.t[:-1]) / 2
+        mean = means_by_way(self.sums, state)
+        self.from_mean = np.stack([speed - mean[0], t - mean[1]], -1)
         self.varied = 1 + self.from_mean @ c[[BY_SPEED, BY_TIME], None]
         self.leaned = state.scale * (
             np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
             + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
+
+    def _unsaid(self, coarse):
+        """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
+        if coarse is None:
+            return None
+        said = np.einsum('kij,j->ki', self.sums.S, self.state.forward) @ self.state.forward
+        moves = np.abs(said) > coarse.step * self.T[:, 0]
+        return (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None] * self.T
 
     def _faster(self):
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
@@ -166,6 +185,8 @@ class Motion:
             c[:, D, column] = turned + swing @ gradient @ self.arm_v
             c[:, D, lean] = turned * accel[:, None]
         c[:, D, ODO_ARM] = swing @ state.C_bv
+        if self.unsaid is not None:
+            c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self._faster()
         c[:, :, GYRO] = gyro[:, :, 3:]

@@ -22,6 +22,7 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     PITCH,
+    SPEED_OFFSET,
     YAW,
 )
 from odocal_ros.nav.angles import wrap
@@ -37,7 +38,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = range(GYRO.start, ACCEL.stop)     # errors of the Imu
+SCALES = (*range(GYRO.start, ACCEL.stop), SPEED_OFFSET)     # errors of Imu and speed
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
 

@@ -13,6 +13,7 @@ from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
 from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
+from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import State
 from odocal_ros.reasons import Code, Reason
@@ -57,8 +58,9 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 
 def best_fit(problem, config, trace=None):
-    """Return the likeliest fit, the Imu's own errors judged."""
-    return judge_imperfect(problem, likeliest_fit(problem, config, trace), config, trace)
+    """Return the likeliest fit, the odometer's and the Imu's own errors judged."""
+    found = judge_offset(problem, likeliest_fit(problem, config, trace), trace)
+    return judge_imperfect(problem, found, config, trace)
 
 
 def likeliest_fit(problem, config, trace=None):

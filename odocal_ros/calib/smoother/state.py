@@ -30,7 +30,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'gyro_y_by_force_x', 'gyro_y_by_force_y', 'gyro_z_by_force_x', 'gyro_z_by_force_y',
              'accelerometer_scale_x', 'accelerometer_scale_y', 'accelerometer_axis_xy',
              'accelerometer_axis_zx', 'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'squat',
-             'sideslip')
+             'sideslip', 'speed_offset')
 LN_K, YAW, PITCH = 0, 1, 2
 ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY = 9, 10
@@ -48,11 +48,13 @@ FIX_LAG2 = 25                # s^2, square of the time constant by which a recei
 # relative change of the scale with speed, 1 / (m/s), and time, 1 / s, from their means by travel
 BY_SPEED, BY_TIME = 26, 27
 SQUAT, SIDESLIP = 28, 29     # rad per m/s^2: the forward axis by forward and by left acceleration
-# what a good vehicle has not: all from here on, but for the gyro's scale, which every turn tells
+# what a good vehicle has not, but for the gyro's scale, which every turn tells
 IMPERFECT = slice(13, 30)
 # kinds of these, each there or not: gyro scales, gyro by force, accelerometer scales, axes, ...
 KINDS = (slice(0, 2), slice(2, 8), slice(8, 10), slice(10, 12),
          *(slice(i, i + 1) for i in range(12, 17)))
+# of a speed sent in steps, what a value of it lacks: half a step where the sender truncates
+SPEED_OFFSET = 30            # scale units per s
 M = len(CONSTANTS)
 
 
