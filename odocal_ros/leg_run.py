@@ -14,6 +14,7 @@ from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
+from odocal_ros.coarse_odometer import coarse_reasons, held_steps
 from odocal_ros.fix_screen import origin_amid
 from odocal_ros.leg_tracks import check_of, tracks
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
@@ -87,7 +88,7 @@ class LegRun:
         methods, paths = {}, {}
         for name in self._asked():
             method, paths[name] = METHODS[name](self)
-            method = held(method, self)
+            method = held_steps(held(method, self), self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))
@@ -185,6 +186,7 @@ class LegRun:
                 inputs, self.spans, self.rough, self.fixes_n, self.origin, config)
         self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
         self.track = self.reckon(inputs.travel)
+        self.reasons += coarse_reasons(self)
         self.wheel_slips = self._faults()
         self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
         # turns are what the others live on

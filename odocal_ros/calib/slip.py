@@ -22,6 +22,13 @@ TURN = 0.1         # rad in a window: more is a turn
 COUNTS = 8.0       # odometer counts: what pins by counts may make of a window
 
 
+def rounding(travel) -> float:
+    """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
+    coarse = travel.coarse
+    # speeds at both ends of a window, and within it, err by up to a step
+    return travel.quantum if coarse is None else coarse.step * WINDOW / COUNTS
+
+
 def find_slips(t_imu, f_b, track, f, latitude, quantum):
     """
     Return when and how far the odometer ran ahead of the Imu.

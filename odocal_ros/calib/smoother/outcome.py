@@ -74,8 +74,9 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     """Return what a settled fit says of the leg."""
     near = fit.solved.neighbours()
     widen, reasons = mismatch(problem, fit, near, config)
-    slips = find_slips(fit, near)
-    reasons += slip_reasons(fit, slips)
+    count = leg.travel.quantum * fit.state.scale
+    slips = find_slips(fit, near, count)
+    reasons += slip_reasons(fit, slips, count)
     sigma = np.sqrt(np.diag(fit.solved.covariance)) * widen
     state, c = fit.state, fit.state.constants
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
