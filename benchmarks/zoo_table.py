@@ -23,7 +23,7 @@ EXPLAINS = {
     'temperature': {'TRACK_MISMATCH', *IMU},      # what the standstill told no longer holds
     'vibration': IMU | WHEELS, 'grade': IMU,
     'imu_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *IMU},
-    'coarse_speed': WHEELS, 'coarse_pulses': GENERAL,
+    'coarse_speed': {'SPEED_COARSE', *WHEELS}, 'coarse_pulses': {'COUNTER_COARSE', *GENERAL},
     'odometer_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', *WHEELS},
     'speed_law': WHEELS, 'warming': WHEELS, 'slip': WHEELS,
     'sideslip': GENERAL,

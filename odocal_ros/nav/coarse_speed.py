@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FEWEST = 20          # distinct values to know a grid by
+FEW, OFTEN, DIVIDES = 4, 5, 0.02     # a slow drive's: distinct, times sent, of a cell
 LOWEST = 3.0         # cells that the values must span
 ON_GRID = 0.9        # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 CELLS, PADDED = 2**17, 2**20     # of the values' span, and with zeros: frequencies between
@@ -63,7 +64,8 @@ class CoarseSpeed:
 
         The offset is half a cell where the sender truncates, none where it rounds. A change by one
         cell: the speed of its middle is the mean of both values, uniform by what the speed changes
-        in the step. A value between changes by more: it is uniform in its cell.
+        in the step. A value between changes by more: it is uniform in its cell, all the time that
+        it stands: its rows together count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -78,10 +80,12 @@ class CoarseSpeed:
             single &= h <= GAP * usual
         sigma = np.minimum(_gain(middle, edge, q) * h, q)[single]
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
-        first, last = at[:-1][run] + 1, at[1:][run]
-        when = np.r_[middle[single], (t[first] + t[last]) / 2]
-        value = np.r_[edge[single], v[first]]
-        sigma = np.hypot(np.r_[sigma, np.full(len(first), q)] / np.sqrt(12), SHARPEST * q)
+        first, length = at[:-1][run] + 1, np.diff(at)[run]
+        row = np.repeat(first, length) + np.arange(length.sum()) - np.repeat(
+            np.cumsum(length) - length, length)
+        when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
+        sigma = np.r_[sigma, q * np.sqrt(np.repeat(length, length))] / np.sqrt(12)
+        sigma = np.hypot(sigma, SHARPEST * q)
         order = np.argsort(when, kind='stable')
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 
@@ -127,9 +131,10 @@ def grid(value) -> float | None:
     span = np.ptp(value) if len(value) else 0.0
     if span <= 0:
         return None
-    u = np.unique(np.rint((value - value.min()) / span * (CELLS - 1)).astype(int))
+    u, count = np.unique(np.rint((value - value.min()) / span * (CELLS - 1)).astype(int),
+                         return_counts=True)
     if len(u) < FEWEST:
-        return None
+        return _of_few(value, u * (span / (CELLS - 1)) + value.min(), count)
     there = np.zeros(PADDED)
     there[u] = 1.0
     phase = np.abs(np.fft.rfft(there)) / len(u)
@@ -140,6 +145,15 @@ def grid(value) -> float | None:
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
     return _refined(value, 1 / float(f[peak]))
+
+
+def _of_few(value, u, count):
+    """Return the step of few distinct values u, each sent time and again, that it divides."""
+    if len(u) < FEW or np.median(count) < OFTEN:
+        return None
+    step = _refined(value, float(np.diff(u).min()))
+    off = u / step - np.rint(u / step)
+    return step if np.abs(off).max() < DIVIDES else None
 
 
 def _refined(value, step):

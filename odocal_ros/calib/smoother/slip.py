@@ -40,7 +40,8 @@ def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:
     """Return the runs that lie far out along, by more than a count, m; largest first."""
     turned, t = along(fit, neighbours), fit.state.t
     noise = NOISY * float(np.sqrt(fit.levels['along']))
-    far = np.flatnonzero((fit.spread[:, 0] > FAR_OUT) | (np.abs(turned) > max(LEAST, noise, count)))
+    least = max(LEAST, noise, count)
+    far = np.flatnonzero((fit.spread[:, 0] > FAR_OUT) | (np.abs(turned) > least))
     if not len(far):
         return ()
     runs = np.split(far, np.flatnonzero(np.diff(far) > TOGETHER) + 1)

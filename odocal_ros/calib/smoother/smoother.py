@@ -14,6 +14,7 @@ from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
 from odocal_ros.calib.smoother.speed_offset import judge_offset
+from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import State
 from odocal_ros.reasons import Code, Reason
@@ -78,7 +79,8 @@ def likeliest_fit(problem, config, trace=None):
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
         fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.thin = {name: alike(best.weighted[name]) for name in problem.outside}
+    problem.thin = {name: alike(best.weighted[name])
+                    for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
         return with_slow_errors(problem, best, asked, trace)

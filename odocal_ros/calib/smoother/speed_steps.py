@@ -44,6 +44,8 @@ class SpeedSteps(PointRows):
         self.state, self.points, self.fitted = state, points, here.fitted
         self.told, self.k = _within(problem), points.interval
         self.sigma = self.told.sigma * leg.rough_scale
+        # at an even acceleration the speed is at the same place of its cell again and again
+        self.thin = problem.thin.get(self.name, 1.0)
         C, tau = state.C_nb[self.k], points.tau[:, None]
         self.C, self.C_t = C, C @ points.R
         self.dv = turn(C, points.dv)
@@ -53,7 +55,10 @@ class SpeedSteps(PointRows):
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
         swing = np.cross(points.rate, state.C_bv @ self.arm_v)
         self.speed = np.einsum('ki,ki->k', self.ahead, self.v_n) + swing @ state.forward
-        self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g)
+        self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
+        # the way ahead turns too, and the Imu, off the axle, moves across it
+        self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g) + np.einsum(
+            'ki,ki->k', np.cross(points.rate, state.forward), self.v_b)
         c = state.constants
         mean = means_by_way(here.intervals, state)
         self.from_mean = np.stack([
@@ -97,10 +102,10 @@ class SpeedSteps(PointRows):
         c[:, LN_K], c[:, SPEED_OFFSET] = said, K * self.told.side
         by = (said / self.varied)[:, None] * self.from_mean
         c[:, BY_SPEED], c[:, BY_TIME] = by.T
-        rate, v_b = self.points.rate, turn(np.swapaxes(self.C_t, 1, 2), v)
+        rate = self.points.rate
         for column, gradient in zip((YAW, PITCH), C_bv_gradient(
                 state.constants[YAW], state.constants[PITCH]), strict=True):
-            c[:, column] = -(v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
+            c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
         c[:, ODO_DELAY] = self.gained
