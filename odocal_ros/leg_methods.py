@@ -4,6 +4,7 @@ from odocal_ros.calib.failed import failed
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
+from odocal_ros.coarse_odometer import held_steps
 from odocal_ros.errors import OdocalError
 from odocal_ros.slow_slip import held
 from odocal_ros.smoother_run import smoother
@@ -27,7 +28,7 @@ def run_method(name, run):
     found = len(run.reasons)
     try:
         method, path = METHODS[name](run)
-        return held(method, run), path
+        return held_steps(held(method, run), run), path
     except (OdocalError, MemoryError):
         raise
     except Exception as error:

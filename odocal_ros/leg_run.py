@@ -14,6 +14,7 @@ from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
+from odocal_ros.coarse_odometer import coarse_reasons
 from odocal_ros.fix_screen import origin_amid
 from odocal_ros.leg_methods import METHODS, run_method
 from odocal_ros.leg_tracks import check_of, tracks
@@ -177,6 +178,7 @@ class LegRun:
                 inputs, self.spans, self.rough, self.fixes_n, self.origin, config)
         self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
         self.track = self.reckon(inputs.travel)
+        self.reasons += coarse_reasons(self)
         self.wheel_slips = self._faults()
         self.distance, found = judge_drive(self.track, inputs.t_stop, self.rough, config.leg)
         # turns are what the others live on

@@ -44,6 +44,10 @@ class Code(Enum):
     COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg; the travel across the '
                               'reset was bridged at the speed beside it.')
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
+    SPEED_COARSE = NOTE, ('Take wheel pulses or a finer speed signal of the same bus, if there is '
+                          'one; the smoother hears when the steps change and can do without.')
+    COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
+                            'farther: a count weighs less the longer the way.')
     REVERSING_UNSIGNED = REJECT, ('Do not reverse during a leg, or use an odometer that counts '
                                   'backwards (odometer.signed).')
     ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '

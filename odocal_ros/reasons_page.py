@@ -59,6 +59,13 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'or lost power. What was driven in that moment is guessed, with a sigma.',
         Code.COUNTER_ROLLOVER: 'The counter reached its largest number and began anew. That is '
         'undone exactly.',
+        Code.SPEED_COARSE: 'All speeds sent are multiples of one step, such as 1 km/h. Truncated, '
+        'they are half a step too low on the mean, rounded they are not, and the steps do not say '
+        'which. The smoother uses the moments at which the speed passes from one step to the '
+        'next, and finds which; the sigma of the other methods holds half a step.',
+        Code.COUNTER_COARSE: 'There are few counts a metre, so that the way is known to a count '
+        'at each moment. Over a long drive that is little, and the sigma holds it; what happens '
+        'within a few metres, such as a short slip, does not show.',
         Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up: '
         'travel backwards was taken for travel forwards.',
         Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '

@@ -6,18 +6,12 @@ before and that of after; the fixes of the leg do not tell which of them is the 
 drawn out over tens of seconds is no step, and hides in the smoother's road noise.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Source
-from odocal_ros.reasons import Code
+from odocal_ros.scale_error import SCALES, WHEELS, with_scale_error
 
 NAME = 'slow_wheel_slip'
 STEP = 8.0          # s: method wheels takes a slip for a step, which a longer one is not
-WHEELS = ('scale_factor_left', 'scale_factor_right')
-SCALES = ('scale_factor', 'scale_ratio', *WHEELS)
 
 
 def held(method, run):
@@ -32,24 +26,10 @@ def held(method, run):
     if run.distance > 0:
         part = float(np.linalg.norm(_not_held(method, slips))) / run.distance
         mean, wheel = float(np.hypot(mean, part / 2)), float(np.hypot(wheel, part))
-    K = method.estimates['scale_factor'].value
-    if not K or not mean:
+    if not mean:
         return method
-    relative = dict.fromkeys(SCALES, mean) | dict.fromkeys(WHEELS, wheel)
-    effects = np.array([[relative.get(name, 0.0)] for name in method.parameters])
-    estimates = {name: replace(e, sigma=float(np.hypot(e.sigma, relative[name] * e.value)))
-                 if name in relative and e.value is not None and e.sigma is not None else e
-                 for name, e in method.estimates.items()}
-    row = {name: relative.get(name, 0.0) * (method.estimates[name].value or 0.0)
-           for name in method.parameters} | {'shared': False}
-    judged = [r for r in judge(estimates, run.nominal, run.config)
-              if r.code is Code.SCALE_SIGMA_TOO_LARGE]
-    return replace(
-        method, estimates=estimates, sources=(*method.sources, Source(NAME, effects)),
-        details=method.details | {'budget': method.details.get('budget', {}) | {NAME: row}},
-        border=method.border and method.border.loosened({'scale_factor': mean}),
-        reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
-                 *judged))
+    return with_scale_error(method, run, NAME,
+                            dict.fromkeys(SCALES, mean) | dict.fromkeys(WHEELS, wheel))
 
 
 def _not_held(method, slips):

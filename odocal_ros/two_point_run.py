@@ -17,7 +17,7 @@ from odocal_ros.calib.check import (
 )
 from odocal_ros.calib.facing import toward
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.slip import find_slips, slip_reason, WINDOW
+from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.leg_tracks import near
@@ -74,7 +74,7 @@ class TwoPointRun:
         """Return slips of the mean between the marks, s and m; name those not named already."""
         t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
                              toward(self.run.facing, f), self.run.origin.latitude,
-                             self.inputs.travel.quantum)
+                             rounding(self.inputs.travel))
         one = self.run.wheel_slips      # of one wheel: half of it goes into the mean
         known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
         held = (t >= chord.start.t) & (t <= chord.end.t) & ~known

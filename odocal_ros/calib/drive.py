@@ -64,8 +64,9 @@ def _rate_1s(t, x):
 def uncovered(travel, t_stop) -> tuple[Reason, ...]:
     """Say where the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
-    what = [f'begins {late:.1f} s after the start mark'] * (late > EDGE)
-    what += [f'ends {early:.1f} s before the stop mark'] * (early > EDGE)
+    edge = max(EDGE, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
+    what = [f'begins {late:.1f} s after the start mark'] * (late > edge)
+    what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
     if not what:
         return ()
     return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is taken as far '

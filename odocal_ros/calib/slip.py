@@ -22,6 +22,16 @@ TURN = 0.1         # rad in a window: more is a turn
 COUNTS = 8.0       # odometer counts: what pins by counts may make of a window
 
 
+def rounding(travel) -> float:
+    """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
+    coarse = travel.coarse
+    if coarse is None:
+        return travel.quantum
+    # speeds at both ends of a window err by up to a step, and by what a bend between rows hides
+    bend = float(np.percentile(np.abs(np.diff(coarse.value)), 95)) / 4
+    return (coarse.step + bend) * WINDOW / COUNTS
+
+
 def find_slips(t_imu, f_b, track, f, latitude, quantum):
     """
     Return when and how far the odometer ran ahead of the Imu.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.reasons import Code, Reason
 
 RESET_FACTOR = 5.0   # a step this many times the 95th percentile of the moving rate is no motion
@@ -19,11 +20,13 @@ class Travel:
     t : (n,) s since the start mark, rising.
     s : (n,) signed travel from the first row, in scale units (pulses, rad or configured m).
     quantum : size of one count in s, 0 for speeds and floats.
+    coarse : the speeds sent, where they lie on a grid and are those of one wheel.
     """
 
     t: NDArray[np.float64]
     s: NDArray[np.float64]
     quantum: float
+    coarse: CoarseSpeed | None = None
 
     def at(self, t):
         """Return travel at times t, linear between rows, constant outside."""
@@ -55,15 +58,17 @@ def travel(t, value, form, reversed_counts=False,
     """
     whole = np.issubdtype(value.dtype, np.integer)
     reasons: tuple[Reason, ...] = ()
+    coarse = None
     if form.quantity == 'rate':
         step = (value[:-1] + value[1:]) / 2 * np.diff(t)
+        coarse = coarse_speed(t, -value if reversed_counts else value)
     elif form.quantity == 'increment':
         step = value[1:].astype(float)
     else:
         step, reasons = _counter_steps(t, value, form.modulus, name)
     s = np.concatenate([[0.0], np.cumsum(step)]) if len(value) else np.empty(0)
     quantum = 1.0 if whole and form.quantity != 'rate' else 0.0
-    return Travel(t, -s if reversed_counts else s, quantum), reasons
+    return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
 
 
 def mean_travel(left: Travel, right: Travel) -> Travel:

@@ -17,23 +17,28 @@ from odocal_ros.calib.smoother.state import (
     GNSS_DELAY,
     GYRO,
     IMPERFECT,
+    LN_K,
     M,
+    ODO_DELAY,
     P,
     PHI,
     SLOW,
+    SPEED_OFFSET,
     WITH_SLOW,
 )
 from odocal_ros.config import with_settings
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.odometer import Travel
 
 N = WITH_SLOW
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
 # and half the attitude residual, 2e-4. Instants: what a turn of 1e-3 rad leaves of second order
-LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3}
+LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'steps': 2e-3}
 # biases act within a second as under constant force and no turn, of which a vehicle makes 0.3 rad
 BIASES = dict.fromkeys(range(BG.start, BG.stop), 0.3) | dict.fromkeys(
     (*range(BA.start, BA.stop), *range(N + ACCEL.start, N + ACCEL.stop)), 0.1)
 # an arm's swing: at the mean turn rate of the second, and with no delay in it
-SWING = {'fixes': 1e-2, 'velocity': 0.3}
+SWING = {'fixes': 1e-2, 'velocity': 0.3, 'steps': 0.03}
 
 
 @pytest.fixture(scope='module')
@@ -50,8 +55,24 @@ def shaken():
     step[:, PHI.start:BG.stop] *= 0.1
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
+    c[SPEED_OFFSET] = 0.0
     c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, 0.0, 0.0, 0.0]
     return problem, state.moved(step, c)
+
+
+@pytest.fixture(scope='module')
+def stepping(shaken):
+    """Return the problem of the same leg with a speed in whole km/h, and such a state."""
+    problem, state = shaken
+    leg, step = problem.leg, 1 / 3.6
+    t = np.arange(leg.t_begin, leg.t_stop, 0.1)
+    speed = np.diff(leg.travel.at(np.append(t, t[-1] + 0.1))) / 0.1 * leg.rough_scale
+    coarse = CoarseSpeed(step, t, np.floor(speed / step) * step)
+    way = Travel(t, np.cumsum(coarse.value) * 0.1, 0.0, coarse)
+    c = np.zeros(M)
+    c[LN_K], c[SPEED_OFFSET] = -np.log(leg.rough_scale), 0.1
+    state = state.moved(np.zeros((len(state.t), N)), c)
+    return replace(problem, leg=replace(leg, travel=way, rough_scale=1.0)), state
 
 
 def part_at(problem, state, name, sums=None):
@@ -59,8 +80,8 @@ def part_at(problem, state, name, sums=None):
 
 
 @pytest.mark.parametrize('name', LOOSE)
-def test_derivatives_are_those_of_finite_differences(shaken, name):
-    problem, state = shaken
+def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
+    problem, state = stepping if name == 'steps' else shaken
     # sums are held where they are shifted to a state, and made again where they are not
     held = problem.sums(state) if name == 'motion' else None
     part = part_at(problem, state, name, held)
@@ -88,17 +109,34 @@ def test_derivatives_are_those_of_finite_differences(shaken, name):
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
         loose = LOOSE[name] if name == 'motion' else BIASES.get(i, LOOSE[name])
-        loose = SWING.get(name, loose) if i == N + GNSS_DELAY else loose
+        loose = SWING.get(name, loose) if i in (N + GNSS_DELAY, N + ODO_DELAY) else loose
+        # ahead turns with the bias as well: half as much again of what a turn makes of it
+        loose = 1.5 * loose if name == 'steps' and i in BIASES else loose
         np.testing.assert_allclose((raw(h) - raw(-h)) / (2 * h), expected, err_msg=str(i),
                                    atol=loose * max(1.0, np.abs(expected).max()))
     assert begin[:, :, P].any() == (name in ('motion', 'fixes'))
 
 
+def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
+    problem, state = stepping
+    held = problem.sums(state)
+
+    def raw(size):
+        c = np.zeros(M)
+        c[SPEED_OFFSET] = size
+        return part_at(problem, state.moved(np.zeros((len(state.t), N)), c), 'motion', held).raw
+
+    by_offset = part_at(problem, state, 'motion', held).jacobians(N)[2][:, :, SPEED_OFFSET]
+    np.testing.assert_allclose((raw(0.01) - raw(-0.01)) / 0.02, by_offset, atol=1e-9)
+    moves = np.linalg.norm(by_offset, axis=1)
+    assert {0, 1} == set(np.rint(moves))        # seconds that moved, of each interval
+
+
 @pytest.mark.parametrize('name', [part.name for part in PARTS])
-def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, name):
-    problem, state = shaken
+def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, name):
+    problem, state = stepping if name == 'steps' else shaken
     # so wide that nothing lies far out: squares only
-    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'velocity_up', 'heading'), 1e8)
+    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'velocity_up', 'heading', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighed(levels)
     normal = Normal.zeros(len(state.t), N, M)

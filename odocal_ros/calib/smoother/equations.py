@@ -13,12 +13,13 @@ from odocal_ros.calib.smoother.part import Here, Part
 from odocal_ros.calib.smoother.priors import PriorRows
 from odocal_ros.calib.smoother.rests import Rests
 from odocal_ros.calib.smoother.slow_error import SlowError
+from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.state import BARE, M, WITH_SLOW
 from odocal_ros.calib.smoother.travel_error import TravelError
 from odocal_ros.calib.smoother.velocity import VelocityRows
 
-PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, TravelError,
-                                 SlowError, Rests, PriorRows)
+PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
+                                 TravelError, SlowError, Rests, PriorRows)
 
 
 class Equations:

@@ -32,6 +32,7 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     PITCH,
     SIDESLIP,
+    SPEED_OFFSET,
     SQUAT,
     V,
     YAW,
@@ -58,6 +59,27 @@ def gravity_n(position_n, origin):
     latitude, longitude, height = origin.to_geodetic(position_n).T
     up_e = C_en(latitude, longitude)[..., 2]
     return -gravity(latitude, height)[:, None] * (up_e @ C_en(origin.latitude, origin.longitude))
+
+
+def accelerations(state):
+    """Return what springs and tyres answer to in each interval, vehicle axes: (K, 3) m/s^2."""
+    T = np.diff(state.t)[:, None]
+    accel_v = turn(np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2), np.diff(state.v_n, axis=0) / T)
+    if len(T) > 1:       # a body answers to what accelerates it a moment later
+        accel_v -= SPRUNG * np.gradient(accel_v, axis=0) / T
+    return accel_v
+
+
+def varies_with(speed, t, accel):
+    """Return what the scale varies with, as BY_SPEED, BY_TIME and BY_FORCE have it: (..., 3)."""
+    return np.stack([speed**2 / (2 * FAST), t, accel], -1)
+
+
+def means_by_way(sums, state):
+    """Return the means of ``varies_with`` over a leg, each metre counted alike: (3,)."""
+    way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
+    t = (state.t[1:] + state.t[:-1]) / 2
+    return way @ varies_with(way / sums.T, t, accelerations(state)[:, 0]) / max(way.sum(), 1e-9)
 
 
 class Motion:
@@ -88,6 +110,9 @@ class Motion:
         if np.any(change[0]):
             way = way + turn(intervals.S_by, change[0])
         self.way = turn(half @ self.C, way) + self._faster() * change[1]
+        self.unsaid = self._unsaid(leg.travel.coarse)
+        if self.unsaid is not None:
+            self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
         self.dv, self.dp = dv, dp
         p, v = state.p_n, state.v_n
         g = gravity_n((p[:-1] + p[1:]) / 2, leg.origin)
@@ -110,19 +135,22 @@ class Motion:
     def _vary(self):
         """Work out how scale and forward axis change with speed, time and acceleration."""
         state, T, c = self.state, self.T, self.state.constants
-        gained = np.diff(state.v_n, axis=0) / T
-        self.accel_v = turn(np.swapaxes(self.C @ state.C_bv, 1, 2), gained)
-        if len(T) > 1:       # a body answers to what accelerates it a moment later
-            self.accel_v -= SPRUNG * np.gradient(self.accel_v, axis=0) / T
-        way = np.linalg.norm(self.sums.S @ self.f, axis=1)
+        self.accel_v = accelerations(state)
+        speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
-        total = max(way.sum(), 1e-9)
-        self.from_mean = np.stack([x - (x @ way) / total for x in (
-            (way / T[:, 0])**2 / (2 * FAST), t, self.accel_v[:, 0])], -1)
+        self.from_mean = varies_with(speed, t, self.accel_v[:, 0]) - means_by_way(self.sums, state)
         self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1, None]
         self.leaned = state.scale * (
             np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
             + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
+
+    def _unsaid(self, coarse):
+        """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
+        if coarse is None:
+            return None
+        said = np.einsum('kij,j->ki', self.sums.S, self.state.forward) @ self.state.forward
+        moves = np.abs(said) > coarse.step * self.T[:, 0]
+        return (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None] * self.T
 
     def _faster(self):
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
@@ -171,6 +199,8 @@ class Motion:
             c[:, D, column] = turned + swing @ gradient @ self.arm_v
             c[:, D, lean] = turned * accel[:, None]
         c[:, D, ODO_ARM] = swing @ state.C_bv
+        if self.unsaid is not None:
+            c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self._faster()
         c[:, :, GYRO] = gyro[:, :, 3:]

@@ -30,6 +30,7 @@ SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
 GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
 GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
 ABSENT = 1e4        # m^2: no odometer
+STEPS = 0.05        # m/s: a speed in finer steps errs as if by chance
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,15 @@ class IntervalNoise:
     columns: Floats
     component: NDArray[np.int64]       # (c,)
     extra: Floats                      # (K, 18) variances that are given, not estimated
+    given: Floats                      # (K, 18, g) columns of unit noises, the same
 
     def covariance(self, levels: Levels) -> Floats:
         """Return the covariance of the rows, (K, 18, 18)."""
         root = np.sqrt([levels[INTERVAL[i]] for i in self.component])
         W = self.columns * root
         Q = W @ np.swapaxes(W, 1, 2)
+        if self.given.shape[2]:
+            Q += self.given @ np.swapaxes(self.given, 1, 2)
         Q[:, range(ROWS), range(ROWS)] += self.extra
         return Q
 
@@ -117,7 +121,33 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
     extra[rest, D] += still
     slow = ~rest & (speed < 1.0)
     extra[slow, D] += still * (1 - speed[slow, None])
-    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component), extra)
+    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component), extra,
+                         _given(motion, leg, axes, rest))
+
+
+def _given(motion, leg, axes, rest):
+    """
+    Return noises of a way that is told by speeds in steps: (K, 18, g).
+
+    Along the way itself it says nothing: what it tells is in speed_steps.py. In a turn an error
+    that goes from one end of its cell to the other within the interval moves the end sideways.
+    """
+    if not by_steps(leg):
+        return np.zeros((len(rest), ROWS, 0))
+    size = np.linalg.norm(motion.way, axis=1, keepdims=True)
+    along = np.where(size > 1e-3, motion.way / np.maximum(size, 1e-3), axes[:, 0])
+    turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
+    cell = motion.state.scale * leg.travel.coarse.step * motion.T[:, 0]
+    given = np.zeros((len(rest), ROWS, 2))
+    given[:, D, 0] = along * np.sqrt(ABSENT)
+    given[:, D, 1] = axes[:, 1] * (cell * turned / 12)[:, None]
+    return given * ~rest[:, None, None]
+
+
+def by_steps(leg) -> bool:
+    """Tell whether a leg's odometer is heard by the steps of its speed, not by its way."""
+    coarse = leg.travel.coarse
+    return coarse is not None and coarse.step * leg.rough_scale > STEPS
 
 
 def rest_noise(speed, rest):

@@ -23,6 +23,7 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     PITCH,
+    SPEED_OFFSET,
     YAW,
 )
 from odocal_ros.nav.angles import wrap
@@ -38,7 +39,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = range(GYRO.start, ACCEL.stop)     # errors of the Imu
+SCALES = (*range(GYRO.start, ACCEL.stop), SPEED_OFFSET)     # errors of Imu and speed
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
 
@@ -74,8 +75,9 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     """Return what a settled fit says of the leg."""
     near = fit.solved.neighbours()
     widen, reasons = mismatch(problem, fit, near, config)
-    slips = find_slips(fit, near)
-    reasons += slip_reasons(fit, slips)
+    count = leg.travel.quantum * fit.state.scale
+    slips = find_slips(fit, near, count)
+    reasons += slip_reasons(fit, slips, count)
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.solved.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))

@@ -20,6 +20,7 @@ from odocal_ros.calib.smoother.state import (
     P,
     PHI,
     SIDESLIP,
+    SPEED_OFFSET,
     SQUAT,
     V,
 )
@@ -37,6 +38,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'receiver_smoothing': slice(FIX_LAG2, FIX_LAG2 + 1),
           'tyre_changes': slice(BY_SPEED, BY_FORCE + 1),
           'body_lean': slice(SQUAT, SIDESLIP + 1),
+          'speed_truncation': slice(SPEED_OFFSET, SPEED_OFFSET + 1),
           'heading': slice(HEADING, HEADING + 1)}
 
 
@@ -47,8 +49,9 @@ class PriorRows(Part):
 
     def __init__(self, problem, here):
         self.state, self.priors = here.state, here.priors
-        self.shared = {name: where for name, where in SHARED.items()
-                       if name != 'heading' or 'heading' in problem.outside}
+        absent = {'heading'} - {*problem.outside}
+        absent |= {'speed_truncation'} if problem.leg.travel.coarse is None else set()
+        self.shared = {name: where for name, where in SHARED.items() if name not in absent}
 
     def _biases(self):
         """Yield columns, value and sigma of the biases at the first keyframe."""

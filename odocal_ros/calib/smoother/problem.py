@@ -32,6 +32,7 @@ from odocal_ros.calib.smoother.state import (
     ODO_DELAY,
     Priors,
     SIZES,
+    SPEED_OFFSET,
     State,
 )
 from odocal_ros.grades import Grade, grade_as_seen
@@ -179,4 +180,11 @@ def _priors(config, grade, leg) -> Priors:
     # what gravity makes of axes and scale is a bias
     level = np.sqrt(2) * G * grade.misalignment
     accel_bias = np.hypot(max(grade.accel_bias, 1e-6), [level, level, grade.accel_scale_error * G])
-    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, np.zeros(M))
+    centre = np.zeros(M)
+    centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
+    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)
+
+
+def _offset(coarse):
+    """Return what a speed in steps lacks, and its sigma: none of a step to half of it."""
+    return (0.0, NO_ERROR) if coarse is None else (coarse.step / 4, coarse.step / 4)

@@ -15,6 +15,7 @@ TOGETHER = 2            # intervals between slips of one run
 HARD_NOISE = 0.006      # m/sqrt(s) when speeding up or braking, which no wheel without slip has
 HARDER = 3.0            # times that of even driving, the same
 SHOWN = 3               # runs told in the sentence
+SPELL = 10.0            # s that a vehicle speeds up or brakes at a time
 
 
 @dataclass(frozen=True)
@@ -35,31 +36,34 @@ def along(fit, neighbours):
     return -estimate[:, 0] * size
 
 
-def find_slips(fit, neighbours) -> tuple[Slip, ...]:
-    """Return the runs of intervals that lie far out along, largest first."""
+def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:
+    """Return the runs that lie far out along, by more than a count, m; largest first."""
     turned, t = along(fit, neighbours), fit.state.t
     noise = NOISY * float(np.sqrt(fit.levels['along']))
-    far = np.flatnonzero((fit.spread[:, 0] > FAR_OUT) | (np.abs(turned) > max(LEAST, noise)))
+    least = max(LEAST, noise, count)
+    far = np.flatnonzero((fit.spread[:, 0] > FAR_OUT) | (np.abs(turned) > least))
     if not len(far):
         return ()
     runs = np.split(far, np.flatnonzero(np.diff(far) > TOGETHER) + 1)
     slips = [Slip(float(t[run[0]]), float(t[run[-1] + 1] - t[run[0]]), float(turned[run].sum()))
              for run in runs]
     return tuple(sorted((s for s in slips if abs(s.metres)
-                         >= max(LEAST, noise * np.sqrt(s.duration))),
+                         >= max(LEAST, noise * np.sqrt(s.duration), count)),
                         key=lambda s: -abs(s.metres)))
 
 
-def slip_reasons(fit, slips):
+def slip_reasons(fit, slips, count=0.0):
     """Say where the wheels slipped and how much, one by one or whenever the speed changes."""
     level = fit.levels.roots()
+    # two readings differ by that whatever the wheel does
+    rounding = count * np.sqrt(2 / 12) / np.sqrt(SPELL)
     said = []
     if slips:
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)' for s in slips[:SHOWN]]
         more = f' and {len(slips) - SHOWN} more' if len(slips) > SHOWN else ''
         said.append('the wheel turned more (+) or less (-) than the vehicle moved: '
                     + ', '.join(one) + more)
-    if level['along_hard'] > max(HARD_NOISE, HARDER * level['along']):
+    if level['along_hard'] > max(HARD_NOISE, HARDER * level['along'], rounding):
         said.append('it slips when the speed changes: about '
                     f'{1e3 * level["along_hard"]:.0f} mm in each second of speeding up or '
                     f'braking, {1e3 * level["along"]:.1f} mm in even driving')

@@ -13,6 +13,8 @@ from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
 from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
+from odocal_ros.calib.smoother.speed_offset import judge_offset
+from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import State
 from odocal_ros.reasons import Code, Reason
@@ -57,8 +59,9 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 
 def best_fit(problem, config, trace=None):
-    """Return the likeliest fit, the Imu's own errors judged."""
-    return judge_imperfect(problem, likeliest_fit(problem, config, trace), trace)
+    """Return the likeliest fit, what is imperfect in odometer and Imu judged."""
+    found = judge_offset(problem, likeliest_fit(problem, config, trace), trace)
+    return judge_imperfect(problem, found, trace)
 
 
 def likeliest_fit(problem, config, trace=None):
@@ -76,7 +79,8 @@ def likeliest_fit(problem, config, trace=None):
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
         fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.thin = {name: alike(best.weighted[name]) for name in problem.outside}
+    problem.thin = {name: alike(best.weighted[name])
+                    for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
     asked = config.gnss.correlation_time
     if are_slow(problem, best, asked):
         return with_slow_errors(problem, best, asked, trace)

@@ -1,0 +1,48 @@
+"""
+Whether a sender of coarse speeds truncates or rounds, where the drive tells.
+
+A leg is fitted with anything between, since the grid does not say. What the drive then finds lies
+at one of the two, many sigmas from the other, and to know it exactly halves the scale's sigma.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.state import SPEED_OFFSET
+
+TELLING = 8.0      # sigmas between both
+NEAR = 2.5         # sigmas from one of them
+EXACT = 1e-3       # of a step, sigma of what is known
+FEW = 6            # passes
+
+
+def judge_offset(problem, now: Fit, trace=None) -> Fit:
+    """
+    Return a fit with the offset of a coarse speed taken as that of truncation or of rounding.
+
+    As it was where the drive does not tell which, or where it is neither.
+    """
+    coarse = problem.leg.travel.coarse
+    if coarse is None:
+        return now
+    sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
+    found = float(now.state.constants[SPEED_OFFSET])
+    known = coarse.step / 2 if found > coarse.step / 4 else 0.0
+    if TELLING * sigma > coarse.step / 2 or abs(found - known) > NEAR * sigma:
+        return now
+    constants = now.state.constants.copy()
+    constants[SPEED_OFFSET] = known
+    about = replace(now, **{name: _held(getattr(now, name), known, EXACT * coarse.step)
+                            for name in ('priors', 'first')})
+    last = fit(problem, replace(now.state, constants=constants), now.levels, FEW, about=about,
+               frozen=True, trace=trace)
+    return replace(last, iterations=now.iterations + last.iterations)
+
+
+def _held(priors, value, sigma):
+    """Return priors with the offset known."""
+    constants, centre = priors.constants.copy(), priors.centre.copy()
+    constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value
+    return replace(priors, constants=constants, centre=centre)

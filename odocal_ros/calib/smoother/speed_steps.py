@@ -1,0 +1,119 @@
+"""
+The steps of a coarse speed as rows: how fast the vehicle is where the value sent changes.
+
+The way that such a speed adds up to is not used along the vehicle (noise.py): its error is that of
+a cell, for as long as the value stands.
+"""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.motion import accelerations, gravity_n, means_by_way, varies_with
+from odocal_ros.calib.smoother.noise import by_steps
+from odocal_ros.calib.smoother.point_rows import PointRows
+from odocal_ros.calib.smoother.preintegrate import turn
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    BA,
+    BG,
+    BY_FORCE,
+    BY_SPEED,
+    C_bv_gradient,
+    GYRO_SCALE,
+    LN_K,
+    M,
+    ODO_ARM,
+    ODO_DELAY,
+    PHI,
+    PITCH,
+    SPEED_OFFSET,
+    V,
+    YAW,
+)
+
+LEAST = 0.25     # of the variance by the grid: no vehicle crosses its edges more evenly
+
+
+class SpeedSteps(PointRows):
+    """Residuals of speeds, by K what the odometer says less that of its point; one component."""
+
+    name, source = 'steps', 'speed_steps'
+    levels_of = {'steps': slice(0, 1)}
+
+    def __init__(self, problem, here):
+        leg, state, points = problem.leg, here.state, here.points[self.name]
+        self.state, self.points, self.fitted = state, points, here.fitted
+        self.told, self.k = _within(problem), points.interval
+        self.sigma = self.told.sigma * leg.rough_scale
+        # at an even acceleration the speed is at the same place of its cell again and again
+        self.thin = problem.thin.get(self.name, 1.0)
+        C, tau = state.C_nb[self.k], points.tau[:, None]
+        self.C, self.C_t = C, C @ points.R
+        self.dv = turn(C, points.dv)
+        g = gravity_n(state.p_n[self.k], leg.origin)
+        self.v_n = state.v_n[self.k] + self.dv + g * tau
+        self.ahead = self.C_t @ state.forward
+        self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
+        swing = np.cross(points.rate, state.C_bv @ self.arm_v)
+        self.speed = np.einsum('ki,ki->k', self.ahead, self.v_n) + swing @ state.forward
+        self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
+        # the way ahead turns too, and the Imu, off the axle, moves across it
+        self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g) + np.einsum(
+            'ki,ki->k', np.cross(points.rate, state.forward), self.v_b)
+        c = state.constants
+        self.from_mean = varies_with(
+            self.speed, state.t[self.k] + points.tau, accelerations(state)[self.k, 0]
+        ) - means_by_way(here.intervals, state)
+        self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1]
+        said = self.told.value + self.told.side * c[SPEED_OFFSET]
+        self.said = state.scale * self.varied * said
+        self.raw = (self.said - self.speed + self.gained * here.odo_later)[:, None]
+
+    @classmethod
+    def there(cls, problem):
+        """Tell whether the odometer sends such a speed."""
+        return by_steps(problem.leg) and len(_within(problem).t) > 0
+
+    @classmethod
+    def times(cls, problem, constants):
+        """Return when the speeds were so, s."""
+        return _within(problem).t - constants[ODO_DELAY]
+
+    @classmethod
+    def first_levels(cls, problem):
+        """Return the first level, a factor on the variances by the grid, and the least."""
+        return {'steps': 1.0}, {'steps': LEAST}
+
+    def stated(self, rows):
+        """Return rows in the sigmas that the grid gives."""
+        return rows / self.sigma[:, None, None]
+
+    def jacobians(self, n):
+        """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""
+        state, ahead, v, tau = self.state, self.ahead, self.v_n, self.points.tau[:, None]
+        J, c = np.zeros((len(v), n)), np.zeros((len(v), M))
+        J[:, V], J[:, PHI] = -ahead, -np.cross(ahead, v - self.dv)
+        J[:, BA] = turn(np.swapaxes(self.C, 1, 2), ahead) * tau
+        arm = state.C_bv @ self.arm_v
+        turned = np.cross(ahead, v) - np.cross(ahead, self.dv) / 2
+        J[:, BG] = turn(np.swapaxes(self.C, 1, 2), turned) * tau + np.cross(arm, state.forward)
+        K = state.scale * self.varied
+        # a value is its cell's: by the speed as fitted, which its error is not in
+        said = self.speed if self.fitted else self.said
+        c[:, LN_K], c[:, SPEED_OFFSET] = said, K * self.told.side
+        c[:, BY_SPEED:BY_FORCE + 1] = (said / self.varied)[:, None] * self.from_mean
+        rate = self.points.rate
+        for column, gradient in zip((YAW, PITCH), C_bv_gradient(
+                state.constants[YAW], state.constants[PITCH]), strict=True):
+            c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
+                rate, gradient @ self.arm_v) @ state.forward
+        c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv
+        c[:, ODO_DELAY] = self.gained
+        c[:, GYRO_SCALE] = J[:, BG.start + 2] * rate[:, 2]
+        c[:, ACCEL] = np.einsum('ki,kij->kj', ahead, self.C @ self.points.F)
+        return J[:, None], c[:, None]
+
+
+def _within(problem):
+    """Return what the speeds tell within the keyframes."""
+    t = problem.imu.t[problem.imu.key]
+    return problem.leg.travel.coarse.told.between(t[0], t[-1])

@@ -1,0 +1,165 @@
+"""
+Speeds in coarse steps: whole km/h of a car's bus, truncated or rounded, at times interpolated.
+
+Such a speed says where it lies in a cell of the grid, so its error is no noise: a cruise stands in
+one cell for half a minute. What is sharp is the change: in the step in which the value changes by
+one, the speed passes the edge between both cells. Where it changes by more, each value is one of a
+cell. Zero is no cell: below it is whatever the sender holds for rest.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+FEWEST = 20          # distinct values to know a grid by
+FEW, OFTEN, DIVIDES = 4, 5, 0.02     # a slow drive's: distinct, times sent, of a cell
+LOWEST = 3.0         # cells that the values must span
+ON_GRID = 0.9        # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
+CELLS, PADDED = 2**17, 2**20     # of the values' span, and with zeros: frequencies between
+COLLINEAR = 1e-6     # of the top speed: a second difference that vanishes
+KNOTS = 0.5          # share of the rows that change: more are no knots of an interpolation
+KNOT_STEP = 1.5      # the knots' grid over that of all rows, at least, of an interpolation
+LEAST_CELL = 2       # cells from zero: in the first, a dead band may be at work
+GAP = 2.5            # median steps: longer ones tell no crossing
+SHARPEST = 0.02      # of a cell, sigma of a crossing: what speeds do beside
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Speeds known: at t s, ``value`` + side * offset, scale units per s, 1 sigma."""
+
+    t: Floats        # (m,)
+    value: Floats    # (m,)
+    side: Floats     # (m,) 1 forwards, -1 backwards
+    sigma: Floats    # (m,)
+
+    def between(self, begin, end) -> 'Told':
+        """Return those of a time, s."""
+        pick = (self.t >= begin) & (self.t <= end)
+        return Told(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseSpeed:
+    """
+    A speed on a grid.
+
+    step : scale units per s.   t, value : (n,) s and scale units per s, the rows that are data.
+    interpolated : rows between these were sent, which say nothing more.
+    """
+
+    step: float
+    t: Floats
+    value: Floats
+    interpolated: bool = False
+
+    @cached_property
+    def told(self) -> Told:
+        """
+        Return what the rows tell of the speed, but for the offset that all values share.
+
+        The offset is half a cell where the sender truncates, none where it rounds. A change by one
+        cell: the speed of its middle is the mean of both values, uniform by what the speed changes
+        in the step. A value between changes by more: it is uniform in its cell, all the time that
+        it stands: its rows together count as one.
+        """
+        q, t, v = self.step, self.t, self.value
+        cell = np.rint(v / q)
+        at = np.flatnonzero(np.diff(cell))              # changes from row at to the row after it
+        jump, h = np.abs(np.diff(cell)[at]), np.diff(t)[at]
+        middle, edge = (t[at] + t[at + 1]) / 2, (v[at] + v[at + 1]) / 2
+        outer = np.maximum(np.abs(cell[at]), np.abs(cell[at + 1]))
+        inner = np.minimum(np.abs(cell[at]), np.abs(cell[at + 1]))
+        usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
+        single = (jump == 1) & (outer >= LEAST_CELL) & (inner > 0)
+        if not self.interpolated:
+            single &= h <= GAP * usual
+        sigma = np.minimum(_gain(middle, edge, q) * h, q)[single]
+        run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
+        first, length = at[:-1][run] + 1, np.diff(at)[run]
+        row = np.repeat(first, length) + np.arange(length.sum()) - np.repeat(
+            np.cumsum(length) - length, length)
+        when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
+        sigma = np.r_[sigma, q * np.sqrt(np.repeat(length, length))] / np.sqrt(12)
+        sigma = np.hypot(sigma, SHARPEST * q)
+        order = np.argsort(when, kind='stable')
+        return Told(when[order], value[order], np.sign(value[order]), sigma[order])
+
+
+def _gain(t, edge, q):
+    """
+    Return how fast the speed changes at its crossings (m,): between those before and after.
+
+    Where it turns about, both are the same edge: there the faster of both sides is taken, within
+    which the speed may have changed by a cell.
+    """
+    dt, rise = np.maximum(np.diff(t), 1e-9), np.diff(edge)
+    side = np.maximum(np.abs(rise), q) / dt
+    gain = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
+    on = np.flatnonzero(rise[:-1] * rise[1:] > 0)
+    gain[on + 1] = np.abs(rise[on] + rise[on + 1]) / (dt[on] + dt[on + 1])
+    return gain
+
+
+def coarse_speed(t, value) -> CoarseSpeed | None:
+    """Return a speed's grid, scale units per s, by its rows; None where it has none."""
+    step = grid(value)
+    top = np.abs(value).max(initial=0.0)
+    knots = np.ones(len(value), bool)
+    if len(value) > 2:
+        knots[1:-1] = np.abs(np.diff(value, n=2)) > COLLINEAR * top
+    changes = np.diff(value, prepend=value[:1]) != 0
+    if (knots & changes).sum() < KNOTS * changes.sum():
+        own = grid(value[knots])
+        if own and own > KNOT_STEP * (step or 0.0):
+            return CoarseSpeed(own, t[knots], value[knots], True)
+    return CoarseSpeed(step, t, value) if step else None
+
+
+def grid(value) -> float | None:
+    """
+    Return the step of the grid that values other than zero lie on, None where they lie on none.
+
+    Each distinct value counts once, so that a cruise says no more than a passage; the grid is the
+    lowest frequency at which all have one phase.
+    """
+    value = np.abs(value[value != 0])
+    span = np.ptp(value) if len(value) else 0.0
+    if span <= 0:
+        return None
+    u, count = np.unique(np.rint((value - value.min()) / span * (CELLS - 1)).astype(int),
+                         return_counts=True)
+    if len(u) < FEWEST:
+        return _of_few(value, u * (span / (CELLS - 1)) + value.min(), count)
+    there = np.zeros(PADDED)
+    there[u] = 1.0
+    phase = np.abs(np.fft.rfft(there)) / len(u)
+    f = np.arange(len(phase)) * ((CELLS - 1) / PADDED / span)
+    high = np.flatnonzero((phase > ON_GRID) & (f > LOWEST / span))
+    if not len(high):
+        return None
+    last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
+    peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
+    return _refined(value, 1 / float(f[peak]))
+
+
+def _of_few(value, u, count):
+    """Return the step of few distinct values u, each sent time and again, that it divides."""
+    if len(u) < FEW or np.median(count) < OFTEN:
+        return None
+    step = _refined(value, float(np.diff(u).min()))
+    off = u / step - np.rint(u / step)
+    return step if np.abs(off).max() < DIVIDES else None
+
+
+def _refined(value, step):
+    """Return the step with which values lie on its multiples best, about one that is near."""
+    cell = np.rint(value / step)
+    for _ in range(3):
+        step = float(cell @ value / (cell @ cell))
+        cell = np.rint(value / step)
+    return step

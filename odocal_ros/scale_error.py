@@ -1,0 +1,48 @@
+"""An error of the scale beyond a method's own model, put into its sigmas and budget."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.result import Source
+from odocal_ros.reasons import Code
+
+WHEELS = ('scale_factor_left', 'scale_factor_right')
+SCALES = ('scale_factor', 'scale_ratio', *WHEELS)
+
+
+def with_scale_error(method, run, name, relative, shared=False):
+    """
+    Return a method's result with an error in the sigmas of its scales.
+
+    Parameters
+    ----------
+    method, run : MethodResult, LegRun
+        The result, and the leg, prepared.
+    name : str
+        Of the source.
+    relative : dict
+        1 sigma of each of SCALES, relative.
+    shared : bool
+        The same in every leg of the vehicle.
+
+    """
+    K = method.estimates['scale_factor'].value
+    if not K:
+        return method
+    effects = np.array([[relative.get(name_, 0.0)] for name_ in method.parameters])
+    estimates = {name_: replace(e, sigma=float(np.hypot(e.sigma, relative[name_] * e.value)))
+                 if name_ in relative and e.value is not None and e.sigma is not None else e
+                 for name_, e in method.estimates.items()}
+    row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
+           for name_ in method.parameters} | {'shared': shared}
+    judged = [r for r in judge(estimates, run.nominal, run.config)
+              if r.code is Code.SCALE_SIGMA_TOO_LARGE]
+    return replace(
+        method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),
+        details=method.details | {'budget': method.details.get('budget', {}) | {name: row}},
+        border=method.border and method.border.loosened({'scale_factor':
+                                                         relative['scale_factor']}),
+        reasons=(*(r for r in method.reasons if r.code is not Code.SCALE_SIGMA_TOO_LARGE),
+                 *judged))

@@ -1,0 +1,104 @@
+"""Coarse speeds and counters through the whole pipeline: covered, named, and no slip."""
+
+from dataclasses import replace
+from functools import cache
+
+from drives import settings
+import numpy as np
+import pytest
+
+from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.samples import OdometerSamples
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+KMH = 1 / 3.6
+SEED = 31
+
+
+@cache
+def calibrated(how='floor', rate=10.0, step=KMH, between=0.0, **options):
+    """Return a drive and what is made of it; between: Hz to which the speeds are interpolated."""
+    drive = simulate(SimOptions(**({
+        'scenario': 'town', 'odometer': 'speed', 'scale': 1.01, 'nominal_scale': 1.0,
+        'odometer_rate': rate, 'imu_rate': 50.0, 'duration': 300.0, 'seed': SEED,
+        'real': Real(speed_step=step, speed_rounding=how)} | options)))
+    leg = drive.leg()
+    if between:
+        ns, v = leg.odometer.stamp_ns, leg.odometer.value
+        more = np.arange(ns[0], ns[-1], round(1e9 / between))
+        leg = replace(leg, odometer=OdometerSamples(more, more, np.interp(
+            more - ns[0], ns - ns[0], v)))
+    return drive, calibrate(leg, settings(drive, None, method='auto'))
+
+
+def error(drive, method):
+    """Return the error of the scale and its sigma, relative."""
+    found = method.estimates['scale_factor']
+    return found.value / drive.truth.scale - 1, found.sigma / drive.truth.scale
+
+
+def codes(result):
+    return {r.code for r in (*result.reasons, *(
+        r for m in result.methods.values() for r in m.reasons))}
+
+
+@pytest.mark.parametrize(('rate', 'between', 'most'), [
+    (10.0, 0.0, 1.5e-3), (5.0, 0.0, 2e-3), (1.0, 0.0, 4e-3), (1.0, 10.0, 5e-3)])
+@pytest.mark.parametrize('how', ['floor', 'round'])
+def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, between, most):
+    drive, result = calibrated(how, rate, between=between)
+    off, sigma = error(drive, result.methods['smoother'])
+    assert abs(off) < 3.3 * sigma
+    # as it adds up, truncated, it is 1.4 % off; five minutes hold half the steps of ten
+    assert sigma < most
+    off, sigma = error(drive, result.methods['two_point'])
+    assert abs(off) < 2.0 * sigma
+    seen = codes(result)
+    assert Code.SPEED_COARSE in seen
+    assert Code.WHEEL_SLIP not in seen
+
+
+@pytest.mark.parametrize(('how', 'share'), [('floor', 0.5), ('round', 0.0)])
+def test_truncation_or_rounding_is_found(how, share):
+    _, result = calibrated(how)
+    offset = result.methods['smoother'].details['speed_offset']
+    assert offset['value'] == pytest.approx(share * KMH, abs=3 * offset['sigma'])
+    assert offset['sigma'] < KMH / 20
+
+
+def test_the_sentence_tells_the_step():
+    _, result = calibrated()
+    text = next(r.text for r in result.reasons if r.code is Code.SPEED_COARSE)
+    assert 'whole steps of 0.278 m/s (1 km/h)' in text
+
+
+def test_a_smooth_speed_has_no_steps():
+    _, result = calibrated(step=0.0)
+    smoother = result.methods['smoother']
+    assert Code.SPEED_COARSE not in codes(result)
+    assert smoother.details['speed_offset']['value'] == 0.0
+    assert 'speed_truncation' not in {s.name for s in smoother.sources}
+
+
+def test_steps_too_fine_for_crossings_have_an_offset():
+    # 0.06 km/h truncated is 0.1 % of the way: 800 ppm at this speed
+    drive, result = calibrated(step=0.06 * KMH, rate=50.0)
+    smoother = result.methods['smoother']
+    off, sigma = error(drive, smoother)
+    assert abs(off) < 3.3 * sigma
+    assert smoother.details['noise'].keys().isdisjoint({'steps'})
+    offset = smoother.details['speed_offset']
+    assert offset['value'] == pytest.approx(0.03 * KMH, abs=4 * offset['sigma'])
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_half_metre_pulses_are_named_and_no_slip(seed):
+    drive, result = calibrated(odometer='counts', rate=50.0, step=0.0, scale=0.505,
+                               nominal_scale=0.5, seed=seed)
+    seen = codes(result)
+    assert Code.COUNTER_COARSE in seen
+    assert Code.WHEEL_SLIP not in seen
+    off, sigma = error(drive, result.methods['smoother'])
+    assert abs(off) < 3.3 * sigma

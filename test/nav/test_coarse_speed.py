@@ -1,0 +1,86 @@
+"""Grids of speeds: found where there is one, and what values on a grid tell."""
+
+import numpy as np
+import pytest
+
+from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid
+from odocal_ros.nav.odometer import travel
+from odocal_ros.samples import OdometerForm
+
+KMH = 1 / 3.6
+T = np.arange(0.0, 600.0, 0.1)
+# stops and goes of uneven lengths: 0 to 16 m/s
+SPEED = np.maximum(0.0, 8 + 6 * np.sin(T / 9) + 4 * np.sin(T / 4.3))
+RATE = OdometerForm('rate', 0, '1')
+
+
+def sent(step, how, t=T, speed=SPEED):
+    """Return what a bus sends: in steps, truncated or rounded."""
+    return t, np.floor(speed / step + {'floor': 0.0, 'round': 0.5}[how]) * step
+
+
+@pytest.mark.parametrize('how', ['floor', 'round'])
+@pytest.mark.parametrize('step', [KMH, 0.1 * KMH, 0.0075 * KMH])
+def test_the_step_is_found(step, how):
+    found = coarse_speed(*sent(step, how))
+    assert found.step == pytest.approx(step, rel=1e-6)
+    assert not found.interpolated
+
+
+def test_the_step_is_found_under_noise():
+    t, v = sent(KMH, 'floor')
+    noisy = v + 0.01 * np.random.default_rng(1).standard_normal(len(v)) * (v != 0)
+    # the mean of some hundred places of 0.01 m/s, over a lever of tens of cells: below 1e-3
+    assert grid(noisy) == pytest.approx(KMH, rel=1e-3)
+
+
+def test_a_slow_drive_has_few_values_and_a_grid():
+    slow = SPEED / 8
+    assert coarse_speed(*sent(KMH, 'round', speed=slow)).step == pytest.approx(KMH, rel=1e-6)
+    assert coarse_speed(T, slow) is None
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.01])
+def test_a_smooth_speed_has_none(noise):
+    assert coarse_speed(T, SPEED + noise * np.random.default_rng(1).standard_normal(len(T))) \
+        is None
+
+
+def test_of_an_interpolation_only_the_knots_are_data():
+    t, v = sent(KMH, 'floor', T[::10], SPEED[::10])
+    found = coarse_speed(T[:-9], np.interp(T[:-9], t, v))
+    assert found.interpolated
+    assert found.step == pytest.approx(KMH, rel=1e-6)
+    assert np.isin(found.t[1:-1], t).all()
+
+
+def test_only_speeds_have_a_grid_and_reversed_ones_too():
+    t, v = sent(KMH, 'floor')
+    found = travel(t, v, RATE, reversed_counts=True)[0].coarse
+    np.testing.assert_array_equal(found.value, -v)
+    assert travel(t, np.cumsum(v), OdometerForm('cumulative', 0, '1'))[0].coarse is None
+
+
+@pytest.mark.parametrize('rate', [1, 10])
+@pytest.mark.parametrize(('how', 'offset'), [('floor', KMH / 2), ('round', 0.0)])
+def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
+    every = slice(None, None, 10 // rate)
+    told = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).told
+    z = (told.value + offset - np.interp(told.t, T, SPEED)) / told.sigma
+    # uniform: sqrt(3) sigma at most, but for what the change in a step is known by
+    assert np.abs(z).max() < 2.6
+    # rows of one run share its information: an even share of each, so rms is at most 1
+    assert 0.6 < np.sqrt((z**2).mean()) < 1.1
+    assert np.abs(told.value).min() > KMH
+
+
+def test_backwards_the_offset_is_backwards():
+    t, v = sent(KMH, 'floor')
+    np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).told.side, -1.0)
+
+
+def test_zero_and_the_cell_beside_it_tell_nothing():
+    # a dead band of a cell: from 0 to 2 at once
+    t, v = sent(KMH, 'floor', speed=SPEED / 8)
+    told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).told
+    assert np.abs(told.value).min() > 1.9 * KMH
