@@ -18,7 +18,7 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, Priors, State, YAW
 
 MOST = 40            # iterations
-NEAR = 1.0           # sigmas of a step from which residuals are noise
+NEAR, FAR = 1.0, 4.0     # sigmas of a step from which residuals are noise, and are no more
 SETTLED = 0.03       # sigmas that the constants may still move
 CREEPS = 0.5         # the same: values that are worth having, with wider sigmas
 NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
@@ -97,7 +97,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         before = sigma[:3]
         settled = bool(fitted and move < SETTLED
                        and (frozen or change < QUIET and count > tails + 2))
-        fitted = fitted or move < NEAR
+        fitted = bool(move < (FAR if fitted else NEAR))
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
