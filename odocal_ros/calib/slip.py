@@ -25,11 +25,8 @@ COUNTS = 8.0       # odometer counts: what pins by counts may make of a window
 def rounding(travel) -> float:
     """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
     coarse = travel.coarse
-    if coarse is None:
-        return travel.quantum
-    # speeds at both ends of a window err by up to a step, and by what a bend between rows hides
-    bend = float(np.percentile(np.abs(np.diff(coarse.value)), 95)) / 4
-    return (coarse.step + bend) * WINDOW / COUNTS
+    # speeds at both ends of a window, and within it, err by up to that
+    return travel.quantum if coarse is None else coarse.most * WINDOW / COUNTS
 
 
 def find_slips(t_imu, f_b, track, f, latitude, quantum):

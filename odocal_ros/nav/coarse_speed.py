@@ -23,6 +23,7 @@ KNOTS = 0.5          # share of the rows that change: more are no knots of an in
 KNOT_STEP = 1.5      # the knots' grid over that of all rows, at least, of an interpolation
 LEAST_CELL = 2       # cells from zero: in the first, a dead band may be at work
 GAP = 2.5            # median steps: longer ones tell no crossing
+GOLDEN = 0.618034    # steps through a range evenly
 SHARPEST = 0.02      # of a cell, sigma of a crossing: what speeds do beside
 
 Floats = NDArray[np.float64]
@@ -58,14 +59,24 @@ class CoarseSpeed:
     interpolated: bool = False
 
     @cached_property
+    def most(self) -> float:
+        """Return how far a speed may be from the line between rows, bends in between too."""
+        return self.step + self._bend
+
+    @cached_property
+    def _bend(self):
+        change = np.abs(np.diff(self.value))
+        return float(np.percentile(change, 95)) / 4 if len(change) else 0.0
+
+    @cached_property
     def told(self) -> Told:
         """
         Return what the rows tell of the speed, but for the offset that all values share.
 
         The offset is half a cell where the sender truncates, none where it rounds. A change by one
         cell: the speed of its middle is the mean of both values, uniform by what the speed changes
-        in the step. A value between changes by more: it is uniform in its cell, all the time that
-        it stands: its rows together count as one.
+        in the step. A value between changes by more, or of rows so far apart that speeds bend in
+        between: it is uniform in its cell, and its rows, however many, count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -78,14 +89,15 @@ class CoarseSpeed:
         single = (jump == 1) & (outer >= LEAST_CELL) & (inner > 0)
         if not self.interpolated:
             single &= h <= GAP * usual
+        if self._bend > q / 2:        # rows so far apart tell their own times only
+            single, jump = np.zeros(len(at), bool), np.full(len(at), 2)
         sigma = np.minimum(_gain(middle, edge, q) * h, q)[single]
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
-        row = np.repeat(first, length) + np.arange(length.sum()) - np.repeat(
-            np.cumsum(length) - length, length)
+        # one of its rows by turns: where the speed turns about, the middle one is the fastest
+        row = first + (length * (np.arange(len(first)) * GOLDEN % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
-        sigma = np.r_[sigma, q * np.sqrt(np.repeat(length, length))] / np.sqrt(12)
-        sigma = np.hypot(sigma, SHARPEST * q)
+        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), SHARPEST * q)
         order = np.argsort(when, kind='stable')
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 

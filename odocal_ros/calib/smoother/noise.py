@@ -130,17 +130,17 @@ def _given(motion, leg, axes, rest):
     Return noises of a way that is told by speeds in steps: (K, 18, g).
 
     Along the way itself it says nothing: what it tells is in speed_steps.py. In a turn an error
-    that goes from one end of its cell to the other within the interval moves the end sideways.
+    that goes from one end of its cell to the other amid the interval moves the end sideways.
     """
     if not by_steps(leg):
         return np.zeros((len(rest), ROWS, 0))
     size = np.linalg.norm(motion.way, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.way / np.maximum(size, 1e-3), axes[:, 0])
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
-    cell = motion.state.scale * leg.travel.coarse.step * motion.T[:, 0]
+    most = motion.state.scale * leg.travel.coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
     given[:, D, 0] = along * np.sqrt(ABSENT)
-    given[:, D, 1] = axes[:, 1] * (cell * turned / 12)[:, None]
+    given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]
     return given * ~rest[:, None, None]
 
 
