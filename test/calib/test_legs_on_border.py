@@ -11,6 +11,7 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.remarks import FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.slips import NO_SLIPS
 from odocal_ros.combination import combine
@@ -244,7 +245,7 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
             e = one.estimates[name]
             value, size = (np.log(e.value), e.value) if i == 0 else (e.value, 1.0)
-            sigma = np.sqrt(found.covariance[i, i])
+            sigma = np.hypot(np.sqrt(found.covariance[i, i]), FLOOR[i])
             assert sigma == pytest.approx(e.sigma / size, rel=1e-6)
             assert abs(found.value[i] - value) < 1e-3 * sigma
 
@@ -252,10 +253,11 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
 def test_legs_of_the_smoother_add_up_their_information(legs):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
-    border = results[0].border
-    C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / border.used**2))
-    assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(np.sqrt(C[0, 0]), rel=1e-3)
-    assert whole.estimates[YAW].sigma == pytest.approx(np.sqrt(C[1, 1]), rel=1e-3)
+    used = np.max([r.border.used for r in results], axis=0)      # priors as any leg left them
+    C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
+    sigma = np.hypot(np.sqrt(np.diag(C))[:3], FLOOR)
+    assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
+    assert whole.estimates[YAW].sigma == pytest.approx(sigma[1], rel=1e-3)
     for name, true in ((SCALE, truth.scale), (YAW, truth.yaw)):
         e = whole.estimates[name]
         assert abs(e.value - true) < 3.3 * e.sigma, name
@@ -272,7 +274,7 @@ def test_sources_of_legs_combined_make_their_sigma(legs):
     sigma = [whole.estimates[n].sigma for n in whole.parameters]
     sigma[0] /= whole.estimates[SCALE].value
     assert np.sqrt(np.diag(total)) == pytest.approx(sigma)
-    assert [s.name for s in whole.sources if not s.shared] == ['legs']
+    assert [s.name for s in whole.sources if not s.shared] == ['legs', 'model']
     assert 'fix_latency' in {s.name for s in whole.sources}
     assert 'heading' not in {s.name for s in whole.sources}       # there was none
 
@@ -320,7 +322,8 @@ def test_a_slip_that_the_smoother_does_not_hold_is_in_its_border_too(legs):
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
     C = joint([loose.border], []).covariance
-    assert np.sqrt(C[0, 0]) == pytest.approx(scale.sigma / scale.value, rel=1e-6)
+    assert np.hypot(np.sqrt(C[0, 0]), FLOOR[0]) == pytest.approx(scale.sigma / scale.value,
+                                                                 rel=1e-6)
 
 
 def test_a_dispute_names_leg_and_parameter(legs):

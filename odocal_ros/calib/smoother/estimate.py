@@ -35,6 +35,7 @@ INERTIA = 1.0
 # with each step the same way, less with each that turns back
 HASTE, SPEED_UP, SLOW_DOWN, MOST_HASTE = 1.6, 1.25, 0.5, 3.0
 ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
+STIRS = 0.05         # relative change of a slip's variance from which it moves
 OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
 GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
 MOST_WIDE = 30.0     # times its own sigma
@@ -86,7 +87,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
-    tails, pace = 1 if about else FIRST_TAILS, {}
+    tails, pace, slipping = 1 if about else FIRST_TAILS, {}, False
     for count in range(1, most + 1):
         sums = problem.sums_near(state)
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
@@ -95,7 +96,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(fitted and move < SETTLED
+        settled = bool(fitted and not slipping and move < SETTLED
                        and (frozen or change < QUIET and count > tails + 2))
         fitted = bool(move < (FAR if fitted else NEAR))
         state = state.moved(solved.step, solved.step_border)
@@ -110,10 +111,10 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             near = solved.neighbours()
             tail = tails <= count <= LAST_TAILS
             # slips and the road's levels are factors on the same rows: never both in one pass
-            slipping = tail and (count - tails) % 2 == 0
+            found = slips(weighted, near, spread) if tail and not slipping else spread
+            slipping = bool(np.abs(np.log(found / spread)).max() > STIRS)
             levels = update(weighted, near, levels, problem, pace, slipping)
-            if slipping:
-                spread = slips(weighted, near, spread)
+            spread = found
             if tail:
                 priors = beliefs(first, priors, state, solved, near)
     creeping = not settled and bool(still < CREEPS and change < CREEPS)

@@ -69,10 +69,12 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
 def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
     """Say in which constants legs differ, and which leg differs most from the others."""
     J, said = len(found.deviation), []
-    for name in found.spread:
-        z = found.deviation[:, found.names.index(name)]
+    apart = {name: found.deviation[:, found.names.index(name)] for name in found.spread}
+    # what is told with a parameter differs with it
+    worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
+    for name, z in apart.items():
         k = int(np.argmax(np.abs(z)))
-        if name not in PARAMETERS and abs(z[k]) < FAR_OFF:
+        if name not in PARAMETERS and abs(z[k]) < max(FAR_OFF, worst):
             continue
         # of two each differs from the other alike
         who = f', leg {numbers[k]} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
