@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 FEWEST = 20          # distinct values to know a grid by
 FEW, OFTEN, DIVIDES = 4, 5, 0.02     # a slow drive's: distinct, times sent, of a cell
 LOWEST = 3.0         # cells that the values must span
+CROWDS = 6           # cells that they must lie in
 ON_GRID = 0.9        # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 CELLS, PADDED = 2**17, 2**20     # of the values' span, and with zeros: frequencies between
 COLLINEAR = 1e-6     # of the top speed: a second difference that vanishes
@@ -156,7 +157,9 @@ def grid(value) -> float | None:
         return None
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
-    return _refined(value, 1 / float(f[peak]))
+    step = _refined(value, 1 / float(f[peak]))
+    # where a speed bends into a cruise values crowd: at two or three speeds, on some grid
+    return step if len(np.unique(np.rint(value / step))) >= CROWDS else None
 
 
 def _of_few(value, u, count):

@@ -84,3 +84,12 @@ def test_zero_and_the_cell_beside_it_tell_nothing():
     t, v = sent(KMH, 'floor', speed=SPEED / 8)
     told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).told
     assert np.abs(told.value).min() > 1.9 * KMH
+
+
+def test_a_smooth_start_to_one_cruise_has_no_grid():
+    # values crowd at rest and at the cruise, and so lie on any grid that has both
+    t = np.arange(0.0, 60.0, 0.04)
+    x = np.clip((t - 10.0) / 12.0, 0.0, 1.0)
+    speed = 11.7647 * (x**3 * (10 - 15 * x + 6 * x**2))      # no jerk at either end
+    assert coarse_speed(t, speed) is None
+    assert coarse_speed(t, np.floor(speed * 3.6) / 3.6).step == pytest.approx(1 / 3.6, rel=1e-6)

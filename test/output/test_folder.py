@@ -226,6 +226,8 @@ def test_ctrl_c_waits_for_the_exchange(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         swap(*paths)
     monkeypatch.setattr(module, '_swap', interrupted)
+    # a shell's background jobs have it ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     one = ResultFolder(tmp_path / 'out', MAIN, OURS)
     with pytest.raises(KeyboardInterrupt):
         one.put(texts('two'), True)

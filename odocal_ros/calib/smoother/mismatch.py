@@ -13,7 +13,6 @@ ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
 SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
 OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said to be wrong
 WIDEN = 2.0            # factor on the sigmas where the model does not hold
-MOST_WIDEN = 3.0       # the same of an Imu that is shaken: the more, the less its colour is known
 
 
 def mismatch(problem, fit, neighbours, config):
@@ -46,7 +45,7 @@ def mismatch(problem, fit, neighbours, config):
                    f'{max(level["side"], level["side_turn"]):.2f} m in a second')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
-        widen = max(WIDEN, min(np.sqrt(shaken), MOST_WIDEN))
+        widen = WIDEN
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd)))
     return widen, reasons
 

@@ -13,7 +13,6 @@ from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
-    ACCEL,
     BG,
     CONSTANTS,
     GNSS_ARM,
@@ -23,7 +22,6 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     PITCH,
-    SPEED_OFFSET,
     YAW,
 )
 from odocal_ros.nav.angles import wrap
@@ -39,9 +37,9 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = (*range(GYRO.start, ACCEL.stop), SPEED_OFFSET)     # errors of Imu and speed
+SCALES = range(GYRO.start, M)     # errors of Imu, receiver, tyres, body
 # estimates where the drive tells them: lever arms and delays
-OPTIONAL = [i for i in range(len(CONSTANTS)) if i not in (LN_K, YAW, PITCH, HEADING, *SCALES)]
+OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
 def refused(reasons, scale_unit, details=None) -> MethodResult:
@@ -85,7 +83,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
     found, undetermined = told(c + configured(leg), sigma, after, leg.scale_unit,
-                               leg.nominal_scale, config)
+                               leg.nominal_scale, config, widen)
     reasons += undetermined
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
@@ -115,7 +113,7 @@ def floored(covariance):
     return covariance
 
 
-def told(value, sigma, ratio, scale_unit, nominal, config):
+def told(value, sigma, ratio, scale_unit, nominal, config, doubt=1.0):
     """
     Return the estimates of the constants as far as the data tell them, and why not further.
 
@@ -129,6 +127,9 @@ def told(value, sigma, ratio, scale_unit, nominal, config):
         Of the scale; K0, 0 unknown.
     config : Config
         Limits.
+    doubt : float
+        Factor by which the model was found to doubt its sigmas: of an angle that is known badly,
+        by a model that does not hold, nothing is known.
 
     """
     K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
@@ -140,12 +141,12 @@ def told(value, sigma, ratio, scale_unit, nominal, config):
     limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
     for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
                            ('pitch_mounting_angle', PITCH, pitch)):
-        if sigma[i] <= limit:
+        if doubt * sigma[i] <= limit:
             found[name] = Estimate(angle, float(sigma[i]), 'rad')
     for i in OPTIONAL:
         if ratio[i] < INFORMED:
             found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
-    return found, _undetermined(sigma, limit, config, yaw)
+    return found, _undetermined(sigma, limit / doubt, config, yaw)
 
 
 def configured(leg):
