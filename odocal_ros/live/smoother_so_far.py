@@ -22,7 +22,7 @@ from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
-from odocal_ros.calib.smoother.outcome import outcome
+from odocal_ros.calib.smoother.outcome import floored, outcome
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit, too_little
 from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, YAW
@@ -217,8 +217,8 @@ def _running(view, problem, best, config) -> Running:
     T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
     moving = steps > 0.5 * T
     way = max(float(steps.sum()), 1.0)
-    sigmas = np.sqrt(np.diag(best.solved.covariance))[[LN_K, YAW, PITCH]]
-    sigmas = sigmas * method.details['widened']
+    covariance = floored(best.solved.covariance * method.details['widened']**2)
+    sigmas = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)
     for name, sigma in zip(PARAMETERS, sigmas, strict=True):

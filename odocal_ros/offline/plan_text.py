@@ -11,7 +11,7 @@ from odocal_ros.output.figures import length, share, time_span
 
 PITCH = 'pitch_mounting_angle'
 PARAMETERS = (SCALE, YAW, PITCH)
-SHOWN = 1e-3       # share of a variance below which a source is not worth a line
+SHOWN = 0.01          # share of the variance from which a source has its row
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 

@@ -100,7 +100,9 @@ def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
     assert len(after) > 2
     assert after == sorted(after)
     assert 'RTK' in lines[begin + 1]
-    assert ('heading' if 'method=two_point' in drive else 'stop and go') in lines[end + 1]
+    # a better Imu has straighter axes too
+    wanted = 'heading' if 'method=two_point' in drive else 'stop and go'
+    assert any(wanted in line for line in lines[end + 1:end + 3])
 
 
 def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
@@ -158,7 +160,8 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     path = str(gpx(tmp_path / 'a.gpx', rest=0.0, corner=0.0, count=60))
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
-    assert 'the result: scale and pitch by smoother, yaw unknown' in out
+    # an Imu whose axes are off by half a degree: without turns no pitch against the plane of them
+    assert 'the result: scale by smoother, yaw unknown, pitch by two_point' in out
     said = ' '.join(out.split())
     assert 'YAW_NOT_DETERMINED: the drive tells the yaw mounting to' in said
     assert 'Drive with stops, starts and turns' in said
