@@ -158,13 +158,13 @@ class TwoPointRun:
         run, (t, p) = self.run, fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
         keep, sigma = steady(residual, run.fix_sigma)
-        middle, direction, course = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
+        middle, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
         C = matrix_from_quat(self.track.q_nb)
         yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
         found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
         by_imu = Code.REVERSING_UNSIGNED in {r.code for r in run.reasons}
         if not by_imu:
-            found += against_travel(direction, course, self.config.odometer.signed)
+            found += against_travel(direction, course, stretch, self.config.odometer.signed)
         run.reasons += found
         if not (found or by_imu):
             check = track_check(stray(run.path(f), chord.start, fixes), run.distance)

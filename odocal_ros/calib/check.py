@@ -9,6 +9,7 @@ from odocal_ros.reasons import Code, Reason
 DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compared
 CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
 SURE_TURN = 0.5           # rad between pieces: five sigmas of such directions
+AS_FAR = (0.6, 1.6)     # of a piece driven backwards, track beside fixes
 LOOSE = 4.0               # sigmas of disagreement that name a mismatch
 SLOP = 0.002              # of the distance: slip, suspension, road
 
@@ -84,6 +85,7 @@ def pieces(track_2d, fixes_2d, t, sigma):
     Returns
     -------
     middle : (k,) s.   track_direction, course : (k,) rad, from east, ccw.
+    stretch : (k,) how long the track is beside the fixes.
 
     """
     need = max(DIRECTION_CHORD, CLEAR * sigma)
@@ -93,10 +95,11 @@ def pieces(track_2d, fixes_2d, t, sigma):
             cuts.append((a, b))
             a = b
     if not cuts:
-        return np.empty(0), np.empty(0), np.empty(0)
+        return (np.empty(0),) * 4
     a, b = np.array(cuts).T
     track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
-    return (t[a] + t[b]) / 2, arctan2(*track.T[::-1]), arctan2(*fix.T[::-1])
+    return ((t[a] + t[b]) / 2, arctan2(*track.T[::-1]), arctan2(*fix.T[::-1]),
+            np.hypot(*track.T) / np.hypot(*fix.T))
 
 
 def steady(residual, fix_sigma):
@@ -149,13 +152,18 @@ def gyro_against_course(yaw, course) -> tuple[Reason, ...]:
     return ()
 
 
-def against_travel(track_direction, course, signed) -> tuple[Reason, ...]:
-    """Return REVERSING_UNSIGNED where counts rise while the vehicle drives backwards."""
+def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ...]:
+    """
+    Return REVERSING_UNSIGNED where counts rise while the vehicle drives backwards.
+
+    As far as the fixes go back the counter goes on: fixes that only jump go as far as they like.
+    """
     if len(course) < 3:
         return ()
     off = wrap(track_direction - course)
     middle = np.angle(np.median(np.cos(off)) + 1j * np.median(np.sin(off)))
     back = np.abs(wrap(off - middle)) > np.deg2rad(135)
+    back &= (stretch > AS_FAR[0]) & (stretch < AS_FAR[1])
     if not back.any() or back.mean() > 0.5:
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.planned_drive import PlannedDrive
 from odocal_ros.calib.predict import Sigmas
+from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import GIVEN, Heading, HEADING_LIMIT, HEADING_RATE
-from odocal_ros.calib.smoother.preintegrate import ImuRows
 from odocal_ros.calib.smoother.state import M, State
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n

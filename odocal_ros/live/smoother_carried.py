@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.smoother.imperfect import with_imperfect
+from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.preintegrate import ImuRows, preintegrate
+from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, Priors, State
 from odocal_ros.nav.strapdown import rotation_increments

@@ -169,10 +169,14 @@ class TestCheck:
 
     def test_reversing_with_rising_counts_is_seen(self):
         course = np.array([0.1, 0.0, 0.1, 0.0, 3.1, 3.2, 0.1, 0.0])
-        reasons = against_travel(np.full(8, 0.05), course, signed=True)
+        as_far = np.full(8, 1.05)
+        reasons = against_travel(np.full(8, 0.05), course, as_far, signed=True)
         assert codes(reasons) == [Code.REVERSING_UNSIGNED]
         assert 'on 2 of 8 pieces' in reasons[0].text
-        assert against_travel(course + 0.3, course, signed=True) == ()
+        assert against_travel(course + 0.3, course, as_far, signed=True) == ()
+        # fixes that jump back 60 m and on again while the vehicle goes on by 20
+        jump = np.where(np.abs(course) > 3, 0.33, as_far)
+        assert against_travel(np.full(8, 0.05), course, jump, signed=True) == ()
 
     def test_outliers_have_no_direction(self):
         rng = np.random.default_rng(4)
@@ -187,7 +191,8 @@ class TestCheck:
     def test_pieces_are_long_enough_for_a_direction(self):
         t = np.arange(0.0, 100.0)
         p = np.stack([2.0 * t, np.zeros(100)], -1)
-        middle, track, course = pieces(p, p, t, sigma=1.0)
+        middle, track, course, stretch = pieces(p, p, t, sigma=1.0)
         assert len(middle) == 9                    # of 20 sigmas, 20 m
         np.testing.assert_array_equal(track, course)
+        np.testing.assert_array_equal(stretch, 1.0)
         assert len(pieces(p * 0, p * 0, t, 1.0)[0]) == 0

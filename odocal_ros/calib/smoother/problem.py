@@ -8,11 +8,12 @@ from odocal_ros.calib.sanity import G
 from odocal_ros.calib.smoother.equations import PARTS
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
+from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import PointRows
-from odocal_ros.calib.smoother.preintegrate import ImuRows, Intervals, Points, preintegrate
+from odocal_ros.calib.smoother.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.calib.smoother.slide import turned
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (

@@ -147,7 +147,8 @@ class _Track:
             apart = np.stack([(laid - z).real, (laid - z).imag], -1)
             keep, noise = steady(apart, sigma)
             flat = np.stack([at.real, at.imag], -1) * self.K
-            middle, course_track, course = pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
+            middle, course_track, course, _ = pieces(
+                flat[keep], fix[keep, :2], t_fix[keep], noise)
             if not len(middle):
                 break
             off = course - course_track

@@ -1,0 +1,63 @@
+"""Imu samples of a leg as rows between keyframes, and the Imu's own errors in them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+)
+from odocal_ros.nav.strapdown import rotation_increments
+
+Floats = NDArray[np.float64]
+
+
+def keyframes(t, t_begin, t_end, spacing):
+    """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
+    first, last = np.searchsorted(t, t_begin), np.searchsorted(t, t_end, side='right') - 1
+    count = max(1, round((t[last] - t[first]) / spacing))
+    grid = np.linspace(t[first], t[last], count + 1)
+    k = np.clip(np.searchsorted(t, grid), first, last)
+    earlier = np.maximum(k - 1, first)
+    k = np.where(grid - t[earlier] < t[k] - grid, earlier, k)
+    return np.unique(k)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuRows:
+    """Imu samples of the leg with what never changes from one pass to the next."""
+
+    t: Floats           # (n,)
+    f_b: Floats         # (n, 3)
+    turn: Floats        # (n - 1, 3) rotation vectors between samples, bias and all
+    key: NDArray[np.int64]   # (K + 1,) samples that are keyframes
+
+    @classmethod
+    def of(cls, leg, spacing):
+        """Return the rows of a leg between its begin and stop."""
+        key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
+        rows = slice(key[0], key[-1] + 1)
+        t = leg.t_imu[rows]
+        return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
+
+
+def mended(imu, constants):
+    """Return rotation vectors (n - 1, 3) and forces (n, 3) without the Imu's own errors."""
+    if constants is None or not (constants[GYRO].any() or constants[ACCEL].any()):
+        return imu.turn, imu.f_b
+    gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
+    gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
+    accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
+    return imu.turn - signals(imu) @ gyro.T, imu.f_b - imu.f_b @ accel.T
+
+
+def signals(imu):
+    """Return what the gyro's errors go by over each step: turns, rad, and forces times s."""
+    dt = np.diff(imu.t)[:, None]
+    return np.concatenate([imu.turn, (imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt], axis=1)
