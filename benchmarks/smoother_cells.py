@@ -112,11 +112,9 @@ def bounds(drive, config, leg, result):
     from odocal_ros.calib.smoother import bound
     from odocal_ros.calib.smoother.noise import Levels
     from odocal_ros.calib.smoother.problem import Problem
-    noise = dict(result.details['noise'])
-    tau = noise.pop('correlation_time')
     state, problem = truth(drive, config, leg), Problem.of(leg, config)
     out = {}
-    for name, levels in (('fit', Levels({k: v**2 for k, v in noise.items()}, tau)),
+    for name, levels in (('fit', Levels.of_roots(result.details['noise'])),
                          ('true', true_levels(problem, drive))):
         sigma = np.sqrt(np.diag(bound(leg, config, state, levels)))
         out |= {f'scale_{name}': float(sigma[0]), f'yaw_{name}': float(sigma[1])}

@@ -83,7 +83,8 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
     tau = sigmas.correlation_time
     white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
     values = road | {name: sigma**2 for name, sigma in sensor_noise(grade).items()} | {
-        'slow': (1 - white) * sigmas.fix**2, 'slow_up': (1 - white) * up}
+        name: 2 / max(tau, 1.0) * (1 - white) * variance
+        for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
     values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
     least = {name: problem.least.get(name, 0.0) for name in values}
     # that of a fix is for each, not for those that one stands for

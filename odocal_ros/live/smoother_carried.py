@@ -71,8 +71,7 @@ def carried(last: Footing, problem: Problem) -> Footing | None:
                      for name, value in vars(last.state).items()})
     slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
     spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
-    levels = Levels(problem.first_levels.values | last.levels.values,
-                    last.levels.correlation_time)
+    levels = problem.first_levels.but(**last.levels.values)
     first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
     return Footing(_reckoned(state, problem) if n < len(t) else state, levels, last.priors, first,
                    spread)

@@ -72,7 +72,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
                 np.diag(1 / (STILL_TURN * np.sqrt(T))))
         if n == WITH_SLOW:
             decay = np.exp(-T / correlation_time)
-            power = np.array([levels['slow']] * 2 + [levels['slow_up']])
+            power = correlation_time / 2 * np.array([levels['slow']] * 2 + [levels['slow_up']])
             add(np.concatenate([-decay * single[SLOW], single[SLOW]], axis=1),
                 (block(k), block(k + 1)), np.diag(1 / np.sqrt(power * (1 - decay**2))))
     first = np.concatenate([np.full(3, ANYWHERE), np.full(3, ANY_SPEED), ANY_WAY,

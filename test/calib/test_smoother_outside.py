@@ -123,8 +123,7 @@ def test_a_heading_adds_its_sigma_and_no_more(how):
                      'alignment__heading_sigma': sigma}}[how]
     method = fitted(drive.leg(), config, **ask)
     # without it, at the noise levels that this fit found: a fit of its own would find others
-    noise = dict(method.details['noise'])
-    levels = Levels({k: v**2 for k, v in noise.items()}, noise.pop('correlation_time'))
+    levels = Levels.of_roots(method.details['noise'])
     alone = math.sqrt(bound(replace(leg, heading=Heading()), config,
                             truth(drive, config, leg), levels)[YAW, YAW])
     # two independent sources; linearised at the estimate or at the truth: 3 %. A heading that the

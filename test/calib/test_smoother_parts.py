@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made, truth, with_velocity
 
-from odocal_ros.calib.smoother.chain import Normal
+from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.slow_error import SPREAD, USUAL
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
@@ -56,7 +57,7 @@ def shaken():
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET] = 0.0
-    c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, 0.0, 0.0, 0.0]
+    c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, 0.0, 0.0, 0.0, 0.0]
     return problem, state.moved(step, c)
 
 
@@ -155,3 +156,32 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, na
     # standstills take their turns anew: of second order in 1e-3 rad
     assert part.cost() - before == pytest.approx(change, rel=1e-2 if name == 'rests' else 1e-6)
     assert change != 0.0
+
+
+@pytest.mark.parametrize('name', ['slow', 'slow_up', 'correlation_time'])
+def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
+    problem, state = shaken
+    levels = problem.first_levels.but(correlation_time=20.0, slow=0.01, slow_up=0.02,
+                                      fix=1e4, fix_up=1e4)
+
+    def at(levels):
+        weighted = Equations(problem, state, sums).at(levels)
+        solved = solve(weighted.normal())
+        weighted.after(solved)
+        return weighted, solved, -0.5 * (weighted.cost() + weighted.log_R_total()
+                                         + solved.log_determinant)
+
+    for _ in range(3):      # to the least cost, where it does not change with the state
+        sums = problem.sums(state)
+        weighted, solved, _ = at(levels)
+        state = state.moved(solved.step, solved.step_border)
+    sums = problem.sums(state)
+    weighted, solved, _ = at(levels)
+    quadratic, expected = weighted['slow'].components(solved.neighbours())[name]
+    score = (quadratic - expected) / 2
+    if name == 'correlation_time':      # a score as it is, and what is believed of the time
+        score = quadratic - expected + np.log(20.0 / USUAL) / SPREAD**2
+    h = 1e-3
+    above, below = (at(levels.but(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
+    assert score == pytest.approx((above - below) / (2 * h), rel=1e-3)
+    assert abs(score) > 0.1

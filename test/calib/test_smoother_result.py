@@ -101,10 +101,8 @@ def test_slow_errors_of_fixes_are_seen_and_widen_the_scale():
 def test_stated_sigma_is_the_bound_at_the_truth():
     drive, config, leg = made(**SHORT)
     _, method = result()
-    noise = dict(method.details['noise'])
-    tau = noise.pop('correlation_time')
     covariance = bound(leg, config, truth(drive, config, leg),
-                       Levels({k: v**2 for k, v in noise.items()}, tau))
+                       Levels.of_roots(method.details['noise']))
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same but for heavy tails

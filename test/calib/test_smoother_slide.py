@@ -27,10 +27,8 @@ def straight(**options):
 def test_a_straight_drive_states_the_bound_of_an_ordinary_road(sway):
     drive, config, leg = straight(sway=sway)
     method = smooth(leg, config)
-    noise = dict(method.details['noise'])
-    tau = noise.pop('correlation_time')
     # the road's noise in the place of what the fit made of the seconds
-    levels = Levels({k: v**2 for k, v in noise.items()}, tau).but(
+    levels = Levels.of_roots(method.details['noise']).but(
         **dict.fromkeys(SIDEWAYS, 0.05**2 / 10.0))
     sigma = np.sqrt(bound(leg, config, truth(drive, config, leg), levels)[1, 1])
     stated = method.estimates['yaw_mounting_angle'].sigma

@@ -15,7 +15,16 @@ from odocal_ros.calib.smoother.chain import solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import GYRO_SCALE, IMPERFECT, M, PITCH, Priors, State, YAW
+from odocal_ros.calib.smoother.state import (
+    GYRO_SCALE,
+    IMPERFECT,
+    M,
+    PITCH,
+    Priors,
+    SPEED_OFFSET,
+    State,
+    YAW,
+)
 
 MOST = 40            # iterations
 NEAR, FAR = 1.0, 4.0     # sigmas of a step from which residuals are noise, and are no more
@@ -168,6 +177,7 @@ def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
     untold = SMALL & (variance > KNOWN * now.constants**2)
     constants[untold] = now.constants[untold]
+    constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
     return replace(
         now,
         gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),

@@ -16,8 +16,6 @@ from odocal_ros.calib.smoother.state import (
     ACCEL_SIGNAL,
     BA,
     BG,
-    BY_FORCE,
-    BY_SPEED,
     C_bv_gradient,
     E,
     FAST,
@@ -34,6 +32,7 @@ from odocal_ros.calib.smoother.state import (
     SIDESLIP,
     SPEED_OFFSET,
     SQUAT,
+    TYRES,
     V,
     YAW,
 )
@@ -43,6 +42,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 D = slice(15, 18)       # rows of the odometer
 ROWS = 18
 SPRUNG = 0.07       # s, 2 z / w of a body on springs: 1.3 Hz, damped by 0.3
+RESISTANCE, AIR = 0.1, 1e-4     # m/s^2, 1/m: what a car's tyres pull at a steady speed
 
 
 def rotvec(C):
@@ -71,12 +71,13 @@ def accelerations(state):
 
 
 def varies_with(speed, t, accel):
-    """Return what the scale varies with, as BY_SPEED, BY_TIME and BY_FORCE have it: (..., 3)."""
-    return np.stack([speed**2 / (2 * FAST), t, accel], -1)
+    """Return what the scale varies with, as TYRES has it: (..., 4)."""
+    force = accel + RESISTANCE + AIR * speed**2
+    return np.stack([speed**2 / (2 * FAST), t, np.maximum(force, 0.0), np.minimum(force, 0.0)], -1)
 
 
 def means_by_way(sums, state):
-    """Return the means of ``varies_with`` over a leg, each metre counted alike: (3,)."""
+    """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""
     way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
     t = (state.t[1:] + state.t[:-1]) / 2
     return way @ varies_with(way / sums.T, t, accelerations(state)[:, 0]) / max(way.sum(), 1e-9)
@@ -139,7 +140,7 @@ class Motion:
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(speed, t, self.accel_v[:, 0]) - means_by_way(self.sums, state)
-        self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1, None]
+        self.varied = 1 + self.from_mean @ c[TYRES, None]
         self.leaned = state.scale * (
             np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
             + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
@@ -191,7 +192,7 @@ class Motion:
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
         c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
-        c[:, D, BY_SPEED:BY_FORCE + 1] = (c[:, D, LN_K] / self.varied)[:, :, None] \
+        c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]
         for column, gradient, lean, accel in ((YAW, self.by_yaw, SIDESLIP, self.accel_v[:, 1]),
                                               (PITCH, self.by_pitch, SQUAT, self.accel_v[:, 0])):

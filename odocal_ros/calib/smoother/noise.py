@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 # level: variance per second of the white noise or walk
 INTERVAL = ('gyro', 'accel', 'gyro_walk', 'accel_walk', 'along', 'along_hard', 'side',
             'side_turn', 'up')
-OTHERS = ('travel', 'fix', 'fix_up', 'slow', 'slow_up')
+SLOW_LEVELS = ('slow', 'slow_up')
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 HARD = 0.5          # m/s^2 along: above it, a wheel may slip
@@ -35,22 +35,38 @@ STEPS = 0.05        # m/s: a speed in finer steps errs as if by chance
 
 @dataclass(frozen=True)
 class Levels:
-    """Variance of each component: per s of INTERVAL, of OTHERS as factors on the stated ones."""
+    """
+    Variance of each component: per s of INTERVAL and slow errors, factors on the stated ones.
+
+    ``correlation_time`` is one of them: that of the slow fix error, s, where there is one.
+    """
 
     values: dict[str, float]
-    correlation_time: float = 0.0      # s of the slow fix error, 0: none
 
     def __getitem__(self, name):
         return self.values[name]
 
-    def but(self, correlation_time=None, **values) -> 'Levels':
+    @property
+    def correlation_time(self) -> float:
+        """Return the correlation time of the slow fix error, s, 0: there is none."""
+        return self.values.get('correlation_time', 0.0)
+
+    def but(self, **values) -> 'Levels':
         """Return levels with some replaced."""
-        tau = self.correlation_time if correlation_time is None else correlation_time
-        return Levels(self.values | values, tau)
+        return Levels(self.values | values)
 
     def roots(self) -> dict[str, float]:
-        """Return standard deviations."""
-        return {k: float(np.sqrt(v)) for k, v in self.values.items()}
+        """Return standard deviations, of slow errors those in the long run, and the time."""
+        time = self.correlation_time
+        return {k: float(np.sqrt(v * (time / 2 if k in SLOW_LEVELS else 1.0)))
+                for k, v in self.values.items()} | {'correlation_time': time}
+
+    @classmethod
+    def of_roots(cls, roots) -> 'Levels':
+        """Return the levels of such standard deviations."""
+        time = roots['correlation_time']
+        return cls({k: v**2 / (time / 2 if time and k in SLOW_LEVELS else 1.0)
+                    for k, v in roots.items()} | {'correlation_time': time})
 
 
 @dataclass(eq=False)

@@ -213,7 +213,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
         'correlation': correlations(fit.solved.covariance[:3, :3], PARAMETERS),
         'f': K * state.forward,
-        'noise': fit.levels.roots() | {'correlation_time': fit.levels.correlation_time},
+        'noise': fit.levels.roots(),
         'iterations': fit.iterations, 'widened': float(widen),
         'outside': _outside(leg, problem, fit, sigma),
         'posterior_to_prior': ratio,

@@ -53,6 +53,10 @@ class Intervals:
     mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
+    def derived_as(self, other: 'Intervals') -> 'Intervals':
+        """Return these sums with the derivatives of others."""
+        return _with(self, other, 'AA', 'F', 'FF', 'turned', 'dv_by', 'dp_by', 'S_by')
+
     def shifted(self, gyro, accel_bias, accel) -> 'Intervals':
         """
         Return the sums for errors of the Imu that differ a little.
@@ -79,9 +83,17 @@ class Points:
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
 
+    def derived_as(self, other: 'Points') -> 'Points':
+        """Return these sums with the derivatives of others, of the same points."""
+        return _with(self, other, 'F', 'FF')
+
     def take(self, index) -> 'Points':
         """Return the points that an index picks."""
         return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+def _with(sums, other, *names):
+    return replace(sums, **{name: getattr(other, name) for name in names})
 
 
 def turn(C, vectors):
@@ -90,7 +102,7 @@ def turn(C, vectors):
 
 
 def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
-                 constants=None, derivatives=True):
+                 constants=None, owner=None, derivatives=True):
     """
     Sum up all intervals.
 
@@ -108,6 +120,8 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
         Times of fixes, rising, within the keyframes.
     constants : (M,) array, optional
         Of which GYRO and ACCEL are taken out.
+    owner : (m,) array, optional
+        Intervals of the points, rising; default: the one that each lies in.
     derivatives : bool
         False: zeros stand in for those that cost most (AA, F, FF, turned, dv_by, dp_by, S_by).
 
@@ -118,7 +132,7 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
     """
     key, out, points = imu.key, [], []
     turn_b, f_b = mended(imu, constants)
-    owner = np.clip(np.searchsorted(imu.t[key], t_points, side='right') - 1, 0, len(key) - 2)
+    owner = owners(imu, t_points) if owner is None else owner
     per = max(1, int(CHUNK * (len(key) - 1) / max(len(imu.t), 1)))
     for first in range(0, len(key) - 1, per):
         last = min(first + per, len(key) - 1)
@@ -131,6 +145,11 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
         out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], owner[mine] - first, first))
     return _joined(Intervals, out), _joined(Points, points)
+
+
+def owners(imu, t):
+    """Return the intervals between keyframes in which times lie: (m,)."""
+    return np.clip(np.searchsorted(imu.t[imu.key], t, side='right') - 1, 0, len(imu.key) - 2)
 
 
 def _joined(cls, parts):

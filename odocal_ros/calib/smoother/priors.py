@@ -7,8 +7,6 @@ from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
     BG,
-    BY_FORCE,
-    BY_SPEED,
     FIX_LAG2,
     GNSS_ARM,
     GNSS_DELAY,
@@ -22,6 +20,7 @@ from odocal_ros.calib.smoother.state import (
     SIDESLIP,
     SPEED_OFFSET,
     SQUAT,
+    TYRES,
     V,
 )
 
@@ -36,7 +35,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'accelerometer_scale': slice(ACCEL.start, ACCEL.start + 3),
           'accelerometer_axes': slice(ACCEL.start + 3, ACCEL.stop),
           'receiver_smoothing': slice(FIX_LAG2, FIX_LAG2 + 1),
-          'tyre_changes': slice(BY_SPEED, BY_FORCE + 1),
+          'tyre_changes': TYRES,
           'body_lean': slice(SQUAT, SIDESLIP + 1),
           'speed_truncation': slice(SPEED_OFFSET, SPEED_OFFSET + 1),
           'heading': slice(HEADING, HEADING + 1)}

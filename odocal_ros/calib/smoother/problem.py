@@ -1,6 +1,6 @@
 """A leg made ready for the smoother: keyframes, priors, first noise levels, sums over samples."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import PointRows
-from odocal_ros.calib.smoother.preintegrate import Intervals, Points, preintegrate
+from odocal_ros.calib.smoother.preintegrate import Intervals, owners, Points, preintegrate
 from odocal_ros.calib.smoother.slide import turned
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
@@ -38,10 +38,12 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.grades import Grade, grade_as_seen
 
-# how near to the last pass over the samples a state must lie to do without another: first order
-# leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix
-NEAR_GYRO, NEAR_ACCEL, NEAR_FORWARD = 1e-4, 1e-2, 1e-3       # rad/s, m/s^2, 1
-NEAR_ODO_TIME, NEAR_GNSS_TIME = 3e-4, 3e-3                   # s
+# how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
+# forward axis, times of odometer and of fixes s. NEAR, to do without another pass: first order
+# leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix. LIKE, to
+# keep the derivatives, which cost most: those of an interval are the same to half a per cent
+NEAR = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
+LIKE = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
 SPACING = 1.0        # s between keyframes
 NO_ERROR = 1e-12     # of what there is none of
 WARMING = 600.0      # s
@@ -60,6 +62,7 @@ class Problem:
     still: np.ndarray        # (N,) bool
     outside: dict            # velocity and heading within the keyframes, where there are any
     turned: float            # rad, in turns
+    fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict = field(default_factory=dict)     # levels
     shaken: dict = field(default_factory=dict)    # levels of the Imu to come down from
@@ -76,7 +79,7 @@ class Problem:
         grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, root, still, used(leg, t),
-                   turned(leg, imu))
+                   turned(leg, imu), config.gnss.correlation_time)
         for part in PARTS:
             if part.there(made):
                 first, least = part.first_levels(made)
@@ -92,25 +95,32 @@ class Problem:
 
     def sums_near(self, state: State) -> 'Sums':
         """Return the last sums where they were made near a state, else those about it."""
-        if self.kept is None or not self.kept.hold_at(state):
-            self.kept = self.sums(state)
+        kept = self.kept
+        if kept is None or not kept.hold_at(state):
+            alike = kept is not None and kept.derived_at.hold_at(state, LIKE)
+            self.kept = self.sums(state, kept.derived_at if alike else None)
         return self.kept
 
-    def sums(self, state: State) -> 'Sums':
-        """Return the preintegrated sums about a state."""
+    def sums(self, state: State, derived: 'Sums | None' = None) -> 'Sums':
+        """Return the preintegrated sums about a state; ``derived``: some with its derivatives."""
         leg, c = self.leg, state.constants
         delay = c[ODO_DELAY]
         times = {part.name: part.times(self, c) for part in PARTS
                  if issubclass(part, PointRows) and part.there(self)}
         all_t = np.concatenate(list(times.values()))
-        order = np.argsort(all_t, kind='stable')
+        # derivatives go on being those of a point where it leaves its interval by a little
+        owner = owners(self.imu, all_t) if derived is None else np.concatenate(
+            [derived.points[name].interval for name in times])
+        order = np.lexsort((all_t, owner))
         intervals, points = preintegrate(
             self.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c)
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c,
+            owner[order], derived is None)
         place = np.split(np.argsort(order, kind='stable'),
                          np.cumsum([len(t) for t in times.values()])[:-1])
-        return Sums(state, intervals, {name: points.take(own) for name, own in zip(
+        made = Sums(state, intervals, {name: points.take(own) for name, own in zip(
             times, place, strict=True)})
+        return made if derived is None else made.derived_as(derived)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +130,19 @@ class Sums:
     about: State
     intervals: Intervals
     points: dict[str, Points]      # to the times of a part's rows, by its name
+    source: 'Sums | None' = None   # whose derivatives these are, None: their own
+
+    @property
+    def derived_at(self) -> 'Sums':
+        """Return the sums that the derivatives were made with."""
+        return self if self.source is None else self.source
+
+    def derived_as(self, other: 'Sums') -> 'Sums':
+        """Return these sums with another's derivatives."""
+        return replace(
+            self, source=other, intervals=self.intervals.derived_as(other.intervals),
+            points={name: own.derived_as(other.points[name])
+                    for name, own in self.points.items()})
 
     def _apart(self, state):
         a, b = state, self.about
@@ -136,17 +159,15 @@ class Sums:
             return self.intervals, self.points, 0.0, *later
         return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, *later
 
-    def hold_at(self, state) -> bool:
-        """Tell whether a state is near enough for first order."""
+    def hold_at(self, state, limits=NEAR) -> bool:
+        """Tell whether a state is near enough: for first order, or within other limits."""
         gyro, accel, c = self._apart(state)
         rate, force = self.intervals.mean_rate, self.intervals.mean_force
         signals = np.concatenate([rate, force], axis=1)
         gyro = gyro[:, :3] + _errors(signals, c[GYRO], GYRO_AXIS, GYRO_SIGNAL)
         accel = accel + _errors(force, c[ACCEL], ACCEL_AXIS, ACCEL_SIGNAL)
-        return bool(np.abs(gyro).max() < NEAR_GYRO and np.abs(accel).max() < NEAR_ACCEL
-                    and abs(c[ODO_DELAY]) < NEAR_ODO_TIME
-                    and abs(c[GNSS_DELAY]) < NEAR_GNSS_TIME
-                    and np.abs(c[:3]).max() < NEAR_FORWARD)
+        apart = (gyro, accel, c[:3], c[ODO_DELAY], c[GNSS_DELAY])
+        return bool(np.all(np.array([np.abs(a).max() for a in apart]) < limits))
 
 
 def _errors(signals, constants, axes, by):
@@ -162,12 +183,12 @@ def imperfect_sigmas(grade, duration):
 
     Those of the Imu by its grade. A receiver that smooths does so over a second.
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
-    slip by 0.3 % for each m/s^2;
+    slip by 0.4 % for each m/s^2;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     return np.repeat([grade.gyro_scale_error, axes, grade.gyro_by_force, grade.accel_scale_error,
-                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 3e-3, 3e-3, 5e-3], SIZES)
+                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 4e-3, 3e-3, 5e-3], SIZES)
 
 
 def _priors(config, grade, leg) -> Priors:

@@ -6,25 +6,32 @@ from odocal_ros.calib.smoother.part import hold, link, Part
 from odocal_ros.calib.smoother.state import SLOW
 
 LEAST = 0.005     # m
+# s that errors stay: receivers over open land by a minute to a quarter of an hour; how much about
+# that by e-fold; the least that can be told from white
+USUAL, SPREAD, SHORTEST = 100.0, 0.6, 5.0
 
 class SlowError(Part):
     """
     Rows of what the slow fix error does beyond its decay, and of its first value.
 
-    Levels slow, slow_up: its variance, m^2; the fixes tie it to the track (fixes.py).
+    Levels slow, slow_up: the variance it gains in a second before it decays, m^2/s, so that its
+    own is that times half the correlation time; and that time, s, where the operator does not say
+    it. The fixes tie it to the track (fixes.py).
     """
 
     name = 'slow'
 
     def __init__(self, problem, here):
         self.state, self.T = here.state, here.intervals.T
+        self.told = not np.isnan(problem.fix_time)
 
     @classmethod
     def first_levels(cls, problem):
         """Return first levels by what the fixes state, and their least."""
-        sigma = problem.fix_sigma
-        first = {'slow': sigma**2, 'slow_up': 4 * sigma**2}
-        return first, dict.fromkeys(first, LEAST**2)
+        gain = 2 * problem.fix_sigma**2 / USUAL
+        return {'slow': gain, 'slow_up': 4 * gain}, {
+            'slow': 2 * LEAST**2 / USUAL, 'slow_up': 2 * LEAST**2 / USUAL,
+            'correlation_time': SHORTEST}
 
     def in_use(self, levels):
         """Tell whether slow errors are estimated."""
@@ -33,7 +40,8 @@ class SlowError(Part):
     def weigh(self, levels):
         """Set decay (K, 1), variances of what drives it (K, 3) and of its values (3,), m^2."""
         decay = np.exp(-self.T / levels.correlation_time)
-        self.power = np.array([levels['slow'], levels['slow'], levels['slow_up']])
+        gain = np.array([levels['slow'], levels['slow'], levels['slow_up']])
+        self.power = gain * levels.correlation_time / 2
         self.drive = np.multiply.outer(1 - decay**2, self.power)
         self.decay = decay[:, None]
         self.log_R = np.log(self.drive).sum() + np.log(self.power).sum()
@@ -55,13 +63,35 @@ class SlowError(Part):
 
     def components(self, near):
         """Return of each level its quadratic sum and what is expected of it."""
-        i, n = np.arange(SLOW.start, SLOW.stop), self.n
-        a, q = self.decay, self.drive
-        var = near[:, n + i, n + i] + a**2 * near[:, i, i] - 2 * a * near[:, i, n + i]
-        num = (self.residual()**2 / q).sum(axis=0) + self.state.slow_n[0]**2 / self.power
-        den = (1 - var / q).sum(axis=0) + (1 - near[0, i, i] / self.power)
-        return {'slow': (float(num[:2].sum()), float(den[:2].sum())),
-                'slow_up': (float(num[2]), float(den[2]))}
+        i, n, s = np.arange(SLOW.start, SLOW.stop), self.n, self.state.slow_n
+        a, q, r = self.decay, self.drive, self.residual()
+        before, both, after = near[:, i, i], near[:, i, n + i], near[:, n + i, n + i]
+        var = after + a**2 * before - 2 * a * both
+        num, den = r**2 / q, 1 - var / q
+        begin, begin_var = s[0]**2 / self.power, near[0, i, i] / self.power
+        level = num.sum(axis=0) + begin, den.sum(axis=0) + (1 - begin_var)
+        found = {'slow': tuple(float(x[:2].sum()) for x in level),
+                 'slow_up': tuple(float(x[2]) for x in level)}
+        if not self.told:
+            found['correlation_time'] = self._time(
+                r * s[:-1] + both - a * before, num - den, begin + begin_var - 1)
+        return found
+
+    def _time(self, product, excess, begin):
+        """
+        Return the score of the logarithm of the correlation time and its information, as a level.
+
+        By Fisher's identity it is what is expected of the complete data's. product : (K, 3) m^2,
+        the drive times the value before it; excess : (K, 3) the square of the drive and begin :
+        (3,) that of the first value, of their variances, less 1: all as expected.
+        """
+        a, tau = self.decay, self.levels.correlation_time
+        da = a * self.T[:, None] / tau                       # by ln tau
+        dq = 1 - 2 * a * da / (1 - a**2)                      # of ln drive
+        score = float((product * da / self.drive + excess * dq / 2).sum() + begin.sum() / 2
+                      - np.log(tau / USUAL) / SPREAD**2)
+        information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + SPREAD**-2
+        return information + score, information
 
     def effects(self, near):
         """Yield what unit errors of what drives it, and of its first value, do."""

@@ -4,7 +4,7 @@ Slow errors of fixes: whether there are any, how large, how long they stay.
 A receiver's error wanders over a minute or so. Taken for white it would be averaged as if each fix
 brought news, and the sigma would be a fraction of the error. Where the residuals of neighbouring
 seconds are alike, or the fixes of a short leg scatter less than they say, a Gauss-Markov part is
-estimated beside the white one; its time by likelihood.
+estimated beside the white one; its time is one of its levels (slow_error.py).
 """
 
 from dataclasses import replace
@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.slow_error import USUAL
 
 BIN = 2.0                      # s over which residuals are averaged
 ALIKE, SURE = 0.15, 4.0        # correlation of neighbouring bins; its sigmas
 SMOOTHED = 0.2                 # of the stated sigma: a fix so much better was filtered
 TOLD = 90.0                    # s of fixes in which errors that stay for a minute show as alike
-TIMES = (15.0, 60.0, 240.0)    # s, tried
 SLOW_SHARE, WHITE_SHARE = 0.9, 0.2    # of the variance, to start from
-FIRST, TRIAL = 5, 3            # iterations with the middle time, with each other
 
 
 def correlation(t, residual):
@@ -42,14 +41,10 @@ def correlation(t, residual):
             float(1 / np.sqrt(residual.shape[1] * len(beside))))
 
 
-def are_slow(problem, first: Fit, asked: float) -> bool:
-    """
-    Tell whether the errors of the fixes stay for a while.
-
-    asked : ``gnss.correlation_time``, s: 0 white, NaN judge by the residuals of a first fit.
-    """
-    if not np.isnan(asked):
-        return asked > 0.0
+def are_slow(problem, first: Fit) -> bool:
+    """Tell whether the errors of the fixes stay for a while: as told, or by a first fit."""
+    if not np.isnan(problem.fix_time):
+        return problem.fix_time > 0.0
     if first.levels['fix'] < SMOOTHED**2:
         return True
     t = problem.leg.t_fix[problem.use]
@@ -70,7 +65,7 @@ def _hidden(t, level) -> bool:
     return t[-1] - t[0] < TOLD and level < 1 - SURE / np.sqrt(len(t))
 
 
-def with_slow_errors(problem, first: Fit, asked: float, trace=None) -> Fit:
+def with_slow_errors(problem, first: Fit, trace=None) -> Fit:
     """
     Return the fit with slow fix errors beside the white ones.
 
@@ -80,38 +75,16 @@ def with_slow_errors(problem, first: Fit, asked: float, trace=None) -> Fit:
         The leg.
     first : Fit
         A first, rough fit with white fix errors.
-    asked : float
-        ``gnss.correlation_time``, s; NaN: the likeliest.
     trace : callable, optional
         As for ``fit``.
 
     """
-    sigma2, sigma2_up = (float(np.median(problem.leg.covariance_n[:, i, i])) for i in (0, 2))
+    time = USUAL if np.isnan(problem.fix_time) else problem.fix_time
+    gain, gain_up = (2 / time * SLOW_SHARE * np.median(problem.leg.covariance_n[:, i, i])
+                     for i in (0, 2))
+    white, up = first.levels['fix'], first.levels['fix_up']
     levels = problem.first_levels.but(
-        correlation_time=TIMES[1] if np.isnan(asked) else asked,
-        **problem.shaken,
-        slow=SLOW_SHARE * first.levels['fix'] * sigma2,
-        slow_up=SLOW_SHARE * first.levels['fix_up'] * sigma2_up,
-        fix=WHITE_SHARE * first.levels['fix'], fix_up=WHITE_SHARE * first.levels['fix_up'])
-    if not np.isnan(asked):
-        return fit(problem, first.state, levels, trace=trace)
-    best = fit(problem, first.state, levels, FIRST, trace=trace)
-    tries = {TIMES[1]: best}
-    for tau in (TIMES[0], TIMES[2]):
-        power = {k: best.levels[k] * min(2.0, (tau / TIMES[1])**0.5) for k in ('slow', 'slow_up')}
-        tries[tau] = fit(problem, best.state, best.levels.but(correlation_time=tau, **power),
-                         TRIAL, about=best, trace=trace)
-    tau = _peak([np.log(x) for x in TIMES], [tries[x].likelihood for x in TIMES])
-    start = min(tries.items(), key=lambda item: abs(np.log(item[0]) - tau))[1]
-    last = fit(problem, start.state, start.levels.but(correlation_time=float(np.exp(tau))),
-               about=start, trace=trace)
-    done = sum(f.iterations for f in (*tries.values(), last))
-    return replace(last, iterations=first.iterations + done)
-
-
-def _peak(x, y):
-    """Return where a parabola through three points is highest, within their ends."""
-    curve = np.polyfit(x, y, 2)
-    if curve[0] >= 0:
-        return x[int(np.argmax(y))]
-    return float(np.clip(-curve[1] / (2 * curve[0]), x[0], x[-1]))
+        **problem.shaken, correlation_time=time, slow=gain * white, slow_up=gain_up * up,
+        fix=WHITE_SHARE * white, fix_up=WHITE_SHARE * up)
+    found = fit(problem, first.state, levels, trace=trace)
+    return replace(found, iterations=first.iterations + found.iterations)

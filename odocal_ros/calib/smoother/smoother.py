@@ -81,9 +81,8 @@ def likeliest_fit(problem, config, trace=None):
     best = max(fits, key=lambda f: f.likelihood)
     problem.thin = {name: alike(best.weighted[name])
                     for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
-    asked = config.gnss.correlation_time
-    if are_slow(problem, best, asked):
-        return with_slow_errors(problem, best, asked, trace)
+    if are_slow(problem, best):
+        return with_slow_errors(problem, best, trace)
     return fit(problem, best.state, best.levels, about=best, trace=trace)
 
 

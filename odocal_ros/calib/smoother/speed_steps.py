@@ -15,8 +15,6 @@ from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
     BG,
-    BY_FORCE,
-    BY_SPEED,
     C_bv_gradient,
     GYRO_SCALE,
     LN_K,
@@ -26,6 +24,7 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     PITCH,
     SPEED_OFFSET,
+    TYRES,
     V,
     YAW,
 )
@@ -63,7 +62,7 @@ class SpeedSteps(PointRows):
         self.from_mean = varies_with(
             self.speed, state.t[self.k] + points.tau, accelerations(state)[self.k, 0]
         ) - means_by_way(here.intervals, state)
-        self.varied = 1 + self.from_mean @ c[BY_SPEED:BY_FORCE + 1]
+        self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.told.value + self.told.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
         self.raw = (self.said - self.speed + self.gained * here.odo_later)[:, None]
@@ -100,7 +99,7 @@ class SpeedSteps(PointRows):
         # a value is its cell's: by the speed as fitted, which its error is not in
         said = self.speed if self.fitted else self.said
         c[:, LN_K], c[:, SPEED_OFFSET] = said, K * self.told.side
-        c[:, BY_SPEED:BY_FORCE + 1] = (said / self.varied)[:, None] * self.from_mean
+        c[:, TYRES] = (said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
         for column, gradient in zip((YAW, PITCH), C_bv_gradient(
                 state.constants[YAW], state.constants[PITCH]), strict=True):
