@@ -122,11 +122,11 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path) -> Files:
     journal, = (folder / 'journal').iterdir()
     results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
                and path.name != 'journal' and not path.name.startswith('.')]
-    contents = {path: _content(path) for path in results}
+    contents = {path: whole_content(path) for path in results}
     latest = folder / 'latest'
     return Files([c for c in contents.values() if c],
                  [path for path, c in contents.items() if c is None and any(path.iterdir())],
-                 not latest.is_symlink() or bool(_content(latest)), replayed(journal))
+                 not latest.is_symlink() or bool(whole_content(latest)), replayed(journal))
 
 
 def wrong(left: Files) -> list[float]:
@@ -137,7 +137,7 @@ def wrong(left: Files) -> list[float]:
     return [sigmas for sigmas in off if sigmas > 5]
 
 
-def _content(folder: Path) -> dict | None:
+def whole_content(folder: Path) -> dict | None:
     """Return calibration.json where all that stands beside it is of the same calibration."""
     try:
         content = json.loads((folder / 'calibration.json').read_text())
