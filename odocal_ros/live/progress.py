@@ -111,8 +111,8 @@ class FixPath:
         for lat, lon, stamp, variance, status in zip(
                 block.latitude, block.longitude, block.stamp_ns,
                 block.covariance_n[:, 0, 0], block.status, strict=True):
-            if status < min_status or not np.isfinite([lat, lon]).all():
-                continue
+            if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
+                continue        # NaN among them
             if self._anchor is None:
                 self._anchor = (lat, lon, stamp)
                 continue

@@ -206,6 +206,20 @@ def test_fix_path_counts_steps_not_noise():
     assert nothing.total == 0.0
 
 
+@pytest.mark.parametrize('odd', [1e200, -1e308, np.inf, np.nan, 2.0])
+def test_a_fix_from_nowhere_is_no_way(odd):
+    n = 5
+    block = FixSamples(np.arange(n) * SECOND, np.arange(n) * SECOND, np.full(n, 0.7),
+                       np.full(n, 0.1), np.zeros(n), np.tile(np.eye(3) * 0.25, (n, 1, 1)),
+                       np.full(n, 2), np.zeros(n))
+    latitude = block.latitude.copy()
+    latitude[2] = odd
+    path = FixPath()
+    with np.errstate(all='raise'):
+        assert path.feed(replace(block, latitude=latitude), 0) == 0.0
+    assert path.total == 0.0
+
+
 def test_clocks_are_compared_between_rows_that_arrived_together():
     clocks, config = Clocks(), Config()
     for i in range(5):
