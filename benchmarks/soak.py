@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 DRIVE_S, START_S, TICK_S, SIGMAS = 260.0, 20.0, 0.2, 5.0
 MOST_AHEAD = 50     # messages of a topic that the node may be behind
+LONGEST_S = 300.0   # an answer
 DRIVES = 10          # of one vehicle, each with noise of its own
 PARKED = 20.0       # times as fast does time go by while nothing is sent
 GROWTH = {'rss_mib': 0.05, 'threads': 0.0, 'descriptors': 0.0, 'call_ms': 0.5}   # of the earlier
@@ -128,7 +129,7 @@ def size_mib(folder: Path) -> float:
 
 def one_leg(day, client, node, folder, leg, truth) -> Look:
     """Drive a leg and look at the node after it."""
-    from bench import answer_of
+    from bench import wait_for
     day.play(0.0, START_S)
     client.start()
     calls = []
@@ -139,7 +140,7 @@ def one_leg(day, client, node, folder, leg, truth) -> Look:
         calls.append((time.perf_counter() - asked) * 1e3)
     asked, begin = client.ask('stop_leg'), time.perf_counter()
     day.play(DRIVE_S - 5, DRIVE_S)
-    answer_of(asked)
+    wait_for(asked.done, 'the answer of ~/stop_leg', LONGEST_S)
     stop_s = time.perf_counter() - begin
     status = client.status
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
