@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 def main() -> None:
     """Kill and count."""
-    from kills import drive, killed
+    from kills import drive, killed, wrong
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--kills', type=int, default=50)
@@ -33,7 +33,7 @@ def main() -> None:
     if args.stage != 'record':
         kill_at_files(args)
         return
-    driven, lost, found, short = drive(), [], 0, 0
+    driven, lost, found, short, false = drive(), [], 0, 0, 0
     for moment_s in np.random.default_rng(args.seed).uniform(0.0, args.longest, args.kills):
         with tempfile.TemporaryDirectory() as folder:
             left = killed(driven, float(moment_s), Path(folder))
@@ -42,12 +42,14 @@ def main() -> None:
         short += not good and left.moment_s < 1.0 and left.code == 2
         lost.append(left.lost_s)
         found += good
+        false += bool(wrong(left))
         print(f'{len(lost):3} killed {left.moment_s:5.2f} s into the leg: {left.lost_s:5.3f} s '
               f'lost, {left.files} files, replay exit {left.code}'
               + ('' if good else f', NO LEG: {left.text.strip().splitlines()[-1:]}'), flush=True)
     print(f'{len(lost)} kills: lost {max(lost):.3f} s at most, {np.mean(lost):.3f} s on average; '
           f'{found} legs found by their mark and replayed, {short} '
-          'killed in the first second with nothing on the disk yet')
+          'killed in the first second with nothing on the disk yet; '
+          f'{false} wrong and not rejected')
 
 
 def kill_at_files(args) -> None:

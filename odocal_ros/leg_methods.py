@@ -1,11 +1,14 @@
 """The methods of a leg: their order, and what becomes of one that breaks."""
 
+import numpy as np
+
 from odocal_ros.calib.failed import failed
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
 from odocal_ros.coarse_odometer import held_steps
 from odocal_ros.errors import OdocalError
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.slow_slip import held
 from odocal_ros.smoother_run import smoother
 from odocal_ros.two_point_run import two_point
@@ -27,10 +30,17 @@ def run_method(name, run):
     """
     found = len(run.reasons)
     try:
-        method, path = METHODS[name](run)
-        return held_steps(held(method, run), run), path
+        # what runs away is told by the number that is none, not by warnings and what follows
+        with np.errstate(over='raise', divide='raise', invalid='raise'):
+            method, path = METHODS[name](run)
+            return held_steps(held(method, run), run), path
     except (OdocalError, MemoryError):
         raise
+    except FloatingPointError as error:
+        del run.reasons[found:]
+        return UNKNOWN[name](run.inputs, Reason(
+            Code.NOT_CONVERGED, f'{name} ran away from any number ({error}); samples are wild or '
+            'missing')), None
     except Exception as error:
         del run.reasons[found:]       # what it said of the data may be as wrong
         return failed(lambda why: UNKNOWN[name](run.inputs, why), name, error), None

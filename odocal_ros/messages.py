@@ -37,6 +37,7 @@ class SensorPlan:
     """What to take from a stamped sensor message, and the samples it makes."""
 
     form: OdometerForm | None = None
+    known = True         # its layout is all there is to learn of its type
 
     def __init__(self, slot: str, columns: Sequence[Column], build: Callable) -> None:
         self.slot = slot
@@ -134,7 +135,7 @@ class Reader:
     def _settled(self, raws, deserialize) -> int:
         """Let the plan see messages in order until it knows all; return how many told nothing."""
         for k, raw in enumerate(raws):
-            view: View | None = cdr.layout_of(self.msgtype, raw)
+            view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
             if view is None:
                 view = self._view(raw, deserialize)
             if view is not None and self._plan.ready(view):

@@ -179,11 +179,10 @@ class OdometerPlan:
     def _pick(self, field: str, key: str):
         """Return the function that says where in a message a wheel's values lie."""
         path = self._path(field, key)
-        if not self.known:
+        base, own = _base(field)
+        if not self.known or '[' not in _kinds(self.msgtype)[base]:
             return lambda view: (path,)
-        base, key = _base(path)
-        if '[' not in _kinds(self.msgtype)[base]:
-            return lambda view: (path,)
+        key = key or own        # never by way of the path: a joint may have any name
 
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)

@@ -23,6 +23,7 @@ from odocal_ros.glitches import (
     frozen,
     imu_glitches,
     oriented,
+    SEVERAL,
     speed_glitches,
 )
 from odocal_ros.leg import Leg
@@ -192,7 +193,7 @@ def _finite(samples, slot, leg, found):
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
     suspect = about_clumps(wild)
-    if suspect.any() or wild.sum() > DAMAGED * len(wild):
+    if suspect.any() or wild.sum() > min(DAMAGED * len(wild), SEVERAL):
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
                             'messages hold values beyond any sensor; '
                             f'{int((suspect & stamped & finite).sum())} more about them were '

@@ -63,6 +63,19 @@ def test_a_driver_that_sends_nan_now_and_then_is_no_damage(made):
     assert Code.ROWS_DAMAGED not in said
 
 
+@pytest.mark.parametrize(('rows', 'accepted'), [(4, True), (8, False)])
+def test_several_wild_rows_are_a_caution_wherever_they_stand(made, rows, accepted):
+    """Eight far apart stood beside wrong ones that nothing showed: a yaw 17 sigmas off."""
+    leg = made.leg()
+    at = np.linspace(500, len(leg.imu.stamp_ns) - 500, rows).astype(int)
+
+    def wild(column):
+        column[at] = 1e200
+    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wild)), settings(made, method='auto'))
+    assert (Code.ROWS_DAMAGED not in everything_said(result)) == accepted
+    assert (result.verdict is Verdict.ACCEPTED) == accepted
+
+
 def test_what_a_clump_is():
     wild = np.zeros(1000, bool)
     assert not about_clumps(wild).any()

@@ -240,6 +240,25 @@ def test_foreign_type_by_field_path():
         rows('wheels')
 
 
+@pytest.mark.parametrize('name', ['left[', 'left]', 'left[0]', 'left].x[1', '[left'])
+def test_a_joint_may_have_any_name(name):
+    messages = [make.joints(10**9 + i, [name, 'right'], [1.0 + i, 5.0]) for i in range(3)]
+    pairs, reader = read('odometer', messages)
+    assert reader.wheels == (name, 'right')
+    assert [block.value.tolist() for _, block in pairs] == [[1.0, 2.0, 3.0], [5.0] * 3]
+
+
+def test_a_sensors_type_as_an_odometer_is_read_by_its_field():
+    """Its layout is known, and yet what to take from it only a message tells."""
+    messages = [make.imu(10**9 + i, w=(i, 0, 0)) for i in range(3)]
+    block, form = one('odometer', messages, config(odometer__field='angular_velocity.x'))
+    assert block.value.tolist() == [0.0, 1.0, 2.0]
+    assert block.stamp_ns.tolist() == [10**9, 10**9 + 1, 10**9 + 2]
+    assert (form.quantity, form.scale_unit) == ('rate', '1')
+    with pytest.raises(BadData, match="has no value 'ticks'"):
+        one('odometer', messages, config(odometer__field='ticks'))
+
+
 # ---- what is refused -----------------------------------------------------------------------
 
 @pytest.mark.parametrize(('slot', 'msgtype', 'settings_', 'error', 'says'), [

@@ -1,6 +1,7 @@
 """What reading may take, whatever a file claims: every bound, and how a user raises them."""
 
 from collections.abc import Callable
+from functools import cache
 import os
 from pathlib import Path
 import stat
@@ -105,9 +106,10 @@ def opener(packing: str) -> Callable[[], Any]:
     raise Damaged(f'compression {packing[:20]!r} is not known')
 
 
+@cache
 def zstd_module():
     """Return the zstd module that rosbags uses: the standard library's from Python 3.14 on."""
-    from importlib import import_module
+    from importlib import import_module  # a module that is not there is looked for each time
     try:
         return import_module('compression.zstd')
     except ModuleNotFoundError:

@@ -112,7 +112,7 @@ def _sent(leg, inputs, kept, span, config):
     rows = np.array([row[when] for when in inputs.t_fix[kept].tolist()], int)
     near[rows] = False
     usable = np.isin(t, inputs.t_fix)
-    sigma = np.sqrt(np.maximum(fix.covariance_n[:, 0, 0], fix.covariance_n[:, 1, 1]))
+    sigma = np.sqrt(fix.covariance_n[:, :2, :2].diagonal(axis1=1, axis2=2).max(axis=1, initial=0))
     out = np.flatnonzero(near)
     because = [
         f'status below {gnss.min_status}' if fix.status[i] < gnss.min_status else

@@ -3,11 +3,13 @@
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 MEMORY = 64            # blocks kept for the rate
 RATE_SPAN_NS = 3_000_000_000
 SILENCE_NS = 2_000_000_000
 JUMP_NS = 1_000_000_000
+WILD_NS = 30_000_000_000     # a stamp further ahead is believed when others follow it
 FEW = 3
 
 
@@ -29,6 +31,8 @@ class Health:
         self.delay_s = 0.0     # arrival minus stamp of the newest row
         self.jumped_back = False
         self.fix_status: int | None = None
+        self._ahead: list[int] = []      # stamps far ahead that nothing has confirmed yet
+        self._behind = 0                 # stale rows at the end of the last block
         self._last_sequence: int | None = None
         self._ends: deque = deque(maxlen=MEMORY)  # (count, stamp) after each block
         self._interval_s = 0.0
@@ -45,14 +49,43 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def decoded(self, block, max_gap_s: float | None = None) -> None:
-        """Take over the stamps of a block; a gap is a step beyond the limit (or 5 intervals)."""
+    def decoded(self, block, max_gap_s: float | None = None) -> NDArray[np.bool_]:
+        """
+        Take over the stamps of a block; a gap is a step beyond the limit (or 5 intervals).
+
+        Returns which rows have a stamp to reckon with: none that is zero, or wild.
+        """
         self.count += len(block.stamp_ns)
-        stamps = block.stamp_ns[block.stamp_ns > 0]
         if hasattr(block, 'status') and len(block.status):
             self.fix_status = int(block.status[-1])
-        if not len(stamps):
-            return
+        sound = self._not_ahead(block.stamp_ns)
+        if not sound.any():
+            return sound
+        stamps, known = block.stamp_ns[sound], self.newest_ns
+        self._take(stamps, max_gap_s)
+        self.delay_s = (int(block.received_ns[sound][-1]) - int(stamps[-1])) * 1e-9
+        sound[sound] = stamps >= np.maximum.accumulate(np.maximum(stamps, known)) - JUMP_NS
+        return sound
+
+    def _not_ahead(self, stamps) -> NDArray[np.bool_]:
+        """Return which stamps are given and not far ahead of the last, unless enough follow."""
+        sound = stamps > 0
+        given = stamps[sound]
+        if not len(given) or not self._ahead and (
+                given.max() - (self.newest_ns or given[0]) < WILD_NS):
+            return sound
+        last = self.newest_ns
+        for i in np.flatnonzero(sound):
+            stamp = int(stamps[i])
+            if last and stamp - last >= WILD_NS:
+                near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_NS
+                self._ahead = [*self._ahead, stamp] if near else [stamp]
+                sound[i] = len(self._ahead) >= FEW
+            if sound[i]:
+                last, self._ahead = stamp, []
+        return sound
+
+    def _take(self, stamps, max_gap_s: float | None) -> None:
         newest = self._newest(stamps)
         steps = np.diff(stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]) * 1e-9
         rising = steps[steps > 0]
@@ -63,7 +96,6 @@ class Health:
             self._interval_s = 0.9 * self._interval_s + 0.1 * typical if self._interval_s \
                 else typical
         self.newest_ns = newest
-        self.delay_s = (int(block.received_ns[-1]) - int(block.stamp_ns[-1])) * 1e-9
         self._ends.append((self.count, newest))
 
     def _newest(self, stamps) -> int:
@@ -71,16 +103,19 @@ class Health:
         Return the newest stamp with a block of them, and note whether time has started anew.
 
         One or two stale stamps are a hiccup of the driver, more are a new start of time; where a
-        block ends with few of them, the next one tells.
+        block ends with few of them, or has but one row, the next one tells.
         """
         known = stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]
         steps = np.diff(known)
         at = int(np.argmin(steps)) if len(steps) else 0
         fell = bool(len(steps)) and known[at + 1:].max() < known[at] - JUMP_NS
         after_wild = steps[at - 1] > JUMP_NS if at else not self.newest_ns
+        behind, self._behind = self._behind, 0
         if not fell or after_wild:
             return int(stamps[-1])
-        if at and len(known) - 1 - at < FEW:
+        rows = len(known) - 1 - at
+        if rows < FEW if at else rows + behind < 2:
+            self._behind = rows
             return int(known[at])
         self.jumped_back = True
         return int(stamps[-1])
@@ -112,4 +147,5 @@ class Health:
         """Start anew after a jump of time; counts of losses stay."""
         self.newest_ns = 0
         self.jumped_back = False
+        self._ahead, self._behind = [], 0
         self._ends.clear()

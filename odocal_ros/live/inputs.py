@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -66,6 +67,7 @@ class Input:
         self.reader: Reader | None = None
         self.health = Health()
         self.trouble = ''
+        self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
         self.frame = ''        # of the Imu's header, once a message has come
         self.publishers: list = []
         self._failed = 0
@@ -176,7 +178,7 @@ class Input:
             self.trouble = f'{self.topic}: {reader.trouble}'
         for slot, block in pairs:
             if slot == self.slot:
-                self.health.decoded(block, max_gap_s)
+                self.sound = self.health.decoded(block, max_gap_s)
         return pairs
 
     def flowing(self) -> bool:

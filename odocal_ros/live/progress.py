@@ -63,8 +63,8 @@ class Travel:
                 if rest_ns > REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
                 self._anchor, self.moved_ns = total, int(stamp)
-        self.moved_ns = self.moved_ns or int(stamps[0])
         self.newest_ns = int(stamps[-1])
+        self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
         gone, self.total = path[-1] - self.total, float(path[-1])
         return gone * scale / seconds.sum() if seconds.sum() > 0 else 0.0
 
@@ -111,8 +111,8 @@ class FixPath:
         for lat, lon, stamp, variance, status in zip(
                 block.latitude, block.longitude, block.stamp_ns,
                 block.covariance_n[:, 0, 0], block.status, strict=True):
-            if status < min_status or not np.isfinite([lat, lon]).all():
-                continue
+            if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
+                continue        # NaN among them
             if self._anchor is None:
                 self._anchor = (lat, lon, stamp)
                 continue

@@ -9,11 +9,11 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 
 from odocal_ros.config import Config
-from odocal_ros.leg import LegRecorder, SLOTS
+from odocal_ros.leg import LegRecorder
 from odocal_ros.live.ability import Heard
 from odocal_ros.live.inputs import Input, Inputs
 from odocal_ros.live.progress import Progress
-from odocal_ros.samples import Samples
+from odocal_ros.samples import Samples, take
 
 BACKWARD_S = 0.1   # a clock that steps back by more has jumped
 MARGIN_S = 1.0     # kept beyond the pre-roll, since forgetting goes by whole blocks
@@ -49,6 +49,8 @@ class Recording:
             max_gap_s = config.leg.max_gap if source.slot == 'imu' else None
             for slot, block in source.decode(raws, sent_ns, max_gap_s):
                 self.recorder.feed(slot, block)
+                if not source.sound.all():     # the pipeline screens for itself
+                    block = take(block, source.sound)
                 self.progress.feed(slot, block, config, self.inputs.form, found_scale)
                 if self.tap is not None:
                     self.tap(slot, block)
@@ -64,11 +66,15 @@ class Recording:
     def forget(self, preroll_s: float) -> None:
         """Bound the memory of what came before the pre-roll."""
         # by each topic's own stamps: one on a foreign clock must not grow without bound
-        for slot in SLOTS:
-            newest_ns = self.recorder.newest_ns(slot)
-            if newest_ns > 0:
+        for source in self.inputs.by_slot.values():
+            slots = (source.slot, 'odometer_right') if self._both(source) else (source.slot,)
+            if source.health.newest_ns:
                 self.recorder.forget_before(
-                    newest_ns - round((preroll_s + MARGIN_S) * 1e9), (slot,))
+                    source.health.newest_ns - round((preroll_s + MARGIN_S) * 1e9), slots)
+
+    def _both(self, source: Input) -> bool:
+        """Return whether a topic's messages hold both wheels."""
+        return source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
 
     @property
     def newest_imu_ns(self) -> int:

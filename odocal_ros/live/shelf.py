@@ -5,6 +5,7 @@ from pathlib import Path
 import uuid
 
 from odocal_ros.output.worse import replacing, stored_in
+from odocal_ros.whole import locked
 
 LATEST = 'latest'
 
@@ -41,11 +42,12 @@ class Shelf:
         legs : start marks, ns, of the legs in it.
         """
         link = folder.parent / LATEST
-        before = _target(link)
-        worse = '' if force else replacing(stored_in(link), folder)
-        if worse:
-            return worse
-        _point(link, folder.name)
+        with locked(folder.parent):         # another node may file there, too
+            before = _target(link)
+            worse = '' if force else replacing(stored_in(link), folder)
+            if worse:
+                return worse
+            _point(link, folder.name)
         self._filed.append(Filed(folder, legs, before))
         return ''
 

@@ -3,6 +3,7 @@
 import os
 import sqlite3
 import struct
+import sys
 import tracemalloc
 
 import pytest
@@ -200,3 +201,18 @@ def test_a_text_that_does_not_end(tmp_path):
     with open_bag(path) as bag:
         assert 'takes more than' in bag.notes[0]
     assert issubclass(LimitReached, BadBag)
+
+
+def test_a_decompressor_is_looked_for_once_and_not_for_each_message(tmp_path, monkeypatch):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(1.0), 'mcap', 'message')
+    asked = []
+
+    class Finder:
+        @staticmethod
+        def find_spec(name, *_):
+            asked.append(name)
+    zstd_module.cache_clear()
+    monkeypatch.setattr(sys, 'meta_path', [Finder, *sys.meta_path])
+    with open_bag(path) as bag:
+        assert len(list(bag.messages('/imu/data'))) == 100
+    assert len([name for name in asked if name.startswith('compression')]) <= 2

@@ -1,5 +1,7 @@
 """What a report draws of a leg: residuals by direction, scale by section, fixes left out."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -36,7 +38,7 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None):
     covariance = np.tile(np.eye(3) * sigma**2, (n, 1, 1))
     for row, what in bad:
         status[row] = -1 if what == 'status' else status[row]
-        covariance[row] *= 100.0**2 if what == 'sigma' else 1.0
+        covariance[row] *= {'sigma': 100.0**2, 'negative': -1.0}.get(what, 1.0)
     stamp = START_NS + np.round(t_fix * 1e9).astype(np.int64)
     fix = FixSamples(stamp, stamp, np.full(n, 0.8), np.full(n, 0.1), np.zeros(n), covariance,
                      np.full(n, 2), status)
@@ -143,3 +145,10 @@ def test_offsets_of_the_clocks_are_followed():
     found = drive(bad=((3, 'status'),), config=config)
     np.testing.assert_allclose(found.t_excluded, [0.67])
     np.testing.assert_allclose(found.t_fix[:2], [0.07, 0.27])
+
+
+def test_a_negative_variance_is_a_row_like_others_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        found = drive(bad=[(7, 'negative')])
+    assert found.fixes == drive().fixes

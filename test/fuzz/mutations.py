@@ -1,5 +1,6 @@
 """Seeded mutations of bags, by their structure: each takes a random.Random and a folder."""
 
+from pathlib import Path
 import random
 import sqlite3
 import struct
@@ -17,6 +18,7 @@ VALUES = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'te
           '\x1b[2J', '$(command x)', '../../x', '/dev/zero', 'x' * 5000, [], [[]], {}, {'a': 1},
           [None], -1e308, '9' * 5000, '1e400', '!!python/none', '*a', '[' * 3000]
 NUMBERS = ['1', '-5', '1e9', '0.5', 'true', '0x10', '1e-3']
+CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'calibrator.yaml'
 PACKED = struct.Struct('<QQQI')
 
 
@@ -155,7 +157,9 @@ def mcap_inside(rng, bag):
     if rng.random() < 0.3:
         inside = some_records(rng, inside)
     else:
-        inside = [value(rng, *each) if rng.random() < 0.05 else each for each in inside]
+        share = rng.choice([0.002, 0.05, 0.05, 1.0])
+        inside = [(op, cdr(rng, body, 22)) if op == 5 and rng.random() < share else (op, body)
+                  for op, body in inside]
     inner = joined(inside)
     packed = zstd.compress(inner) if form == b'zstd' else inner
     records[which] = CHUNK, (PACKED.pack(start, end, len(inner), 0) + body[28:32 + length]
@@ -165,16 +169,18 @@ def mcap_inside(rng, bag):
     file.write_bytes(MAGIC + joined(kept) + joined([(2, bytes(20))]) + MAGIC)
 
 
-def value(rng, op, body):
-    """Return a message with one of its numbers odd."""
-    body = bytearray(body)
-    if op == 5 and len(body) > 40:
-        at = 26 + 4 * rng.randrange((len(body) - 34) // 4)
-        if rng.random() < 0.8:
-            struct.pack_into('<d', body, at, rng.choice(FLOATS))
-        else:
-            struct.pack_into('<I', body, at, rng.choice(INTEGERS) % 2**32)
-    return op, bytes(body)
+def cdr(rng, message, head=0):
+    """Return a message with one of its numbers odd, or of another length; ``head`` bytes stay."""
+    body = bytearray(message)
+    if len(body) < head + 12 or rng.random() < 0.1:
+        return bytes(body[:head] + spoil(rng, body[head:]))
+    at = head + 4 + 4 * rng.randrange((len(body) - head - 8) // 4)
+    if rng.random() < 0.7 and at + 8 <= len(body):
+        struct.pack_into('<d', body, at, rng.choice(FLOATS))
+    else:               # a time, a length of a string or a list, a status
+        struct.pack_into('<I', body, rng.choice([at, head + 4, head + 8]),
+                         rng.choice(INTEGERS) % 2**32)
+    return bytes(body)
 
 
 # ---- sqlite3 -------------------------------------------------------------------------------
@@ -205,6 +211,16 @@ def sqlite_rows(rng, bag):
     db.close()
 
 
+def sqlite_values(rng, bag):
+    """Change values inside of messages, in some rows or all, and leave the table as it is."""
+    with sqlite3.connect(file_of(bag)) as db:
+        share = rng.choice([0.002, 0.05, 1.0])
+        rows = [row for row in db.execute('SELECT id, data FROM messages') if rng.random() < share]
+        db.executemany('UPDATE messages SET data = ? WHERE id = ?',
+                       [(cdr(rng, data), key) for key, data in rows])
+    db.close()
+
+
 def sqlite_pages(rng, bag):
     """Change the heads of pages: kinds, cells, where they lead."""
     file = file_of(bag)
@@ -215,6 +231,45 @@ def sqlite_pages(rng, bag):
         at = page * size + (100 if page == 0 else 0) + rng.randrange(24)
         data[at] = rng.choice([0, 1, 2, 5, 10, 13, 255, rng.randrange(256)])
     file.write_bytes(data)
+
+
+# ---- rosbag1 -------------------------------------------------------------------------------
+
+def ros1_records(data, at=0):
+    """Return (header, data) of the records of a file or a chunk."""
+    found = []
+    while at + 8 <= len(data):
+        (size,) = struct.unpack_from('<I', data, at)
+        (length,) = struct.unpack_from('<I', data, at + 4 + size)
+        found.append((bytes(data[at + 4:at + 4 + size]),
+                      bytes(data[at + 8 + size:at + 8 + size + length])))
+        at += 8 + size + length
+    return found
+
+
+def ros1_joined(records):
+    """Return records as they stand in a file."""
+    return b''.join(struct.pack('<I', len(part)) + part for record in records for part in record)
+
+
+def ros1_inside(rng, bag):
+    """Change records of the file or of a chunk, or values in messages; all places stay."""
+    magic, rest = bag.read_bytes().split(b'\n', 1)
+    records = ros1_records(rest)
+    chunks = [i for i, (head, _) in enumerate(records) if b'op=\x05' in head]
+    if rng.random() < 0.3 or not chunks:
+        i = rng.randrange(len(records))
+        parts = list(records[i])
+        which = rng.randrange(2)
+        parts[which] = bytes(spoil(rng, parts[which]))
+        records[i] = tuple(parts)
+    else:
+        i, share = rng.choice(chunks), rng.choice([0.002, 0.05, 1.0])
+        records[i] = records[i][0], ros1_joined(
+            (head, cdr(rng, body)[:len(body)].ljust(len(body), b'\0'))
+            if b'op=\x02' in head and rng.random() < share else (head, body)
+            for head, body in ros1_records(records[i][1]))
+    bag.write_bytes(magic + b'\n' + ros1_joined(records))
 
 
 # ---- text ----------------------------------------------------------------------------------
@@ -243,24 +298,31 @@ def text_file(rng, file):
     file.write_text(yaml.safe_dump(tree))
 
 
-def texts(rng: random.Random):
-    """Return options of odd text: settings, legs, topics."""
+def texts(rng: random.Random, folder):
+    """Return options of odd text: settings, legs, topics, a file of settings."""
     from odocal_ros.config import SETTINGS
     found = []
     for _ in range(rng.choice([1, 1, 2, 4])):
         odd = rng.choice([*map(str, VALUES), *map(str, FLOATS), *NUMBERS, '[1, 2, 3]', '[]',
                           '[nan, 0, 0]', '{a: 1}', '&a [*a]'])
-        kind = rng.randrange(8)
+        kind = rng.randrange(9)
         if kind < 5:
             found += ['--set', f'{rng.choice([*SETTINGS, "no.such", ""])}={odd}']
         elif kind == 5:
             found += [f'--leg={odd}:{rng.choice(["", "60", odd])}']
+        elif kind == 6:
+            file = folder / 'settings.yaml'
+            file.write_text(CONFIG.read_text())
+            text_file(rng, file)
+            found += [f'--config={file}']
         else:
             name = rng.choice(['imu', 'odometer', 'fix', 'heading', 'odometer-right'])
             found += [f'--{name}-topic={rng.choice([odd, "/imu/data", "/fix", "/odometer"])}']
     return [option.replace('\0', ' ') for option in found]
 
 
-OF = {'mcap': [raw, raw, clump, mcap_records, mcap_inside, mcap_inside, metadata],
-      'sqlite3': [raw, raw, clump, sqlite_rows, sqlite_rows, sqlite_pages, metadata],
-      'rosbag1': [raw, raw, clump]}
+OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, metadata],
+      'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_pages, metadata],
+      'rosbag1': [raw, clump, ros1_inside, ros1_inside],
+      'file': [raw, clump, metadata],                   # packed as a whole, and
+      'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached

@@ -32,6 +32,7 @@ class Remains:
     code: int              # of odocal replay
     legs: list             # of calibration.json
     text: str              # what replay said
+    result: dict | None    # calibration.json
 
 
 def drive():
@@ -74,7 +75,7 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int) -> Remai
         marks, files = marked_legs(bag), len(bag.files)
     code, result, said = replayed(journal)
     return Remains(moment_s, (end_ns - newest_ns) * 1e-9, files, marks, start_ns, code,
-                   result['legs'] if result else [], said)
+                   result['legs'] if result else [], said, result)
 
 
 def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:
@@ -122,22 +123,23 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path) -> Files:
     journal, = (folder / 'journal').iterdir()
     results = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()
                and path.name != 'journal' and not path.name.startswith('.')]
-    contents = {path: _content(path) for path in results}
+    contents = {path: whole_content(path) for path in results}
     latest = folder / 'latest'
     return Files([c for c in contents.values() if c],
                  [path for path, c in contents.items() if c is None and any(path.iterdir())],
-                 not latest.is_symlink() or bool(_content(latest)), replayed(journal))
+                 not latest.is_symlink() or bool(whole_content(latest)), replayed(journal))
 
 
-def wrong(left: Files) -> list[float]:
+def wrong(left: Files | Remains) -> list[float]:
     """Return by how many sigmas values that were not rejected miss the truth, where too many."""
-    off = [abs(scale['value'] - SCALE) / scale['sigma']
-           for one in (*left.whole, left.journal[1]) if one and one['verdict'] != 'rejected'
-           for scale in [one['result']['scale_factor']]]
+    found = [*left.whole, left.journal[1]] if isinstance(left, Files) else [left.result]
+    scales = [one['result']['scale_factor'] for one in found
+              if one and one['verdict'] != 'rejected']
+    off = [abs(scale['value'] - SCALE) / scale['sigma'] for scale in scales if scale['value']]
     return [sigmas for sigmas in off if sigmas > 5]
 
 
-def _content(folder: Path) -> dict | None:
+def whole_content(folder: Path) -> dict | None:
     """Return calibration.json where all that stands beside it is of the same calibration."""
     try:
         content = json.loads((folder / 'calibration.json').read_text())

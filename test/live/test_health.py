@@ -8,7 +8,7 @@ import pytest
 from odocal_ros.config import Config, with_settings
 from odocal_ros.live.health import Health
 from odocal_ros.live.progress import Clocks, FixPath, nominal_scale, Travel
-from odocal_ros.samples import FixSamples, OdometerForm, OdometerSamples
+from odocal_ros.samples import FixSamples, OdometerForm, OdometerSamples, take
 
 SECOND = 1_000_000_000
 COUNTER = OdometerForm('cumulative', 2**16, 'm/pulse')
@@ -97,6 +97,44 @@ def test_a_wild_stamp_within_a_block_is_no_jump():
             assert health.newest_ns == 22 * SECOND
 
 
+@pytest.mark.parametrize('rows_at_once', [1, 3, 20])
+@pytest.mark.parametrize('wild', [-15.0, -1e6, 40.0, 1e9])
+def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
+    stamps = 1e6 + np.arange(20.0, 24.0, 0.1)
+    for at in range(1, 19):
+        health, travel, some = Health(), Travel(COUNTER), stamps.copy()
+        some[at] += wild
+        sent = rows(some, np.arange(len(some)) >= 30)       # moves by less than counts
+        for begin in range(0, len(some), rows_at_once):
+            part = take(sent, slice(begin, begin + rows_at_once))
+            sound = health.decoded(part)
+            assert (sound == (abs(part.stamp_ns * 1e-9 - 1e6 - 22) < 3)).all()
+            if sound.any():
+                travel.feed(take(part, sound), 0.02)
+            assert 0 <= travel.still_s() < 4
+            assert abs(health.newest_ns * 1e-9 - 1e6 - 22) < 3
+        assert not health.jumped_back, at
+        assert travel.still_s() == pytest.approx(3.9, abs=0.25)     # the ends may be wild
+
+
+def test_stamps_that_go_on_far_ahead_are_a_time():
+    health = Health()
+    health.decoded(rows([10.0, 10.1]))
+    assert health.decoded(rows([1e5])).tolist() == [False]
+    assert health.decoded(rows([1e5 + 1, 1e5 + 2])).tolist() == [False, True]
+    assert health.newest_ns == int((1e5 + 2) * SECOND)
+    assert not health.jumped_back
+
+
+def test_a_clock_that_is_set_back_gives_no_negative_standstill():
+    travel = Travel(COUNTER)
+    travel.feed(rows([1000, 1001, 1002], np.array([0, 100, 200])), 0.02)
+    for t in (10, 11, 12):
+        travel.feed(rows([t], np.array([200])), 0.02)
+        assert travel.still_s() == t - 10
+        assert travel.rested_s(600.0) >= 0
+
+
 def test_zero_stamps_do_not_count_as_flowing():
     health = Health()
     health.arrived([1], now_ns=SECOND)
@@ -166,6 +204,20 @@ def test_fix_path_counts_steps_not_noise():
     nothing = FixPath()
     nothing.feed(replace(block, status=np.full(n, -1)), 0)
     assert nothing.total == 0.0
+
+
+@pytest.mark.parametrize('odd', [1e200, -1e308, np.inf, np.nan, 2.0])
+def test_a_fix_from_nowhere_is_no_way(odd):
+    n = 5
+    block = FixSamples(np.arange(n) * SECOND, np.arange(n) * SECOND, np.full(n, 0.7),
+                       np.full(n, 0.1), np.zeros(n), np.tile(np.eye(3) * 0.25, (n, 1, 1)),
+                       np.full(n, 2), np.zeros(n))
+    latitude = block.latitude.copy()
+    latitude[2] = odd
+    path = FixPath()
+    with np.errstate(all='raise'):
+        assert path.feed(replace(block, latitude=latitude), 0) == 0.0
+    assert path.total == 0.0
 
 
 def test_clocks_are_compared_between_rows_that_arrived_together():

@@ -8,7 +8,7 @@ import time
 from types import SimpleNamespace
 
 from bench import answer_of, Client, NodeProcess, wait_for
-from kills import drive, killed, remains, replayed
+from kills import drive, killed, remains, replayed, wrong
 from player import messages_of, part, Player, sent_of
 import pytest
 
@@ -132,6 +132,7 @@ def test_a_killed_leg_is_replayed_from_its_mark(domain, tmp_path, moment_s):
     assert left.marks == [(left.start_ns, 0)]
     # a second by design; more only where the machine is so busy that the threads wait
     assert left.lost_s < 2.0
+    assert wrong(left) == []
     assert left.code in (0, 1, 2)     # 2: killed before a sample came after the mark
     if moment_s > 1:
         leg, = left.legs

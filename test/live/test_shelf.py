@@ -1,6 +1,7 @@
 """What ``latest`` points at: the best known, never quietly a worse one."""
 
 from pathlib import Path
+import threading
 
 import pytest
 
@@ -85,3 +86,21 @@ def test_a_target_that_is_gone_is_not_linked_again(make, tmp_path):
     old.rmdir()
     shelf.withdraw(frozenset())
     assert latest(tmp_path) is None
+
+
+def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
+    """Whoever looks at what is there points at its own before the next looks."""
+    good, bad = make('good'), make('bad')
+    late = threading.Thread(target=lambda: Shelf().file(good, frozenset({1}), False))
+    stored_in = module.stored_in
+
+    def slowly(path):
+        found = stored_in(path)
+        if not late.ident:          # bad has looked, and good comes
+            late.start()
+            late.join(0.3)
+        return found
+    monkeypatch.setattr(module, 'stored_in', slowly)
+    Shelf().file(bad, frozenset({2}), False)
+    late.join()
+    assert latest(tmp_path) == Path('good')
