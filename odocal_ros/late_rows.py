@@ -14,10 +14,12 @@ from odocal_ros.reasons import Code, Reason
 PAUSE = 1.3         # median intervals: a longer one may be a row that is late
 LEAST = 0.02        # s of lateness, and
 SHARE = 0.3         # of a median interval, that matter
-LONGEST = 2.0       # s within which a burst has caught up
+LONGEST = 5.0       # s within which a burst has caught up
+SHORT = 1.0         # s within which travel is as good as even
 EVEN = 0.5          # share of the intervals that are within a quarter of the median
 COUNTS = 2.5        # by which a late row must be off: less is rounding
-FITS = 0.3          # of what rows are off as sent: speeding up within a burst makes a quarter
+FITS = 0.3          # of what rows are off as sent, of smooth motion
+SMOOTH = 3          # degree: acceleration that changes evenly
 BESIDE = 5          # rows beside a burst that tell the speed there
 FAST = 3.0          # times the speed beside: no wheel, so rows that catch up
 
@@ -76,10 +78,14 @@ def _caught_up(t, a, usual):
 def _placed(t, travel, a, b, usual, least):
     """Return the times of the rows between a and b, None where they were not late."""
     rows = np.arange(a + 1, b)
-    line = (travel[b] - travel[a]) / (t[b] - t[a])
+    about = slice(max(a - BESIDE, 0), b + BESIDE + 1)
 
     def off(times):
-        return float(np.abs(travel[rows] - travel[a] - line * (times - t[a])).max())
+        """Return by how much travel at these times is off a smooth motion."""
+        x = np.concatenate([t[about.start:a + 1], times, t[b:about.stop]])
+        x = (x - x[0]) / (x[-1] - x[0])
+        smooth = np.polynomial.Polynomial.fit(x, travel[about], SMOOTH, domain=[0, 1])
+        return float(np.abs(travel[about] - smooth(x)).max())
 
     sent = off(t[rows])
     even = np.minimum(t[b] - (b - rows) * usual, t[rows])
@@ -91,9 +97,10 @@ def _placed(t, travel, a, b, usual, least):
         return abs(travel[last] - travel[first]) / max(t[last] - t[first], usual / 10)
 
     beside = max(speed(a - BESIDE, a), speed(b, b + BESIDE))
-    if sent <= least or not beside or speed(a + 1, b) < FAST * beside:
+    if t[b] - t[a] > SHORT or not beside or speed(a + 1, b) < FAST * beside:
         return None
     # some rows of the burst are lost, so that its rhythm tells nothing
+    line = (travel[b] - travel[a]) / (t[b] - t[a])
     by_travel = t[a] + (travel[rows] - travel[a]) / line
     rising = np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))
     return rising + np.arange(1, len(rows) + 1) * 1e-9
