@@ -27,6 +27,7 @@ from odocal_ros.live.session import Session, State
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.watch import Watch
 from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
+from odocal_ros.reasons import Code
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
@@ -54,6 +55,7 @@ class LegWay:
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
+        self._told: set[Code] = set()         # faults of the leg that are in the log
         self._filing = Filing(self._worker, self._log, self.show_status)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -72,7 +74,9 @@ class LegWay:
 
     def pump(self) -> None:
         """Decode what has arrived."""
-        self._recording.pump(self._config(), self._outlets.scale_factor())
+        running = self._watch.outlook and self._watch.outlook.estimates.get('scale_factor')
+        found = running.value if running else None
+        self._recording.pump(self._config(), found or self._outlets.scale_factor())
 
     def close(self) -> bool:
         """Let the worker end; return whether it has."""
@@ -105,13 +109,20 @@ class LegWay:
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
+            faults=self._watch.faults(self._recording.imu_silent_s()) if recording else (),
             outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 
     def show_status(self) -> None:
-        """Publish the status as it is now."""
-        array = self._outlets.show_status(self.situation())
+        """Publish the status as it is now; what a leg gets wrong goes to the log, once."""
+        now = self.situation()
+        for fault in now.faults:
+            if fault.code not in self._told:
+                self._told.add(fault.code)
+                self._log.warning(f'leg {now.session.leg_id}: {fault.code.name}: {fault.text}. '
+                                  f'{fault.remedy}')
+        array = self._outlets.show_status(now)
         self._journal.hear(self.session, array)
 
     # a leg's way

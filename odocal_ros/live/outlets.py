@@ -81,7 +81,7 @@ class Outlets:
         return Situation(
             missing=recording.inputs.missing(config), clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
-            max_speed=progress.max_speed, still_s=progress.still_s(),
+            max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(), heard=recording.heard(),
             restored=known['session'].restored_since(), **known)
 

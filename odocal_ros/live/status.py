@@ -67,13 +67,13 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
 def level(now: Situation) -> bytes:
     """Return STALE before anything came, ERROR for what needs the operator, WARN for doubts."""
     state = now.session.state
-    if state in (State.FAILED, State.REJECTED):
+    if state in (State.FAILED, State.REJECTED) or now.lost_cause:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not now.heard:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
     doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
-                                or now.save_trouble or now.lost)
+                                or now.save_trouble or now.lost or now.faults)
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
@@ -101,6 +101,8 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
 
 
 def _reason_codes(now: Situation) -> str:
+    if now.session.state is State.RECORDING:
+        return ','.join(r.code.name for r in now.faults)
     calibration = now.session.calibration
     return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
