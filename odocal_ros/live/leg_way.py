@@ -56,7 +56,8 @@ class LegWay:
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
         self._told: set[Code] = set()         # faults of the leg that are in the log
-        self._filing = Filing(self._worker, self._log, self.show_status)
+        self._filing = Filing(self._worker, self._log, self.show_status,
+                              node.get_fully_qualified_name())
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def tick(self) -> None:

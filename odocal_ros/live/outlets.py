@@ -16,6 +16,7 @@ from odocal_ros.live import outputs, params
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.status import calibration_status, input_status
+from odocal_ros.yaml_text import no_date
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -52,8 +53,11 @@ class Outlets:
 
     def set_results(self, calibration) -> None:
         """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
-        stamp = outputs.iso(self._node.get_clock().now().nanoseconds)
-        results = params.as_results(calibration, stamp) if calibration else self._before
+        stamp = no_date(outputs.iso(self._node.get_clock().now().nanoseconds))
+        results = self._before
+        if calibration:
+            vehicle = self._node.get_parameter('vehicle').value
+            results = params.as_results(calibration, stamp, vehicle)
         self._setting = True
         try:
             self._node.set_parameters_atomically(

@@ -370,10 +370,25 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
         assert health['dropped'] == '0'
 
 
-def test_results_go_to_the_ros_home_by_default(domain, tmp_path, monkeypatch):
-    from odocal_ros.config import Config
+def test_each_node_has_a_folder_of_its_own_in_the_ros_home(domain, tmp_path, monkeypatch):
+    from odocal_ros.config import Config, with_settings
     from odocal_ros.live.outputs import output_root
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    assert output_root(Config()) == tmp_path / 'odocal'
+    assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
+    assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'
     monkeypatch.delenv('ROS_HOME')
-    assert str(output_root(Config())) == os.path.expanduser('~/.ros/odocal')
+    assert str(output_root(Config(), '/calibrator')) == os.path.expanduser(
+        '~/.ros/odocal/calibrator')
+    assert str(output_root(with_settings(Config(), {'output.directory': '/x'}), '/a')) == '/x'
+
+
+def test_the_result_of_another_vehicle_is_not_restored(start, connect):
+    of_three = ['-p', 'result.scale_factor:=0.02', '-p', 'result.scale_factor_sigma:=0.00001',
+                '-p', 'result.valid:=true', '-p', 'result.vehicle:=car 3']
+    refused = NodeProcess(*of_three, '-p', 'vehicle:=car 4')
+    assert refused.wait() == 1
+    line, = refused.lines
+    assert "the result given is of vehicle 'car 3', and this node calibrates 'car 4'" in line
+    start(*of_three, '-p', 'vehicle:=car 3')
+    client = connect()
+    assert 'of vehicle car 3' in client.call('stop_leg').message
