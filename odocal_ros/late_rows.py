@@ -2,8 +2,9 @@
 Odometer rows that came late: a pause, then rows in a burst that catch up.
 
 A counter without a header is stamped on the way: what holds a message up (a serial line, a busy
-machine) looks like a wheel that slid and spun. Such rows are put where they belong: where the
-sender's own rhythm has them, else where the travel on both sides of the burst does.
+machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm shows
+in the rows that came soonest; the others are put on it where the counts bear that out, else where
+the travel on both sides of a burst has them.
 """
 
 import numpy as np
@@ -11,16 +12,18 @@ import numpy as np
 from odocal_ros.odometer_care import counter_steps
 from odocal_ros.reasons import Code, Reason
 
-PAUSE = 1.3         # median intervals: a longer one may be a row that is late
-LEAST = 0.02        # s of lateness, and
-SHARE = 0.3         # of a median interval, that matter
-LONGEST = 5.0       # s within which a burst has caught up
+WINDOW = 5.0        # s, within which some row comes on time
+LEAST = 0.004       # s of lateness, and
+SHARE = 0.1         # of an interval, that matter
+NAMED = 0.02        # s, and
+NAMED_SHARE = 0.3   # of an interval, that are worth a word
+SPAN = 5.0          # s over which the interval is taken
+STEADY = 0.005      # by which it is another than the median: rows are lost
+EVEN = 0.3          # share of the intervals that are within a quarter of the median
+BESIDE = 5          # rows to either side that tell where a row should be
+FITS = 0.4          # of what rows are off as sent
+COUNTS = 2.5        # by which a row may be off: rounding
 SHORT = 1.0         # s within which travel is as good as even
-EVEN = 0.5          # share of the intervals that are within a quarter of the median
-COUNTS = 2.5        # by which a late row must be off: less is rounding
-FITS = 0.3          # of what rows are off as sent, of smooth motion
-SMOOTH = 3          # degree: acceleration that changes evenly
-BESIDE = 5          # rows beside a burst that tell the speed there
 FAST = 3.0          # times the speed beside: no wheel, so rows that catch up
 
 
@@ -36,61 +39,62 @@ def on_time(samples, t, form, found, name='odometer'):
             else samples.value[1:].astype(float))
     travel = np.concatenate([[0.0], np.cumsum(step)])
     whole = np.issubdtype(samples.value.dtype, np.integer)
-    true, count = _put_back(t, travel, COUNTS if whole else 0.0)
+    usual = interval(t)
+    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < EVEN:
+        return t
+    true = _put_back(t, travel, usual, COUNTS if whole else 0.0)
     late = t - true
-    if count:
-        worst = int(np.argmax(late))
-        found.append(Reason(Code.ODOMETER_LATE, f'{int((late > 0).sum())} of {len(t)} {name} '
-                            f'messages came late in {count} burst{"s" * (count > 1)}, by up to '
+    named = late > max(NAMED, NAMED_SHARE * usual)
+    if named.any():
+        worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
+        found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
+                            f'came late, {max(times, 1)} time{"s" * (times > 1)}, by up to '
                             f'{late[worst]:.3g} s at t = {t[worst]:.2f} s; put where they belong, '
-                            f'between the rows beside'))
+                            'between the rows beside'))
     return true
 
 
-def _put_back(t, travel, least):
-    """Return times with late rows put back, and how many bursts there were."""
-    dt = np.diff(t)
-    usual = float(np.median(dt))
-    if np.mean(np.abs(dt - usual) < usual / 4) < EVEN:
-        return t, 0
-    true, count, done = t.copy(), 0, 0
-    for a in np.flatnonzero(dt > max(PAUSE * usual, usual + LEAST / 2)):
-        if a < done:
-            continue
-        b, earliest = _caught_up(t, a, usual)
-        if b <= a + 1 or t[a + 1] - earliest < max(LEAST, SHARE * usual):
-            continue
-        placed = _placed(t, travel, a, b, usual, least)
-        if placed is not None:
-            true[a + 1:b] = placed
-            count, done = count + 1, b
-    return true, count
+def interval(t):
+    """Return the sender's interval, s, lost and late rows notwithstanding."""
+    usual = float(np.median(np.diff(t)))
+    n = min(max(int(SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
+    mean = float(np.median(t[n:] - t[:-n])) / n
+    return mean if abs(mean - usual) < STEADY * usual else usual
 
 
-def _caught_up(t, a, usual):
-    """Return the row by which the rhythm is back after a pause behind row a, and a + 1's time."""
-    end = np.searchsorted(t, t[a + 1] + LONGEST, side='right')
-    back = t[a + 1:end] - usual * np.arange(end - a - 1)      # a row is never early
-    first = int(np.argmax(back <= back.min() + SHARE / 3 * usual))
-    return a + 1 + first, float(back[first])
+def _put_back(t, travel, usual, least):
+    """Return times with late rows put back."""
+    from scipy.ndimage import minimum_filter1d
+    rows = usual * np.arange(len(t))
+    ahead = int(WINDOW / usual) + 1
+    # those to come, not those before: a lost row sets the rhythm back
+    even = rows + minimum_filter1d(t - rows, ahead, origin=-(ahead // 2), mode='nearest')
+    late = t - even > max(LEAST, SHARE * usual)
+    off_sent, off_even = _off(t, travel), _off(even, travel)
+    true = t.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        about = slice(max(begin - BESIDE, 0), end + BESIDE)
+        sent, put = off_sent[about], off_even[about]
+        if np.abs(put).max() <= least or np.linalg.norm(put) < FITS * np.linalg.norm(sent):
+            true[begin:end] = even[begin:end]
+        elif begin > 0 and end < len(t):
+            true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
+    floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
+    return np.where((true > floor) | ~late, true, np.minimum(floor, t))
 
 
-def _placed(t, travel, a, b, usual, least):
-    """Return the times of the rows between a and b, None where they were not late."""
+def _off(t, travel):
+    """Return by how much each row's travel is off that of the rows some way before and after."""
+    k = np.arange(len(t))
+    before, after = np.maximum(k - BESIDE, 0), np.minimum(k + BESIDE, len(t) - 1)
+    share = (t - t[before]) / np.maximum(t[after] - t[before], 1e-9)
+    return travel - travel[before] - share * (travel[after] - travel[before])
+
+
+def _by_travel(t, travel, a, b, usual):
+    """Return the times of the rows between a and b, as sent where they do not catch up."""
     rows = np.arange(a + 1, b)
-    about = slice(max(a - BESIDE, 0), b + BESIDE + 1)
-
-    def off(times):
-        """Return by how much travel at these times is off a smooth motion."""
-        x = np.concatenate([t[about.start:a + 1], times, t[b:about.stop]])
-        x = (x - x[0]) / (x[-1] - x[0])
-        smooth = np.polynomial.Polynomial.fit(x, travel[about], SMOOTH, domain=[0, 1])
-        return float(np.abs(travel[about] - smooth(x)).max())
-
-    sent = off(t[rows])
-    even = np.minimum(t[b] - (b - rows) * usual, t[rows])
-    if even[0] > t[a] and off(even) <= max(FITS * sent, least):
-        return even
 
     def speed(first, last):
         first, last = max(first, 0), min(last, len(t) - 1)
@@ -98,9 +102,7 @@ def _placed(t, travel, a, b, usual, least):
 
     beside = max(speed(a - BESIDE, a), speed(b, b + BESIDE))
     if t[b] - t[a] > SHORT or not beside or speed(a + 1, b) < FAST * beside:
-        return None
+        return t[rows]
     # some rows of the burst are lost, so that its rhythm tells nothing
-    line = (travel[b] - travel[a]) / (t[b] - t[a])
-    by_travel = t[a] + (travel[rows] - travel[a]) / line
-    rising = np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))
-    return rising + np.arange(1, len(rows) + 1) * 1e-9
+    by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])
+    return np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))
