@@ -15,6 +15,7 @@ from odocal_ros.leg import LegRecorder
 from odocal_ros.live import answers, jobs
 from odocal_ros.live.ability import Ability
 from odocal_ros.live.computing import Computing
+from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.guidance import after_result, quantities_ok
 from odocal_ros.live.journal import Journal
@@ -27,7 +28,7 @@ from odocal_ros.live.session import Session, State
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.watch import Watch
 from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
-from odocal_ros.reasons import Code
+from odocal_ros.outside import for_shell
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
@@ -55,7 +56,7 @@ class LegWay:
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
-        self._told: set[Code] = set()         # faults of the leg that are in the log
+        self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status,
                               node.get_fully_qualified_name())
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -85,6 +86,15 @@ class LegWay:
         until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
+
+    def left_behind(self) -> str:
+        """Return where a leg lies that was not stopped, and what computes it; empty: none was."""
+        if self.session.state is not State.RECORDING:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {for_shell(["odocal", "replay", folder])} '
+                'computes it') if folder else 'no journal was kept of it'
+        return f'leg {self.session.leg_id} was not stopped: {kept}'
 
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""
@@ -116,13 +126,9 @@ class LegWay:
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 
     def show_status(self) -> None:
-        """Publish the status as it is now; what a leg gets wrong goes to the log, once."""
+        """Publish the status as it is now, and say what is new in it."""
         now = self.situation()
-        for fault in now.faults:
-            if fault.code not in self._told:
-                self._told.add(fault.code)
-                self._log.warning(f'leg {now.session.leg_id}: {fault.code.name}: {fault.text}. '
-                                  f'{fault.remedy}')
+        self._console.tell(now, self._steady.now().nanoseconds)
         array = self._outlets.show_status(now)
         self._journal.hear(self.session, array)
 

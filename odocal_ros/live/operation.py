@@ -32,7 +32,6 @@ class Operation(LegWay):
         if clocks:
             raise Refused('no leg can be started: ' + clocks_differ(clocks))
         session.start(mark_ns, self._config())
-        self._told.clear()
         self._journal.begin(session, self._recording.inputs.topics)
         self._recording.progress.begin_leg()
         self._watch.begin(self._recording.snapshot(), mark_ns, session.config)

@@ -17,6 +17,7 @@ class Situation:
     session: Session
     config: Config
     missing: list[str] = field(default_factory=list)
+    doubled: list[str] = field(default_factory=list)     # topics with several publishers
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)
     results: dict = field(default_factory=dict)  # result.* parameters

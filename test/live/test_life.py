@@ -9,6 +9,9 @@ import time
 from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
 from player import messages_of, part, Player, Sent
 import pytest
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import get_parameter_value
 
 from odocal_ros.bagio import encode
 from odocal_ros.config import SETTINGS
@@ -37,6 +40,9 @@ def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     assert node.end(how) == 0
     assert 'Traceback' not in node.text
     assert 'rror' not in node.text
+    kept = node.lines[-1]
+    assert kept.startswith('calibrator: leg 1 was not stopped: what was driven is in /')
+    assert kept.endswith('_leg_1 computes it')
 
 
 def test_a_signal_before_anything_ran_is_clean_too(start, connect):
@@ -100,6 +106,12 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.set(leg__min_distance=250.0).successful
     assert client.get('leg.min_distance') == [250.0]
     assert client.set(imu__gyro_noise=math.nan).successful
+    assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
+    # as ros2 param set sends an empty list: of no type, which becomes one of booleans
+    empty = Parameter(name='reference.start', value=get_parameter_value('[]'))
+    answer = answer_of(client.send(SetParameters, 'set_parameters',
+                                   SetParameters.Request(parameters=[empty])))
+    assert answer.results[0].successful, answer.results[0].reason
     assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
     for value, words in (({'leg__min_distance': 0.5}, 'out of range'),
                          ({'leg__min_distance': 3}, 'Wrong parameter type'),
