@@ -47,12 +47,17 @@ setup(
             'ros-jazzy-rclpy',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        # odocal watch
+        'watch': [
+            'rich>=13',
+        ],
         'dev': [
             'colcon-common-extensions',
             'hypothesis>=6',
             'mpmath>=1.3',
             'mypy>=1.8',
             'pytest>=7.4',
+            'rich>=13',
             'ruff>=0.6',
         ],
     },

@@ -53,9 +53,10 @@ def generate_launch_description():
         package='rviz2', executable='rviz2', namespace=LaunchConfiguration('namespace'),
         arguments=['-d', PathJoinSubstitution([SHARE, 'config', 'odocal.rviz'])],
         parameters=[SIM_TIME], condition=IfCondition(LaunchConfiguration('rviz')))
+    # first what may be missing: launch gives up there, and would leave a node behind
     return LaunchDescription([
         *declared,
+        rviz,
         calibrator(UnlessCondition(named)),
         calibrator(IfCondition(named), method=ParameterValue(LaunchConfiguration('method'),
-                                                             value_type=str)),
-        rviz])
+                                                             value_type=str))])

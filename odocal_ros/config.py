@@ -188,7 +188,8 @@ class VerdictConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputConfig:
-    directory: str = setting('', about='Where results go; empty: $ROS_HOME/odocal (~/.ros/odocal)'
+    directory: str = setting('', about='Where results go; empty: odocal/ and the full name of '
+                             'the node in $ROS_HOME (~/.ros/odocal/calibrator)'
                              '.')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')
@@ -232,6 +233,9 @@ class Config:
         'auto', 'two_point', 'wheels', 'smoother', 'all'), about=(
         'Method whose figures are the result; auto: each value of the first of smoother, wheels '
         '(with two counters) and two_point that has it; all: the same, wheels tried always.'))
+    vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: it stands in '
+                           'results and titles the report, and a result of another one is not '
+                           'restored.')
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

@@ -75,9 +75,8 @@ class LegRun:
 
     def result(self) -> LegResult:
         """Return what the leg gives, however far it carries."""
-        if not (self._moves() and self._faces_forward()):
+        if not self.examine():
             return leg_result(self.leg, self.inputs, self.reasons)
-        self._prepare()
         methods, paths = {}, {}
         for name in self._asked():
             method, paths[name] = run_method(name, self)
@@ -99,6 +98,13 @@ class LegRun:
             m, details=m.details | check_of(self, paths[name])) for name, m in methods.items()}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
                           deciding=deciding(self.config.method), **shown)
+
+    def examine(self) -> bool:
+        """Say all of the leg that needs no method; return whether methods can be run."""
+        if not (self._moves() and self._faces_forward()):
+            return False
+        self._prepare()
+        return True
 
     def _asked(self):
         """Return the methods to run: those asked for, of auto those that the leg can carry."""
@@ -155,7 +161,7 @@ class LegRun:
             return False
         covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
         if covered.sum() < FEWEST_ROWS:
-            self.reasons += imu_gap(inputs, 0.0, 0.0)
+            self.reasons += imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
             return False
         self.reasons += uncovered(inputs.travel, inputs.t_stop)
         return True
@@ -176,7 +182,8 @@ class LegRun:
         if self.alignment is None:
             self.alignment, self.about_alignment = align(
                 inputs, self.spans, self.rough, self.fixes_n, self.origin, config)
-        self.reasons += imu_gap(inputs, min(self.alignment.t, 0.0), config.leg.max_gap)
+        self.reasons += imu_gap(inputs.t_imu, min(self.alignment.t, 0.0), inputs.t_stop,
+                                config.leg.max_gap)
         self.track = self.reckon(inputs.travel)
         self.reasons += coarse_reasons(self)
         self.wheel_slips = self._faults()

@@ -16,10 +16,12 @@ from odocal_ros.leg import Leg
 from odocal_ros.leg_run import leg_result, LegRun
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.reasons import Code, Reason
+from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screen import Inputs, screen
 
-__all__ = ['calibrate', 'combine']
+__all__ = ['calibrate', 'combine', 'faults']
+# of a leg that is not over
+NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
 
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
@@ -45,19 +47,38 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     LegResult; a leg that cannot be calibrated says why in its reasons.
 
     """
+    inputs, reasons, run = _begun(leg, config, alignment, notes, holdout)
+    return leg_result(leg, inputs, reasons) if run is None else run.result()
+
+
+def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
+    """
+    Return what lowers the verdict of a leg, as ``calibrate`` has it, but for what methods say.
+
+    A leg that is not over may be given: what more of a drive cures is left out.
+    """
+    _, reasons, run = _begun(leg, config)
+    if run is not None:
+        run.examine()
+    return tuple(r for r in reasons
+                 if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
+
+
+def _begun(leg, config, alignment=None, notes=(), holdout=False):
+    """Return inputs, what they say (a list that the run adds to), and the run, None without."""
     inputs, found = screen(leg, config)
     reasons = [*notes, *found]
     missing = _missing(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
-        return leg_result(leg, inputs, reasons + [r for r in missing if r.code not in seen])
+        return inputs, reasons + [r for r in missing if r.code not in seen], None
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
     reasons += sanity
     if z_down:
         inputs = turned_over(inputs)
     if UNUSABLE & {r.code for r in sanity}:
-        return leg_result(leg, inputs, reasons)
-    return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
+        return inputs, reasons, None
+    return inputs, reasons, LegRun(leg, inputs, config, reasons, alignment, holdout)
 
 
 def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:

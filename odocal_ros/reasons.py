@@ -41,6 +41,8 @@ class Code(Enum):
                              'stamp all sensors with one clock.')
     DELAY_SEEN = NOTE, ('Set the time_offset as the sentence says, here and wherever else these '
                         'sensors are used together; the two-point method gains most.')
+    ODOMETER_LATE = NOTE, ('Send the counter with a header stamped where it is read, or ease the '
+                           'line or machine that holds it up; the late messages were put back.')
     COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg; the travel across the '
                               'reset was bridged at the speed beside it.')
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'

@@ -55,6 +55,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'were found late or early against the others, by more than three sigmas and by enough to '
         'matter at the speed driven. Methods wheels and smoother estimate the delay and allow for '
         'it; other software that joins these sensors does not.',
+        Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then came in a burst that '
+        'made up for it: they were held up on the way, and their stamps, taken on arrival, are '
+        'late. They were put where the rhythm of the sender has them, or where the travel before '
+        'and after the burst does, and it is no wheel slip.',
         Code.COUNTER_RESET: 'The counter jumps in a way that no rollover explains: it was reset '
         'or lost power. What was driven in that moment is guessed, with a sigma.',
         Code.COUNTER_ROLLOVER: 'The counter reached its largest number and began anew. That is '

@@ -258,11 +258,10 @@ def _gaps(slot, t, found):
                             f't = {t[worst]:.2f} s (median interval {np.median(step):.3f} s)'))
 
 
-def imu_gap(inputs: Inputs, t_from: float, limit: float) -> tuple[Reason, ...]:
-    """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and the stop."""
-    t = inputs.t_imu
-    t = t[(t >= t_from - 1e-9) & (t <= inputs.t_stop + 1e-9)]
-    edges = np.concatenate([[t_from], t, [inputs.t_stop]])
+def imu_gap(t_imu, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
+    """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and t_stop."""
+    t = t_imu[(t_imu >= t_from - 1e-9) & (t_imu <= t_stop + 1e-9)]
+    edges = np.concatenate([[t_from], t, [t_stop]])
     gaps = [(b - a, a) for a, b in pairwise(edges.tolist()) if b - a > limit] \
         if np.diff(edges).max() > limit else []
     if not gaps:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.late_rows import on_time
 from odocal_ros.nav.odometer import mean_travel, Travel, travel
 from odocal_ros.odometer_care import counter_steps, doubted, mended
 from odocal_ros.reasons import Code, Reason
@@ -64,6 +65,7 @@ def _one(samples, t, form, config, found, side=''):
         samples, why, doubt_t, doubt = unrolled(t, samples, step, side)
         found.extend(why)
     samples, t = mended(samples, t, form, found, f'{side} odometer'.strip())
+    t = on_time(samples, t, form, found, f'{side} odometer'.strip())
     way, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
     way, more_t, more = doubted(way, samples.value, form)

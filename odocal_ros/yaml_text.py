@@ -1,5 +1,6 @@
 """YAML of parameter files, value by value: read alike by rcl, by YAML 1.1 and by odocal."""
 
+from datetime import datetime, UTC
 import math
 
 from odocal_ros.outside import one_line
@@ -25,6 +26,15 @@ def number(value: float | None) -> str:
     text = repr(float(value))
     mantissa, e, exponent = text.partition('e')
     return text if not e or '.' in mantissa else f'{mantissa}.0e{exponent}'
+
+
+def no_date(iso: str) -> str:
+    """
+    Return a date and time, UTC, as text that YAML takes for text even without its quotes.
+
+    ros2 param load reads each value twice, and a date it cannot set.
+    """
+    return f'{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
 
 
 def parameters(values: dict, key: str = '/**') -> str:

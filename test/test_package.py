@@ -23,8 +23,9 @@ XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
         'jinja2': ('python3-jinja2', 'jinja2'),
         'matplotlib': ('python3-matplotlib', 'matplotlib'), 'pyproj': ('python3-pyproj', 'pyproj'),
-        'rosbags': ('python3-rosbags-pip', 'rosbags'),
+        'rich': ('python3-rich', 'rich'), 'rosbags': ('python3-rosbags-pip', 'rosbags'),
         'scipy': ('python3-scipy', 'scipy'), 'tqdm': ('python3-tqdm', 'tqdm')}
+EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that brings it
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 
@@ -60,8 +61,10 @@ def test_setup_requires_all_that_is_imported_but_ros():
     setup = (ROOT / 'setup.py').read_text()
     block = setup.partition('install_requires=[')[2].partition(']')[0]
     required = set(re.findall(r"'([A-Za-z0-9]+)", block))
-    foreign = imported() & set(KEYS)
+    foreign = imported() & set(KEYS) - set(EXTRA)
     assert required == {KEYS[name][1] for name in foreign}
+    for name, extra in EXTRA.items():
+        assert f"'{KEYS[name][1]}" in setup.partition(f"'{extra}': [")[2].partition(']')[0]
 
 
 def copy_of_the_package(target: Path) -> Path:

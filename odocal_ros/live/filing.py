@@ -20,8 +20,9 @@ class Filing:
     saved : the newest folder that still stands.   trouble : why the newest result has none.
     """
 
-    def __init__(self, worker: Worker, log, show: Callable[[], None]) -> None:
+    def __init__(self, worker: Worker, log, show: Callable[[], None], node: str) -> None:
         self.saved = self.trouble = ''
+        self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._shelf = Shelf()
         self._warned: Calibration | None = None    # the operator was told that latest stays
@@ -56,7 +57,8 @@ class Filing:
             self._show()
 
         self._worker.submit(partial(
-            self._write, calibration, config, [{'bag': '', 'sha256': None, 'topics': topics}],
+            self._write, calibration, config, [{'bag': '', 'sha256': None, 'node': self._node,
+                                               'topics': topics}],
             imu_frame, now_ns, self._shelf, asked and calibration is self._warned), then)
         return future
 

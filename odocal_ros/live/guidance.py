@@ -22,15 +22,27 @@ def hint(now: Situation) -> str:
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')
+    if now.lost_cause:
+        return '; '.join([_fault(now), *now.missing[:1]])
     if now.missing:
         return now.missing[0]
     if now.clocks:
         return clocks_differ(now.clocks)
     if state is State.RECORDING:
-        return _while_recording(now)
+        actions, facts = _while_recording(now)
+        return '; '.join([*facts, *actions])
     if state is State.IDLE:
         return _before_start(now.still_s)
     return after_result(now)
+
+
+def action_first(now: Situation) -> str:
+    """Return the hint for one line to watch: in a leg what to do stands before what is known."""
+    fine = not (now.lost_cause or now.missing or now.clocks)
+    if now.session.state is State.RECORDING and fine:
+        actions, facts = _while_recording(now)
+        return '; '.join([*(actions or ['drive on']), *facts])
+    return hint(now)
 
 
 def clocks_differ(clocks: list[tuple[str, float]]) -> str:
@@ -44,7 +56,7 @@ def quantities_ok(now: Situation) -> dict[str, str]:
     """Return which quantities are good enough: of the leg that is recorded, else of the result."""
     session = now.session
     if session.state is State.RECORDING:
-        return quantities.of_outlook(now.outlook, now.config, now.two_wheels)
+        return quantities.of_outlook(now.outlook, now.config, now.two_wheels, now.lost_cause)
     if session.state is State.COMPUTING:
         return quantities.nothing_known()
     if session.calibration is not None:
@@ -100,24 +112,28 @@ def _before_start(still_s: float) -> str:
     return 'call ~/start_leg'
 
 
-def _while_recording(now: Situation) -> str:
-    wheels = None if now.outlook is None else now.outlook.wheels
-    if wheels is not None and wheels.fault:
-        return f'{wheels.fault}; call ~/cancel_leg'
-    if now.outlook is not None and now.outlook.fault:
-        return f'the leg would be rejected: {now.outlook.fault}'
+def _while_recording(now: Situation) -> tuple[list[str], list[str]]:
+    """Return what to do, and what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
     slow = now.max_speed < now.session.config.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
-        return ', '.join(wants) + f'; then stand still {REST_S:.0f} s and call ~/stop_leg'
+        return [', '.join(wants), f'then stand still {REST_S:.0f} s and call ~/stop_leg'], []
     if now.outlook is None:
-        return '; '.join([*wants, _end(now)])
-    parts = [now.outlook.words(), *wants]
+        return [*wants, _end(now)], []
+    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution
+    facts.append(now.outlook.words())
     if now.outlook_age_s > OLD_S:
-        parts.append(f'as it was {now.outlook_age_s:.0f} s ago')
-    return '; '.join(parts + ([_end(now)] if now.outlook.complete else []))
+        facts.append(f'as it was {now.outlook_age_s:.0f} s ago')
+    return wants + ([_end(now)] if now.outlook.complete else []), facts
+
+
+def _fault(now: Situation) -> str:
+    """Return what the leg would be rejected for, and what to do."""
+    worst = now.faults[0]
+    return (f'call ~/cancel_leg and start again: the leg would be rejected: {worst.code.name}: '
+            f'{worst.text}. {worst.remedy.rstrip(".")}')
 
 
 def _end(now: Situation) -> str:

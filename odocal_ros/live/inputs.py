@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+import difflib
 from functools import partial
 
 import numpy as np
@@ -21,6 +22,7 @@ from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
 from odocal_ros.messages import make_reader, Reader
+from odocal_ros.odometer_types import TYPES
 from odocal_ros.outside import said_by
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
@@ -32,6 +34,7 @@ DEPTH = {'imu': 5000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
          'fix': 500, 'fix_velocity': 500}
 LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
           'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
+MOST_MEANT, ALIKE = 2, 0.4
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
@@ -70,6 +73,7 @@ class Input:
         self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
         self.frame = ''        # of the Imu's header, once a message has come
         self.publishers: list = []
+        self.meant: list[str] = []     # topics that others publish, where nobody does this one
         self._failed = 0
         self._node = node
         self._pending: deque = deque()
@@ -85,9 +89,32 @@ class Input:
             message_class(self.allowed[0])
             make_reader(self.slot, self.allowed[0], config)
 
-    def find(self, config: Config) -> None:
-        """Look at who publishes the topic, and subscribe once the type is known."""
+    def look(self) -> None:
+        """Look at who publishes the topic, and where nobody does, at what may be meant."""
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
+        self.meant = [] if self.publishers else self._alike()
+
+    def _alike(self) -> list[str]:
+        """Return topics that others publish with a type that would serve, the nearest first."""
+        wanted, own = set(self.allowed or TYPES), f'{self._node.get_fully_qualified_name()}/'
+        names = [name for name, types in self._node.get_topic_names_and_types()
+                 if wanted & set(types) and not name.startswith(own)
+                 and self._node.count_publishers(name)]
+        # of the many types that may be an odometer's only what is called alike
+        return difflib.get_close_matches(self.topic, names, MOST_MEANT,
+                                         0.0 if self.allowed else ALIKE)
+
+    def doubled(self) -> str:
+        """Name those who publish the topic where they are several, else return nothing."""
+        if len(self.publishers) < 2 or self.reader is None:
+            return ''
+        who = ', '.join(sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+                               for p in self.publishers))
+        return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages mix; '
+                'stop all but one')
+
+    def find(self, config: Config) -> None:
+        """Subscribe once the type is known."""
         if self.reader is not None:
             return
         try:
@@ -197,7 +224,8 @@ class Input:
         if not self.publishers:
             return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'
                     + (f', silent for {silent:.0f} s' if self.health.heard_ns else
-                       '; start the driver or remap ' + self.name))
+                       '; start the driver or remap ' + self.name)
+                    + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
         foreign = {p.topic_type for p in self.publishers} - {self.msgtype}
         if self.msgtype and foreign and not self.health.heard_ns:
             return (f'{self.topic} is published as {", ".join(sorted(foreign))}, want '
@@ -232,6 +260,7 @@ class Inputs:
             if slot not in self.by_slot:
                 self.by_slot[slot] = Input(self._node, slot, allowed)
         for one in self.by_slot.values():
+            one.look()
             if not one.flowing():
                 one.find(config)
 
@@ -246,6 +275,10 @@ class Inputs:
     def missing(self, config: Config) -> list[str]:
         """Return why a leg cannot be started, one line for each topic that lacks."""
         return [one.why() for one in self.required(config) if not one.flowing()]
+
+    def doubled(self) -> list[str]:
+        """Return what is to be said of topics with several publishers."""
+        return [text for text in (one.doubled() for one in self.by_slot.values()) if text]
 
     @property
     def topics(self) -> dict[str, str]:

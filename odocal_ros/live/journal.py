@@ -37,6 +37,7 @@ class Journal:
 
     def __init__(self, node, topic: str) -> None:
         self._log, self._clock, self._topic = node.get_logger(), node.get_clock(), topic
+        self._node = node.get_fully_qualified_name()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._writer = JournalWriter()
         self._batch: dict[str, Heard] = {}
@@ -110,10 +111,10 @@ class Journal:
         now_ns = self._clock.now().nanoseconds
         self._leg_id, self._ended, self._last_event = session.leg_id, False, ''
         self._writer.submit(self._writer.begin, Plan(
-            session.leg_id, output_root(config) / 'journal',
+            session.leg_id, output_root(config, self._node) / 'journal',
             f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
             f'_leg_{session.leg_id}',
-            journal_text(config, session.leg_id, session.start_ns, topics),
+            journal_text(config, session.leg_id, session.start_ns, topics, self._node),
             config.journal.max_bytes))
 
     def hear(self, session: Session, array: DiagnosticArray) -> None:

@@ -14,9 +14,11 @@ HEAD = """\
 """
 
 
-def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, str]) -> str:
-    """Return the text of journal.yaml; ``topics`` are slot -> topic."""
-    about = {'software': f'odocal_ros {__version__}', 'leg_id': leg_id, 'leg_start_ns': start_ns}
+def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, str],
+                 node: str = '') -> str:
+    """Return the text of journal.yaml; ``topics`` are slot -> topic, ``node`` its full name."""
+    about = {'software': f'odocal_ros {__version__}', 'node': node, 'leg_id': leg_id,
+             'leg_start_ns': start_ns}
     about |= {f'topics.{slot}': topic for slot, topic in topics.items()}
     return HEAD + parameters(flat(config)) + parameters(about, 'odocal_journal')
 

@@ -15,6 +15,7 @@ from odocal_ros.leg import LegRecorder
 from odocal_ros.live import answers, jobs
 from odocal_ros.live.ability import Ability
 from odocal_ros.live.computing import Computing
+from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.guidance import after_result, quantities_ok
 from odocal_ros.live.journal import Journal
@@ -27,6 +28,7 @@ from odocal_ros.live.session import Session, State
 from odocal_ros.live.situation import Situation
 from odocal_ros.live.watch import Watch
 from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
+from odocal_ros.outside import for_shell
 
 PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
 
@@ -54,7 +56,9 @@ class LegWay:
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
-        self._filing = Filing(self._worker, self._log, self.show_status)
+        self._console = Console(self._log)
+        self._filing = Filing(self._worker, self._log, self.show_status,
+                              node.get_fully_qualified_name())
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def tick(self) -> None:
@@ -72,7 +76,9 @@ class LegWay:
 
     def pump(self) -> None:
         """Decode what has arrived."""
-        self._recording.pump(self._config(), self._outlets.scale_factor())
+        running = self._watch.outlook and self._watch.outlook.estimates.get('scale_factor')
+        found = running.value if running else None
+        self._recording.pump(self._config(), found or self._outlets.scale_factor())
 
     def close(self) -> bool:
         """Let the worker end; return whether it has."""
@@ -80,6 +86,15 @@ class LegWay:
         until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
+
+    def left_behind(self) -> str:
+        """Return where a leg lies that was not stopped, and what computes it; empty: none was."""
+        if self.session.state is not State.RECORDING:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {for_shell(["odocal", "replay", folder])} '
+                'computes it') if folder else 'no journal was kept of it'
+        return f'leg {self.session.leg_id} was not stopped: {kept}'
 
     def _start_time_anew(self) -> None:
         """Drop what was recorded on the old time; a running leg cannot go on."""
@@ -105,13 +120,16 @@ class LegWay:
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
+            faults=self._watch.faults(self._recording.imu_silent_s()) if recording else (),
             outlook_age_s=(end_ns - outlook.until_ns) * 1e-9 if outlook else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 
     def show_status(self) -> None:
-        """Publish the status as it is now."""
-        array = self._outlets.show_status(self.situation())
+        """Publish the status as it is now, and say what is new in it."""
+        now = self.situation()
+        self._console.tell(now, self._steady.now().nanoseconds)
+        array = self._outlets.show_status(now)
         self._journal.hear(self.session, array)
 
     # a leg's way

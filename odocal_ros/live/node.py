@@ -99,6 +99,8 @@ class Calibrator(Node):
         for part in ('operation', 'journal', 'recording'):
             if hasattr(self, part) and getattr(self, part).close() is False:
                 self.at_work = True
+        if hasattr(self, 'operation') and (left := self.operation.left_behind()):
+            _complain(left)      # a context that is shut down takes its log with it
         super().destroy_node()
 
     def get_logger(self) -> PlainLog:
@@ -161,6 +163,7 @@ class Calibrator(Node):
             response.success, response.message = (
                 await answer if isinstance(answer, Future) else answer)
         except OdocalError as refused:
+            self.get_logger().warning(f'~/{act.__name__} refused: {refused}')
             response.success, response.message = False, str(refused)
         return response
 

@@ -10,13 +10,18 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64, String
 
 from odocal_ros.config import Config
 from odocal_ros.live import outputs, params
+from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.situation import Situation
-from odocal_ros.live.status import calibration_status, input_status
+from odocal_ros.live.status import calibration_status, in_force, input_status
+from odocal_ros.yaml_text import no_date
 
+PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',
+           'yaw_mounting_angle_sigma')
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
@@ -31,6 +36,9 @@ class Outlets:
         self._node = node
         self._status = publish(DiagnosticArray, '~/status', LATCHED)
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
+        self._hint = publish(String, '~/hint', LATCHED)
+        self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
+        self._shown: dict = {}        # what these publishers said last
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -52,8 +60,11 @@ class Outlets:
 
     def set_results(self, calibration) -> None:
         """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
-        stamp = outputs.iso(self._node.get_clock().now().nanoseconds)
-        results = params.as_results(calibration, stamp) if calibration else self._before
+        stamp = no_date(outputs.iso(self._node.get_clock().now().nanoseconds))
+        results = self._before
+        if calibration:
+            vehicle = self._node.get_parameter('vehicle').value
+            results = params.as_results(calibration, stamp, vehicle)
         self._setting = True
         try:
             self._node.set_parameters_atomically(
@@ -79,9 +90,10 @@ class Outlets:
         """Return what is so just now; ``known`` are the fields that are not read off here."""
         config, progress = known['config'], recording.progress
         return Situation(
-            missing=recording.inputs.missing(config), clocks=progress.clocks.differing(config),
+            missing=recording.inputs.missing(config), doubled=recording.inputs.doubled(),
+            clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
-            max_speed=progress.max_speed, still_s=progress.still_s(),
+            max_speed=progress.max_speed(), still_s=progress.still_s(),
             two_wheels=recording.two_wheels(), heard=recording.heard(),
             restored=known['session'].restored_since(), **known)
 
@@ -89,12 +101,22 @@ class Outlets:
         """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
         self._status.publish(array)
+        self._show(self._hint, String(data=action_first(now)))
+        for name, publisher in self._plotted.items():
+            self._show(publisher, Float64(data=in_force(now, name)))
         return array
+
+    def _show(self, publisher, message) -> None:
+        """Publish what is new; NaN after NaN is not."""
+        if repr(message) != self._shown.get(publisher):
+            self._shown[publisher] = repr(message)
+            publisher.publish(message)
 
     def show_diagnostics(self, recording: Recording, config: Config) -> None:
         """Publish the health of each input."""
-        node = (self._node.get_fully_qualified_name() if config.diagnostic_updater.use_fqn
-                else self._node.get_name())
+        node = self._node.get_fully_qualified_name()
+        if not config.diagnostic_updater.use_fqn:
+            node = node.lstrip('/')      # with its namespace: two vehicles are not one
         now_ns = self._steady.now().nanoseconds
         needed = recording.inputs.required(config)
         self._diagnostics.publish(self._array([

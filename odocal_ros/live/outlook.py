@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 import math
 
 from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.reasons import Reason
 
 COARSE = 0.01        # relative sigma from which it is said in per cent
 FARTHEST = 2e4       # m: who must drive on for more needs something else
@@ -65,12 +66,10 @@ class WheelsOutlook:
     What the way so far tells of two wheels by themselves; None: it does not tell them.
 
     left_right, track_width : relative sigmas, of the worse wheel and of the width.
-    fault : what is wrong with a wheel, for people.
     """
 
     left_right: float | None
     track_width: float | None
-    fault: str = ''
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Outlook:
     pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
     methods : what those say that need no end of the drive.   estimates : the running estimate,
     each value by the method that will give it.   until_ns : stamp up to which it was looked at.
-    fault : what the leg will be rejected for however far it goes, and what to do.
+    faults : what a method would reject the leg for however far it goes.
     """
 
     scale: Prospect
@@ -91,7 +90,7 @@ class Outlook:
     methods: dict[str, MethodResult] = field(default_factory=dict)
     estimates: dict[str, Estimate] = field(default_factory=dict)
     until_ns: int = 0
-    fault: str = ''
+    faults: tuple[Reason, ...] = ()
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""

@@ -44,10 +44,11 @@ def iso(stamp_ns: int) -> str:
     return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'
 
 
-def output_root(config: Config) -> Path:
-    """Return where results go: the setting, else ``odocal`` in the ROS home."""
+def output_root(config: Config, node: str) -> Path:
+    """Return where results go: the setting, else a folder of the node's own in the ROS home."""
     home = os.environ.get('ROS_HOME') or '~/.ros'
-    return Path(config.output.directory or Path(home) / 'odocal').expanduser()
+    own = Path(home) / 'odocal' / node.lstrip('/')
+    return Path(config.output.directory or own).expanduser()
 
 
 def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
@@ -55,9 +56,9 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
-    ``imu_frame`` is that of the Imu's headers, for a ``frames.imu`` left empty. Returns the
-    folder, why ``latest`` stays where it was, empty when it does not (``force`` moves it), and
-    what adds the report, which takes long to draw.
+    ``inputs`` name the node. ``imu_frame`` is that of the Imu's headers, for a ``frames.imu``
+    left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
+    (``force`` moves it), and what adds the report, which takes long to draw.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     from odocal_ros.output.files import Results
     from odocal_ros.output.frames import framed
     calibration, config = framed(calibration, config, imu_frame)
-    root = output_root(config)
+    root = output_root(config, inputs[0]['node'])
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:
         folder = _free(root, name)

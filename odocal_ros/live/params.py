@@ -32,7 +32,8 @@ TAKE = 'take the file that ~/save wrote'
 
 def _result_defaults() -> dict:
     numbers = {PREFIX + name + end: math.nan for name in ESTIMATES for end in ('', '_sigma')}
-    return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': ''}
+    return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': '',
+                      PREFIX + 'vehicle': ''}
 
 
 RESULTS = _result_defaults()
@@ -137,10 +138,15 @@ def declare_results(node: Node) -> None:
             raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {TAKE}')
         if whole:
             node.set_parameters([Parameter(name, value=float(value))])
-    restored_from({name: node.get_parameter(name).value for name in RESULTS})
+    kept = restored_from({name: node.get_parameter(name).value for name in RESULTS})
+    here = node.get_parameter('vehicle').value
+    if kept is not None and kept.vehicle and here and kept.vehicle != here:
+        raise BadConfig(f"the result given is of vehicle '{one_line(kept.vehicle)}', and this "
+                        f"node calibrates '{one_line(here)}': give the calibration.yaml of "
+                        'that one, or none')
 
 
-def as_results(calibration: Calibration, stamp: str) -> dict:
+def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict:
     """Return the values of ``result.*`` that a calibration makes."""
     values = dict(RESULTS)
     for name in ESTIMATES:
@@ -149,7 +155,7 @@ def as_results(calibration: Calibration, stamp: str) -> dict:
         values[PREFIX + name + '_sigma'] = _number(estimate.sigma)
     values[PREFIX + 'legs'] = len(calibration.legs)
     values[PREFIX + 'valid'] = calibration.verdict is not Verdict.REJECTED
-    values[PREFIX + 'stamp'] = stamp
+    values[PREFIX + 'stamp'], values[PREFIX + 'vehicle'] = stamp, vehicle
     return values
 
 
@@ -183,7 +189,8 @@ def _restored(results):
         estimates[name] = Estimate(value, sigma, '1' if unit == SCALE else unit)
     if all(e.value is None for e in estimates.values()):
         return None
-    return Restored(estimates, legs, results[PREFIX + 'valid'], stamp or NO_STAMP)
+    return Restored(estimates, legs, results[PREFIX + 'valid'], stamp or NO_STAMP,
+                    results[PREFIX + 'vehicle'])
 
 
 def _number(value) -> float:

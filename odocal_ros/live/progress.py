@@ -16,6 +16,8 @@ from odocal_ros.samples import OdometerForm
 
 STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
 FASTEST = 100.0        # m/s: what goes faster is a counter reset
+SPEED_NS = 1_000_000_000   # speeds are taken over that long, or longer
+STANDS_S = 0.5         # without a count: the vehicle stands
 REST_NS = 1_000_000_000   # a shorter pause is no standstill
 CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
@@ -48,12 +50,14 @@ class Travel:
         self._last: tuple | None = None
         self._anchor = 0.0
         self._rest = 0.0, 0      # length, s, and end of the last standstill
+        self.top = 0.0           # highest speed, units/s
+        self._since = 0.0, 0     # total and stamp that the speed is taken from
 
-    def feed(self, block, scale: float) -> float:
-        """Take a block, return the highest speed in it, m/s (0 where the scale is unknown)."""
+    def feed(self, block, scale: float) -> None:
+        """Take a block; scale: m per unit, 0 unknown."""
         steps, stamps, seconds = self._steps(block)
         if not len(steps):
-            return 0.0
+            return
         if scale > 0:
             steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
         path = self.total + np.cumsum(np.abs(steps))
@@ -63,10 +67,13 @@ class Travel:
                 if rest_ns > REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
                 self._anchor, self.moved_ns = total, int(stamp)
-        self.newest_ns = int(stamps[-1])
+        self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
         self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
-        gone, self.total = path[-1] - self.total, float(path[-1])
-        return gone * scale / seconds.sum() if seconds.sum() > 0 else 0.0
+        before, since_ns = self._since
+        if abs(self.newest_ns - since_ns) >= SPEED_NS:    # rows of a burst tell no speed
+            if since_ns:
+                self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
+            self._since = self.total, self.newest_ns
 
     def _steps(self, block):
         """Return the travel of each row since the row before, its stamp and its duration, s."""
@@ -99,33 +106,31 @@ class Travel:
 
 
 class FixPath:
-    """Distance along the fixes; steps below the noise do not count."""
+    """Distance along the fixes while the counter moves; steps below the noise do not count."""
 
     def __init__(self) -> None:
-        self.total = 0.0
+        self.total = self.top = 0.0      # m, m/s
         self._anchor: tuple | None = None
 
-    def feed(self, block, min_status: int) -> float:
-        """Take a block of fixes, return the highest speed in it, m/s."""
-        fastest = 0.0
+    def feed(self, block, min_status: int, moving: bool) -> None:
+        """Take a block of fixes; moving: as the counter has it."""
         for lat, lon, stamp, variance, status in zip(
                 block.latitude, block.longitude, block.stamp_ns,
                 block.covariance_n[:, 0, 0], block.status, strict=True):
             if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
                 continue        # NaN among them
-            if self._anchor is None:
+            if self._anchor is None or not moving:
                 self._anchor = (lat, lon, stamp)
                 continue
             meridian, normal = radii(lat)
             step = np.hypot((lat - self._anchor[0]) * meridian,
                             (lon - self._anchor[1]) * normal * np.cos(lat))
-            if step > max(3.0, 3 * np.sqrt(variance) if variance > 0 else 0.0):
-                seconds = (stamp - self._anchor[2]) * 1e-9
+            apart_ns = stamp - self._anchor[2]
+            noise = 3 * np.sqrt(variance) if variance > 0 else 0.0
+            if step > max(3.0, noise) and apart_ns >= SPEED_NS:
                 self.total += float(step)
-                if seconds > 0:
-                    fastest = max(fastest, float(step / seconds))
+                self.top = max(self.top, float(step) * 1e9 / apart_ns)
                 self._anchor = (lat, lon, stamp)
-        return fastest
 
 
 class Clocks:
@@ -173,7 +178,6 @@ class Progress:
 
     def __init__(self) -> None:
         self.clocks = Clocks()
-        self.max_speed = 0.0
         self._travel: dict[str, Travel] = {}
         self._path = FixPath()
         self._zero = 0.0
@@ -188,12 +192,11 @@ class Progress:
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
             self._scale = nominal_scale(config, form, found_scale)
-            travel = self._travel.setdefault(slot, Travel(form))
-            self.max_speed = max(self.max_speed, travel.feed(block, self._scale))
+            self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
         elif slot == 'fix':
-            speed = self._path.feed(block, config.gnss.min_status)
-            if not self._scale:
-                self.max_speed = max(self.max_speed, speed)
+            travel = self._travel.get('odometer')
+            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDS_S
+            self._path.feed(block, config.gnss.min_status, moving)
 
     def heard_before(self, preroll_s: float) -> Heard:
         """Return what came so far that says what a leg can tell."""
@@ -212,10 +215,10 @@ class Progress:
 
     def begin_leg(self) -> None:
         """Count distance and speed from here."""
-        self.max_speed = 0.0
         self._path = FixPath()
         travel = self._travel.get('odometer')
-        self._zero = travel.total if travel else 0.0
+        if travel is not None:
+            self._zero, travel.top = travel.total, 0.0
 
     def distance_m(self) -> float:
         """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
@@ -223,6 +226,13 @@ class Progress:
         if travel is not None and self._scale > 0:
             return (travel.total - self._zero) * self._scale
         return self._path.total
+
+    def max_speed(self) -> float:
+        """Return the highest speed of the leg so far, m/s, over a second or more."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return travel.top * self._scale
+        return self._path.top
 
     def still_s(self) -> float:
         """Return how long the vehicle has stood by the odometer."""

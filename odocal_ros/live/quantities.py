@@ -44,19 +44,21 @@ def nothing_known() -> dict[str, str]:
     return dict.fromkeys(QUANTITIES, UNKNOWN)
 
 
-def of_outlook(outlook: Outlook | None, config: Config, two_wheels: bool) -> dict[str, str]:
+def of_outlook(outlook: Outlook | None, config: Config, two_wheels: bool,
+               lost: bool = False) -> dict[str, str]:
     """
     Return what is good enough in a leg that ends where the vehicle is.
 
     Unknown before the first look; a track width that is configured is not asked of the drive.
+    ``lost``: the leg would be rejected, and nothing of it is.
     """
     ok = nothing_known()
     if outlook is None:
-        return ok
+        return ok | dict.fromkeys(('scale', 'yaw', 'pitch'), NO) if lost else ok
     for name, quantity in QUANTITIES.items():
         if quantity.of_two_wheels and (not two_wheels or outlook.wheels is None):
             continue
-        good = _within(outlook.sigma(name), quantity.limit(config))
+        good = NO if lost else _within(outlook.sigma(name), quantity.limit(config))
         if good == NO and _given(name, config):
             good = UNKNOWN
         ok[name] = good

@@ -126,6 +126,11 @@ class Recording:
         """Return whether any message has come on any topic."""
         return any(one.health.heard_ns for one in self.inputs.by_slot.values())
 
+    def imu_silent_s(self) -> float:
+        """Return for how long the Imu has said nothing while others did."""
+        heard_ns = {slot: one.health.heard_ns for slot, one in self.inputs.by_slot.items()}
+        return max(0, max(heard_ns.values()) - heard_ns['imu']) * 1e-9
+
     def close(self) -> None:
         """Let go of the clock."""
         self._jumps.unregister()

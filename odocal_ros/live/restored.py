@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output.summary import values_in_words
+from odocal_ros.outside import one_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,11 +15,13 @@ class Restored:
     legs: int
     valid: bool
     stamp: str
+    vehicle: str = ''
 
     def words(self, unit: str) -> str:
         """Return it as a sentence; ``unit`` is that of scales by the odometer heard, or empty."""
         estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
                      for name, e in self.estimates.items()}
         use = '' if self.valid else ', which was rejected'
-        return (f'restored result of {self.stamp}{use}: {values_in_words(estimates)}; from '
+        whose = f' of vehicle {one_line(self.vehicle)}' if self.vehicle else ''
+        return (f'restored result of {self.stamp}{whose}{use}: {values_in_words(estimates)}; from '
                 f'{self.legs} leg{"s" * (self.legs != 1)}')

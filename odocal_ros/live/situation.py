@@ -7,6 +7,7 @@ from odocal_ros.config import Config
 from odocal_ros.live.ability import Ability
 from odocal_ros.live.outlook import Outlook
 from odocal_ros.live.session import Session, State
+from odocal_ros.reasons import Reason, Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,6 +17,7 @@ class Situation:
     session: Session
     config: Config
     missing: list[str] = field(default_factory=list)
+    doubled: list[str] = field(default_factory=list)     # topics with several publishers
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)
     results: dict = field(default_factory=dict)  # result.* parameters
@@ -27,6 +29,7 @@ class Situation:
     two_wheels: bool = False                     # the right wheel is heard by itself
     ability: Ability | None = None               # of the leg that is recorded
     outlook: Outlook | None = None               # of the leg that is recorded
+    faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
     outlook_age_s: float = nan                   # since the way it is of
     saved: str = ''
     lost: str = ''                               # a leg that nobody wanted dropped
@@ -41,3 +44,8 @@ class Situation:
         if self.session.state is State.IDLE and self.missing:
             return 'waiting'
         return self.session.state.value
+
+    @property
+    def lost_cause(self) -> bool:
+        """Return whether the leg that is recorded would be rejected as it is."""
+        return any(r.code.gravity is Verdict.REJECTED for r in self.faults)

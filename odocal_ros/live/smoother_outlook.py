@@ -62,8 +62,7 @@ def with_running(outlook: Outlook, running: Running, config: Config) -> Outlook:
     faults = [r for r in method.reasons
               if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
     if faults:      # its values are of no use then
-        first = faults[0]
-        return replace(outlook, fault=f'{first.code.name}: {first.text}. {first.remedy}')
+        return replace(outlook, faults=tuple(faults))
     if method.verdict is not Verdict.REJECTED:
         outlook = replace(outlook, methods=outlook.methods | {'smoother': method})
     given, _ = choose(outlook.methods, config.method)

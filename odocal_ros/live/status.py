@@ -20,6 +20,13 @@ from odocal_ros.reasons import Verdict
 
 NAME = 'calibrator: calibration'  # replay finds marks by this name
 # key: result.* parameter
+# decimals that mean something
+PLACES = dict.fromkeys((
+    'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
+    'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
+    'metres_to_go_yaw'), 1) | {
+        'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
+        'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4}
 VALUES = {
     'scale_factor': 'scale_factor', 'scale_factor_sigma': 'scale_factor_sigma',
     'yaw_mounting_angle_rad': 'yaw_mounting_angle',
@@ -52,6 +59,8 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'restored': now.restored,
         'standstill_s': now.still_s, 'max_speed_mps': now.max_speed,
         'metres_to_least': metres_to_go(now), 'seconds_to_stand': seconds_to_stand(now),
+        'asked_scale_sigma_ppm': now.config.verdict.max_scale_sigma * 1e6,
+        'asked_yaw_sigma_deg': math.degrees(now.config.verdict.max_yaw_sigma),
         'manoeuvres': '; '.join(manoeuvres(now)),
         'can_tell': ', '.join(now.ability.can) if now.ability else '',
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
@@ -61,19 +70,32 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
     } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
-        values=[KeyValue(key=k, value=_bare(v)) for k, v in keys.items()])
+        values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
+
+
+def in_force(now: Situation, name: str) -> float:
+    """Return a value or a sigma: of the running estimate in a leg, else of the result."""
+    if now.session.state is not State.RECORDING:
+        return now.results[f'result.{name}']
+    estimates = now.outlook.estimates if now.outlook else {}
+    estimate = estimates.get(name.removesuffix('_sigma'))
+    if estimate is None or estimate.value is None:
+        return math.nan
+    found = estimate.sigma if name.endswith('_sigma') else estimate.value
+    return math.nan if found is None else float(found)
 
 
 def level(now: Situation) -> bytes:
     """Return STALE before anything came, ERROR for what needs the operator, WARN for doubts."""
     state = now.session.state
-    if state in (State.FAILED, State.REJECTED):
+    if state in (State.FAILED, State.REJECTED) or now.lost_cause:
         return DiagnosticStatus.ERROR
     if state is State.IDLE and not now.heard:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
     doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
-                                or now.save_trouble or now.lost)
+                                or now.save_trouble or now.lost or now.faults
+                                or now.doubled)
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
@@ -97,17 +119,22 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (seen, good, now.lost, text, *troubles)))
+    return '; '.join(filter(None, (seen, good, now.lost, text, *now.doubled, *troubles)))
 
 
 def _reason_codes(now: Situation) -> str:
+    if now.session.state is State.RECORDING:
+        return ','.join(r.code.name for r in now.faults)
     calibration = now.session.calibration
     return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
 
-def _bare(value) -> str:
-    """Return a value as PlotJuggler reads it: numbers without unit, every digit."""
-    return repr(float(value)) if isinstance(value, float) else str(value)
+def _bare(value, places: int | None = None) -> str:
+    """Return a value as PlotJuggler reads it: a number without unit, to its last digit or less."""
+    if not isinstance(value, float):
+        return str(value)
+    return repr(float(value) if places is None or not math.isfinite(value)
+                else round(float(value), places))
 
 
 def input_status(name: str, health: Health, why: str, needed: bool,

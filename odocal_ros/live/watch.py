@@ -8,10 +8,12 @@ from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder, SLOTS
 from odocal_ros.live.answers import one_line
 from odocal_ros.live.foresight import Abandoned, outlook_of
+from odocal_ros.live.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.live.outlook import Outlook
 from odocal_ros.live.sketch import Sketch
 from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.worker import Worker
+from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.samples import join
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
@@ -30,6 +32,8 @@ class Watch:
     def __init__(self, worker: Worker, log) -> None:
         self._worker, self._log = worker, log
         self.outlook: Outlook | None = None
+        self._faults: tuple[Reason, ...] = ()
+        self._gaps: ImuGaps | None = None
         self._sketch: Sketch | None = None
         self._smoother = SmootherSoFar()
         self._before: LegRecorder | None = None
@@ -46,12 +50,14 @@ class Watch:
         self._over, self._start_ns, self._config = threading.Event(), start_ns, config
         self._sketch, self._before = Sketch(recorder.form), recorder
         self._smoother = SmootherSoFar()
+        self._gaps = ImuGaps(start_ns, config.leg.max_gap)
         self._due_ns = start_ns + EVERY_NS
 
     def end(self) -> None:
         """Let go of the leg."""
         self._over.set()
-        self.outlook = self._sketch = self._before = None
+        self.outlook = self._sketch = self._before = self._gaps = None
+        self._faults = ()
         self._fresh = []
         self._looking = self._warm = False
         self._pause_until = 0.0
@@ -60,6 +66,22 @@ class Watch:
         """Remember a block as it went into the recorder."""
         if self._sketch is not None:
             self._fresh.append((slot, block))
+            if slot == 'imu' and self._gaps is not None:
+                self._gaps.feed(block)
+
+    def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
+        """
+        Return what is wrong with the leg so far, one reason of a code, the gravest first.
+
+        silent_s : for how long the Imu has said nothing while others did.
+        """
+        if self._gaps is None:
+            return ()
+        seen = (*self._gaps.reasons(silent_s), *self._faults,
+                *(self.outlook.faults if self.outlook else ()))
+        first = {r.code: r for r in reversed(seen)}
+        order = list(Verdict)
+        return tuple(sorted(first.values(), key=lambda r: -order.index(r.code.gravity)))
 
     def look(self, newest_ns: int) -> None:
         """Have the worker look if it is time to."""
@@ -78,7 +100,7 @@ class Watch:
         if over.is_set():
             return
         self._looking = False
-        self.outlook, seconds, failure = look or (None, 0.0, error)
+        self.outlook, self._faults, seconds, failure = look or (None, (), 0.0, error)
         # the first look brings in the pre-roll, and modules: a cost that comes once
         self._pause_until = time.monotonic() + seconds / SHARE if self._warm else 0.0
         self._warm = True
@@ -88,21 +110,23 @@ class Watch:
 
 def _look(sketch: Sketch, before: LegRecorder | None, fresh: list, start_ns: int, config: Config,
           over: threading.Event, smoother: SmootherSoFar,
-          ) -> tuple[Outlook | None, float, Exception | None]:
+          ) -> tuple[Outlook | None, tuple[Reason, ...], float, Exception | None]:
     """
-    Return the outlook, the seconds of CPU it took and what went wrong; for the worker.
+    Return outlook, faults, the seconds of CPU it took and what went wrong; for the worker.
 
     Without what is done ever less often as a leg grows: that is a small share by itself.
     """
     begin = time.thread_time()
-    outlook, failure = None, None
+    outlook, found, failure = None, (), None
     try:
         _bring_up_to_date(sketch, before, fresh, over)
-        outlook = outlook_of(sketch.leg(start_ns), sketch.fix_rate(), config,
+        leg = sketch.leg(start_ns)
+        found = faults_in_cells(leg, config)
+        outlook = outlook_of(leg, sketch.fix_rate(), config,
                              lambda: not over.is_set(), smoother)
     except Exception as error:  # whatever is wrong with a look, the leg goes on
         failure = error
-    return outlook, time.thread_time() - begin - smoother.once_s, failure
+    return outlook, found, time.thread_time() - begin - smoother.once_s, failure
 
 
 def _bring_up_to_date(sketch, before, fresh, over) -> None:

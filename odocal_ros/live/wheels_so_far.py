@@ -10,10 +10,9 @@ from odocal_ros.config import Config, with_settings
 from odocal_ros.leg import Leg
 from odocal_ros.live.outlook import Outlook, Prospect, WheelsOutlook
 from odocal_ros.pipeline import calibrate
-from odocal_ros.reasons import Code, Verdict
+from odocal_ros.reasons import Verdict
 
 SHARE = 0.01         # of the variance: a source of less is not told
-FAULTS = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
 def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
@@ -25,11 +24,9 @@ def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
     if not len(leg.odometer_right.stamp_ns) or 'wheels' not in deciding(config.method):
         return outlook
     result = calibrate(leg, with_settings(config, {'method': 'wheels'}))
-    fault = next((f'{r.code.name}: {r.text}. {r.remedy}' for r in result.reasons
-                  if r.code in FAULTS), '')
     method = result.methods.get('wheels')
     if method is None or method.verdict is Verdict.REJECTED:
-        return replace(outlook, wheels=WheelsOutlook(None, None, fault))
+        return replace(outlook, wheels=WheelsOutlook(None, None))
     left, right, width = (_relative(method.estimates[name]) for name in (
         'scale_factor_left', 'scale_factor_right', 'track_width'))
     apart = None if left is None or right is None else max(left, right)
@@ -41,7 +38,7 @@ def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
         scale = replace(scale, metres=min(scale.metres, more))
     yaw = _better(outlook.yaw, method, 'yaw_mounting_angle',
                   method.estimates['yaw_mounting_angle'].sigma)
-    return replace(outlook, wheels=WheelsOutlook(apart, width, fault), scale=scale, yaw=yaw,
+    return replace(outlook, wheels=WheelsOutlook(apart, width), scale=scale, yaw=yaw,
                    methods=outlook.methods | {'wheels': method})
 
 

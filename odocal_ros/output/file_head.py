@@ -11,8 +11,11 @@ def head(calibration: Calibration, content: dict) -> str:
 
 
 def about(calibration: Calibration, content: dict) -> str:
-    """Return two lines: what made the file, when, from which bags, and with which result."""
-    bags = ', '.join(str(i['bag']) for i in content['inputs'] if i.get('bag')) or 'live'
+    """Return two lines: what made the file, when, of what, and with which result."""
+    inputs = content['inputs']
+    bags = ', '.join(str(i['bag']) for i in inputs if i.get('bag')) or 'live'
+    bags += ''.join(f', node {i["node"]}' for i in inputs if i.get('node'))
+    bags += f', vehicle {content["vehicle"]}' if content.get('vehicle') else ''
     return (f'{content["software"]}, {content["created"]}, {len(calibration.legs)} leg'
             f'{"s" * (len(calibration.legs) != 1)}, from: {one_line(bags)}\n'
             f'{sentence(calibration)}')

@@ -56,6 +56,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
               for name in ('before', 'after')}
     return _plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
+        'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
         'reasons': [r.as_dict() for r in calibration.reasons],
         'result': result,

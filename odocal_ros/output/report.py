@@ -76,7 +76,8 @@ def _context(calibration, config, content):
     methods = _leading(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
-        'title': ', '.join(bags) or 'live drive', 'created': _made(content['created']),
+        'title': content['vehicle'] or ', '.join(bags) or 'live drive',
+        'created': _made(content['created']),
         'verdict': calibration.verdict.value, 'meaning': MEANING[calibration.verdict],
         'sentence': sentence(calibration).partition(': ')[2],
         'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '

@@ -15,7 +15,7 @@ from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.leg_table import leg_table, LEGS
 from odocal_ros.outside import for_comment, for_launch, for_shell, for_xml_comment
 from odocal_ros.reasons import Verdict
-from odocal_ros.yaml_text import parameters
+from odocal_ros.yaml_text import no_date, parameters
 
 PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'
@@ -53,9 +53,10 @@ def _params(calibration, content) -> str:
         if name not in BESIDE:
             result |= {name: entry['value'], f'{name}_sigma': entry['sigma']}
     result |= {'legs': len(calibration.legs),
-               'valid': calibration.verdict is not Verdict.REJECTED, 'stamp': content['created']}
+               'valid': calibration.verdict is not Verdict.REJECTED,
+               'stamp': no_date(content['created']), 'vehicle': content['vehicle']}
     return (head(calibration, content)
-            + '# for the node calibrator: --params-file, or ros2 param load\n'
+            + '# for the node calibrator at its start: --ros-args --params-file THIS_FILE\n'
             '# scale factor: metres of travel per pulse (per rad for joints, 1 for speeds)\n'
             '# angles: rad, of the IMU on the vehicle about fixed axes; yaw > 0: its x axis '
             'points left of forward\n' + parameters({'result': result}))

@@ -25,7 +25,7 @@ def save(tmp_path):
     """Return a function that saves a calibration and returns the answer and where latest is."""
     worker = Worker()
     log = SimpleNamespace(info=lambda text: None, warning=lambda text: None)
-    filing = Filing(worker, log, lambda: None)
+    filing = Filing(worker, log, lambda: None, '/calibrator')
     config = with_settings(Config(), {'output.directory': str(tmp_path)})
 
     def run(calibration, asked=True):
@@ -55,7 +55,7 @@ def test_a_worse_result_needs_the_second_save(save):
 def test_what_cannot_be_saved_is_a_warning_until_it_is(tmp_path):
     worker, said = Worker(), []
     filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=said.append),
-                    lambda: None)
+                    lambda: None, '/calibrator')
 
     def save(folder):
         future = filing.save(GOOD, with_settings(Config(), {'output.directory': str(folder)}), {},
@@ -93,7 +93,7 @@ def test_the_answer_does_not_wait_for_the_report_and_a_leg_neither(tmp_path, mon
     monkeypatch.setattr('odocal_ros.output.files.report_or_why', lambda *_: (
         gate.wait(20), ('<html></html>', ''))[1])
     filing = Filing(worker, SimpleNamespace(info=lambda text: None, warning=done.append),
-                    lambda: None)
+                    lambda: None, '/calibrator')
     config = with_settings(Config(), {'output.directory': str(tmp_path)})
     future = filing.save(GOOD, config, {}, 'imu_link', NOW_NS, True)
     wait_for(lambda: worker.poll() or future.done(), 'the answer')

@@ -14,6 +14,7 @@ from odocal_ros.leg import LegRecorder
 from odocal_ros.live import foresight, watch
 from odocal_ros.live.foresight import Abandoned, DriveSoFar, outlook_of
 from odocal_ros.live.guidance import hint
+from odocal_ros.live.leg_so_far import faults_in_cells
 from odocal_ros.live.outlook import as_keys, Outlook, Prospect
 from odocal_ros.live.session import Session
 from odocal_ros.live.situation import Situation
@@ -23,6 +24,7 @@ from odocal_ros.live.watch import EVERY_NS, Watch
 from odocal_ros.live.wheels_so_far import with_wheels
 from odocal_ros.live.worker import Worker
 from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code
 from odocal_ros.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -339,7 +341,7 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
 
     def dear(*args):
         looks.append(1)
-        return Outlook(GOOD, GOOD), 1.0, None        # a second of CPU
+        return Outlook(GOOD, GOOD), (), 1.0, None    # a second of CPU
 
     monkeypatch.setattr(watch, '_look', dear)
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
@@ -391,7 +393,7 @@ def test_two_wheels_are_foreseen_as_they_come_out(two):
     assert outlook.scale.metres == 0.0
     assert outlook.scale.sources
     assert outlook.wheels.track_width < 0.05
-    assert (outlook.wheels.fault, outlook.yaw.why) == ('', 'not told')
+    assert outlook.yaw.why == 'not told'
 
 
 def test_the_metres_still_to_go_are_enough_and_no_more_than_the_end_points_need(two):
@@ -414,11 +416,10 @@ def test_a_method_of_one_travel_and_a_single_counter_leave_the_outlook_alone(two
 def test_swapped_wheels_are_said_while_it_is_driven(two):
     leg = two.leg()
     swapped = replace(leg, odometer=leg.odometer_right, odometer_right=leg.odometer)
-    before = Outlook(GOOD, NO_YAW)
-    found = with_wheels(before, swapped, with_settings(Config(), {
+    found = faults_in_cells(swapped, with_settings(Config(), {
         'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
-    assert found.wheels.fault.startswith('WHEELS_SWAPPED')
-    assert 'Exchange odometer.left' in found.wheels.fault
+    assert found[0].code is Code.WHEELS_SWAPPED
+    assert 'Exchange odometer.left' in found[0].remedy
 
 
 # what is said

@@ -7,7 +7,7 @@ import pytest
 
 from odocal_ros.config import Config, with_settings
 from odocal_ros.live.health import Health
-from odocal_ros.live.progress import Clocks, FixPath, nominal_scale, Travel
+from odocal_ros.live.progress import Clocks, FixPath, nominal_scale, Progress, Travel
 from odocal_ros.samples import FixSamples, OdometerForm, OdometerSamples, take
 
 SECOND = 1_000_000_000
@@ -198,11 +198,11 @@ def test_fix_path_counts_steps_not_noise():
                        np.zeros(n), np.tile(np.eye(3) * 0.25, (n, 1, 1)), np.full(n, 2),
                        np.zeros(n))
     path = FixPath()
-    speed = path.feed(block, 0)
+    path.feed(block, 0, moving=True)
     assert path.total == pytest.approx(63.6, abs=0.7)   # the jitter may shift the first anchor
-    assert speed == pytest.approx(6.36, abs=0.7)
+    assert path.top == pytest.approx(6.36, abs=0.7)
     nothing = FixPath()
-    nothing.feed(replace(block, status=np.full(n, -1)), 0)
+    nothing.feed(replace(block, status=np.full(n, -1)), 0, moving=True)
     assert nothing.total == 0.0
 
 
@@ -216,8 +216,40 @@ def test_a_fix_from_nowhere_is_no_way(odd):
     latitude[2] = odd
     path = FixPath()
     with np.errstate(all='raise'):
-        assert path.feed(replace(block, latitude=latitude), 0) == 0.0
-    assert path.total == 0.0
+        path.feed(replace(block, latitude=latitude), 0, moving=True)
+    assert (path.total, path.top) == (0.0, 0.0)
+
+
+def test_fix_noise_is_no_way_while_the_counter_stands():
+    """Half a minute of rest under fixes good to 2.5 m, then 20 s at 10 m/s, scale unknown."""
+    rng, progress = np.random.default_rng(3), Progress()
+    t = np.arange(0.0, 50.0, 0.2)
+    way = np.clip(t - 30.0, 0.0, None) * 10.0
+    for k in range(len(t)):
+        counts = rows(t[k:k + 1] + 1000, np.array([int(way[k] / 0.02)]))
+        noise = 2.5 * rng.standard_normal(2) / 6.37e6
+        fix = FixSamples(counts.stamp_ns, counts.received_ns, [0.7 + way[k] / 6.37e6 + noise[0]],
+                         [0.1 + noise[1]], [0.0], np.eye(3)[None] * 6.25, [2], [0])
+        progress.feed('odometer', counts, Config(), COUNTER, float('nan'))
+        progress.feed('fix', fix, Config(), COUNTER, float('nan'))
+        if t[k] < 30.0:
+            assert (progress.distance_m(), progress.max_speed()) == (0.0, 0.0)
+    assert progress.distance_m() == pytest.approx(200.0, rel=0.15)
+    assert 9.0 < progress.max_speed() < 20.0
+    # the scale of the running estimate, once there is one
+    progress.feed('odometer', rows([1050.0], np.array([int(way[-1] / 0.02)])), Config(), COUNTER,
+                  0.02)
+    assert progress.distance_m() == pytest.approx(way[-1], abs=0.1)
+    assert progress.max_speed() == pytest.approx(10.0, abs=0.1)
+
+
+def test_counts_that_come_in_a_burst_are_no_speed():
+    travel = Travel(COUNTER)
+    t = np.arange(0.0, 20.0, 0.02)
+    late = np.where(t % 5.0 < 0.12, t - t % 5.0 + 0.12 + (t % 5.0) / 100, t)
+    for k in range(len(t)):
+        travel.feed(rows(late[k:k + 1] + 1000, np.array([int(10 * t[k] / 0.02)])), 0.02)
+    assert travel.top * 0.02 == pytest.approx(10.0, rel=0.15)
 
 
 def test_clocks_are_compared_between_rows_that_arrived_together():

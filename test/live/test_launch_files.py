@@ -27,8 +27,9 @@ def test_both_start_the_same_nodes(given):
                for _, description in declared_xml.values())
     assert set(given) <= set(declared_xml)
     assert python == xml
-    assert [node.executable for node in python] == ['calibrator'] + [
-        'rviz2'] * (given.get('rviz') == 'true')
+    # RViz first: where it is not installed launch ends, and would leave the node behind
+    assert [node.executable for node in python] == [
+        'rviz2'] * (given.get('rviz') == 'true') + ['calibrator']
 
 
 def test_every_input_can_be_remapped_and_stays_where_it_is_by_itself():
@@ -39,7 +40,7 @@ def test_every_input_can_be_remapped_and_stays_where_it_is_by_itself():
 
 
 def test_the_files_named_are_installed():
-    _, (node, rviz) = of_xml(XML, {'rviz': 'true'})
+    _, (rviz, node) = of_xml(XML, {'rviz': 'true'})
     setup = (ROOT / 'setup.py').read_text()
     for path in (Path(node.parameters[0]), Path(rviz.arguments[1])):
         assert path.exists()

@@ -9,6 +9,9 @@ import time
 from bench import answer_of, NODE, NodeProcess, PATIENCE, ROOT, wait_for
 from player import messages_of, part, Player, Sent
 import pytest
+from rcl_interfaces.msg import Parameter
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import get_parameter_value
 
 from odocal_ros.bagio import encode
 from odocal_ros.config import SETTINGS
@@ -37,6 +40,9 @@ def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     assert node.end(how) == 0
     assert 'Traceback' not in node.text
     assert 'rror' not in node.text
+    kept = node.lines[-1]
+    assert kept.startswith('calibrator: leg 1 was not stopped: what was driven is in /')
+    assert kept.endswith('_leg_1 computes it')
 
 
 def test_a_signal_before_anything_ran_is_clean_too(start, connect):
@@ -100,6 +106,12 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     assert client.set(leg__min_distance=250.0).successful
     assert client.get('leg.min_distance') == [250.0]
     assert client.set(imu__gyro_noise=math.nan).successful
+    assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
+    # as ros2 param set sends an empty list: of no type, which becomes one of booleans
+    empty = Parameter(name='reference.start', value=get_parameter_value('[]'))
+    answer = answer_of(client.send(SetParameters, 'set_parameters',
+                                   SetParameters.Request(parameters=[empty])))
+    assert answer.results[0].successful, answer.results[0].reason
     assert client.set(reference__start=[40.0, 116.0, 50.0, 0.02]).successful
     for value, words in (({'leg__min_distance': 0.5}, 'out of range'),
                          ({'leg__min_distance': 3}, 'Wrong parameter type'),
@@ -370,10 +382,25 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
         assert health['dropped'] == '0'
 
 
-def test_results_go_to_the_ros_home_by_default(domain, tmp_path, monkeypatch):
-    from odocal_ros.config import Config
+def test_each_node_has_a_folder_of_its_own_in_the_ros_home(domain, tmp_path, monkeypatch):
+    from odocal_ros.config import Config, with_settings
     from odocal_ros.live.outputs import output_root
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
-    assert output_root(Config()) == tmp_path / 'odocal'
+    assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
+    assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'
     monkeypatch.delenv('ROS_HOME')
-    assert str(output_root(Config())) == os.path.expanduser('~/.ros/odocal')
+    assert str(output_root(Config(), '/calibrator')) == os.path.expanduser(
+        '~/.ros/odocal/calibrator')
+    assert str(output_root(with_settings(Config(), {'output.directory': '/x'}), '/a')) == '/x'
+
+
+def test_the_result_of_another_vehicle_is_not_restored(start, connect):
+    of_three = ['-p', 'result.scale_factor:=0.02', '-p', 'result.scale_factor_sigma:=0.00001',
+                '-p', 'result.valid:=true', '-p', 'result.vehicle:=car 3']
+    refused = NodeProcess(*of_three, '-p', 'vehicle:=car 4')
+    assert refused.wait() == 1
+    line, = refused.lines
+    assert "the result given is of vehicle 'car 3', and this node calibrates 'car 4'" in line
+    start(*of_three, '-p', 'vehicle:=car 3')
+    client = connect()
+    assert 'of vehicle car 3' in client.call('stop_leg').message

@@ -33,7 +33,7 @@ KEYS = ['state', 'leg_id', 'leg_start_ns', 'leg_stop_ns', 'leg_event', 'distance
 ESTIMATES = ['scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle']
 OF_TWO_WHEELS = ['scale_factor_left', 'scale_factor_right', 'heading_error', 'track_width']
 RESULTS = ([f'result.{name}{end}' for name in ESTIMATES + OF_TWO_WHEELS for end in ('', '_sigma')]
-           + ['result.legs', 'result.valid', 'result.stamp'])
+           + ['result.legs', 'result.valid', 'result.stamp', 'result.vehicle'])
 
 
 @pytest.fixture(scope='module')
@@ -313,7 +313,7 @@ def test_results_are_set_in_one_event(session):
     assert sorted(p.name for p in event.changed_parameters) == sorted(RESULTS)
     assert session.results['result.valid'] is True
     assert session.results['result.legs'] == 1
-    assert session.results['result.stamp'].endswith('Z')
+    assert session.results['result.stamp'].endswith(' UTC')
 
 
 def test_paths_are_latched_and_decimated(session, connect):

@@ -14,6 +14,7 @@ from odocal_ros.live.outlook import Outlook, Prospect, WheelsOutlook
 from odocal_ros.live.restored import Restored
 from odocal_ros.live.session import Session
 from odocal_ros.live.situation import Situation
+from odocal_ros.live.status import level
 from odocal_ros.reasons import Code, Reason
 
 CONFIG = Config()
@@ -147,10 +148,21 @@ def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
                                     max_speed=10.0)) == []
 
 
-def test_a_broken_wheel_is_said_before_all_else():
-    outlook = Outlook(GOOD, YAW, None, WheelsOutlook(None, None, 'WHEEL_DEAD: the left. Mend it'))
-    assert hint(recording(outlook=outlook, distance_m=500.0)) == (
-        'WHEEL_DEAD: the left. Mend it; call ~/cancel_leg')
+def test_a_leg_that_would_be_rejected_is_said_before_all_else():
+    enough = Outlook(GOOD, YAW, 0.001)
+    dead = (Reason(Code.WHEEL_DEAD, 'the left'),)
+    now = recording(outlook=enough, distance_m=500.0, faults=dead, missing=['no Imu for 3 s'])
+    assert hint(now).startswith('call ~/cancel_leg and start again: the leg would be rejected: '
+                                'WHEEL_DEAD: the left. Check the sensor')
+    assert hint(now).endswith('; no Imu for 3 s')
+    assert set(quantities_ok(now).values()) == {'no', 'unknown'}
+    assert (level(now), level(recording(outlook=enough))) == (b'\x02', b'\x00')
+    # a caution is no reason to drive again: it is said, and the rest as before
+    doubt = (Reason(Code.COUNTER_RESET, 'by -70'),)
+    told = hint(recording(outlook=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
+                          faults=doubt))
+    assert told.startswith('COUNTER_RESET: by -70; enough: ')
+    assert level(recording(faults=doubt)) == b'\x01'
 
 
 def test_seconds_to_stand():

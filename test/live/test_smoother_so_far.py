@@ -21,6 +21,7 @@ from odocal_ros.live.smoother_carried import carried, rows_of
 from odocal_ros.live.smoother_outlook import look, with_running
 from odocal_ros.live.smoother_so_far import PASSES, SmootherSoFar
 from odocal_ros.pipeline import calibrate
+from odocal_ros.reasons import Code
 from odocal_ros.samples import take
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -261,13 +262,16 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(config, looks, method
     backwards = replace(leg, odometer=replace(leg.odometer, value=-leg.odometer.value))
     asked = with_settings(config, {'method': method})
     found = outlook_of(backwards, 5.0, asked, smoother=SmootherSoFar())
-    assert found.fault.startswith('ODOMETER_REVERSED: the odometer runs against the Imu')
+    fault = found.faults[0]
+    assert (fault.code, fault.text[:33]) == (Code.ODOMETER_REVERSED,
+                                             'the odometer runs against the Imu')
     assert found.estimates.get('scale_factor') is None      # no value that would be thrown away
     session = Session()
     session.start(1, asked)
-    told = hint(Situation(session, asked, outlook=found, distance_m=900.0, max_speed=10.0))
-    assert told.startswith('the leg would be rejected: ODOMETER_REVERSED')
-    assert outlook_of(leg, 5.0, asked, smoother=SmootherSoFar()).fault == ''
+    told = hint(Situation(session, asked, outlook=found, faults=found.faults, distance_m=900.0,
+                          max_speed=10.0))
+    assert 'the leg would be rejected: ODOMETER_REVERSED' in told
+    assert outlook_of(leg, 5.0, asked, smoother=SmootherSoFar()).faults == ()
 
 
 def test_the_metres_and_the_stops_foreseen_are_about_those_it_takes(drive, config):

@@ -17,8 +17,8 @@ INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 
 def test_json_has_the_fixed_shape(good):
     content = as_json(good, Config(), INPUTS, CREATED)
-    assert list(content) == ['schema', 'software', 'created', 'verdict', 'reasons', 'result',
-                             'methods', 'legs', 'check', 'inputs', 'config']
+    assert list(content) == ['schema', 'software', 'created', 'vehicle', 'verdict', 'reasons',
+                             'result', 'methods', 'legs', 'check', 'inputs', 'config']
     assert content['schema'] == 1
     assert content['software'] == f'odocal_ros {__version__}'
     assert content['verdict'] == 'accepted'

@@ -33,7 +33,18 @@ def test_the_parameter_file_restores_the_node(good):
     assert math.isnan(result['pitch_mounting_angle'])
     assert result['legs'] == 1
     assert result['valid'] is True
-    assert result['stamp'] == CREATED
+    assert result['stamp'] == '2026-01-02 03:04:05 UTC'     # no date to YAML, quoted or not
+    assert yaml.safe_load(result['stamp']) == result['stamp']
+
+
+def test_ros2_param_load_reads_every_value(good, tmp_path):
+    """By its own function: it reads each value a second time, as text."""
+    load = pytest.importorskip('rclpy.parameter').parameter_dict_from_yaml_file
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(texts(good)['calibration.yaml'])
+    loaded = load(str(path), use_wildcard=True)
+    assert loaded['result.stamp'].value.string_value == '2026-01-02 03:04:05 UTC'
+    assert loaded['result.scale_factor'].value.double_value == 0.05
 
 
 def test_the_parameter_file_has_every_name_the_node_declares(good, nothing):

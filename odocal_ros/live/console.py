@@ -1,0 +1,63 @@
+"""What the node says on its console by itself: what it waits for, that it is ready, what fails."""
+
+from odocal_ros.live.situation import Situation
+
+FIRST_NS = 5_000_000_000       # of waiting, before it is said
+SELDOM_NS = 60_000_000_000     # and then
+
+
+class Console:
+    """
+    Turns what changes into lines of the log; what stays is repeated seldom.
+
+    ``tell`` is given every situation, with the time of a clock that never stands.
+    """
+
+    def __init__(self, log) -> None:
+        self._log = log
+        self._ready = False          # has been said
+        self._doubled: set[str] = set()      # said
+        self._silence = False        # has been said
+        self._due_ns = 0             # when the next word about what is missing is due
+        self._pause_ns = FIRST_NS
+        self._leg: tuple = ()        # the leg whose faults are said, and which
+
+    def tell(self, now: Situation, steady_ns: int) -> None:
+        """Say what is new."""
+        self._faults(now)
+        for text in set(now.doubled) - self._doubled:
+            self._doubled.add(text)
+            self._log.warning(text)
+        if now.missing:
+            self._missing(now, steady_ns)
+        else:
+            self._complete(now)
+
+    def _missing(self, now: Situation, steady_ns: int) -> None:
+        if not self._due_ns:     # what has been there and falls silent is said at once
+            self._due_ns = steady_ns + (0 if self._ready else FIRST_NS)
+        if steady_ns >= self._due_ns:
+            self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(now.missing))
+            self._silence = True
+            self._pause_ns = min(2 * self._pause_ns, SELDOM_NS)
+            self._due_ns = steady_ns + self._pause_ns
+
+    def _complete(self, now: Situation) -> None:
+        self._due_ns, self._pause_ns = 0, FIRST_NS
+        if not self._ready:
+            rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
+            self._log.info(f'ready ({rates}): stand still for 10 s, then call ~/start_leg')
+        elif self._silence:
+            self._log.info('all inputs are there again')
+        self._ready, self._silence = True, False
+
+    def _faults(self, now: Situation) -> None:
+        """Say what is wrong with the leg that is recorded, each once."""
+        leg_id = now.session.leg_id
+        if not self._leg or self._leg[0] != leg_id:
+            self._leg = leg_id, set()
+        for fault in now.faults:
+            if fault.code not in self._leg[1]:
+                self._leg[1].add(fault.code)
+                self._log.warning(f'leg {leg_id}: {fault.code.name}: {fault.text}. '
+                                  f'{fault.remedy}')

@@ -1,0 +1,68 @@
+"""A terminal panel of ``~/status``: state, what to do, bars of what is enough."""
+
+from math import isfinite
+
+from rich.console import Group
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
+REST_S = 10.0
+
+
+def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
+    """Return a status (its keys and values as sent) as one panel."""
+    colour = COLOURS.get(level, 'white')
+    state = Text(status.get('state', ''), style=f'bold {colour}')
+    for text, key in (('distance', 'distance_m'), ('time', 'duration_s')):
+        state.append(f'   {text} {status.get(key, "")} {key[-1]}', style='default')
+    rates = '   '.join(f'{slot} {status.get(f"{slot}_rate_hz", "")} Hz'
+                       for slot in ('imu', 'odometer', 'fix'))
+    return Panel(Group(state, Text(hint, style='bold'), _bars(status), Text(_values(status)),
+                       Text(rates, style='dim')), title=name, border_style=colour)
+
+
+def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
+    """Return how much of what is asked is there: label -> (0 to 1, in words)."""
+    way, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
+    stand = number(status, 'seconds_to_stand')
+    found = {'way': (way / (way + lacks) if way + lacks > 0 else 0.0, f'{lacks:.0f} m to go'),
+             'standing': (1 - stand / REST_S, f'{stand:.0f} s to go')}
+    for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
+        asked = number(status, f'asked_{name}_sigma_{unit}')
+        sigma = number(status, f'predicted_{name}_sigma_{unit}')
+        # a sigma falls with the way or its root: its share of what is asked is a modest measure
+        share = min(asked / sigma, 1.0) if sigma > 0 else 0.0
+        known = f'{sigma:.3g} {unit}' if sigma > 0 else 'not known'
+        found[name] = share, f'{known}, asked {asked:.3g}'
+    return found
+
+
+def number(status: dict[str, str], key: str) -> float:
+    """Return a value of the status, 0 where there is none."""
+    try:
+        value = float(status.get(key, ''))
+    except ValueError:
+        return 0.0
+    return value if isfinite(value) else 0.0
+
+
+def _bars(status) -> Table:
+    grid = Table.grid(padding=(0, 1))
+    for label, (share, words) in shares(status).items():
+        full = share >= 1.0
+        grid.add_row(label, ProgressBar(1.0, max(share, 0.0), width=40, complete_style=(
+            'green' if full else 'yellow'), finished_style='green'), 'enough' if full else words)
+    return grid
+
+
+def _values(status) -> str:
+    running = status.get('state') == 'recording'
+    prefix = 'estimate_' if running else ''
+    keys = (('scale factor', 'scale_factor', 'scale_factor_sigma'),
+            ('yaw, rad', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad'))
+    said = [f'{label} {number(status, prefix + value):.7g} ± {number(status, prefix + sigma):.2g}'
+            for label, value, sigma in keys if number(status, prefix + value)]
+    return '   '.join(said) or 'no value yet'

@@ -1,0 +1,54 @@
+"""Hears a calibrator's latched status and hint from another process."""
+
+from collections.abc import Iterator
+
+from diagnostic_msgs.msg import DiagnosticArray
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class StatusListener:
+    """A node of its own that waits for statuses; a context manager and an iterator over them."""
+
+    def __init__(self, node_name: str) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node('odocal_watch', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._status: DiagnosticArray | None = None
+        self._hint: str | None = None
+        name = f'/{node_name.strip("/")}'
+        self._node.create_subscription(DiagnosticArray, f'{name}/status', self._hear, LATCHED)
+        self._node.create_subscription(String, f'{name}/hint', self._hear_hint, LATCHED)
+
+    def _hear(self, array: DiagnosticArray) -> None:
+        self._status = array
+
+    def _hear_hint(self, message: String) -> None:
+        self._hint = message.data
+
+    def __enter__(self) -> 'StatusListener':
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def __iter__(self) -> Iterator[tuple[bytes, dict[str, str], str]]:
+        """Yield (level, key -> value, what to do) of each status, until told to end."""
+        try:
+            while self._context.ok():
+                self._executor.spin_once(timeout_sec=0.5)
+                if self._status is not None and self._hint is not None:
+                    status = self._status.status[0]
+                    self._status = None
+                    yield (status.level, {kv.key: kv.value for kv in status.values}, self._hint)
+        except ExternalShutdownException:
+            return

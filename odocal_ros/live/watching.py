@@ -1,0 +1,34 @@
+"""``odocal watch``: the status of a running node as a panel in the terminal."""
+
+from odocal_ros.errors import BadUsage
+
+NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
+         'rclpy': "source ROS 2 Jazzy, or pip install 'odocal_ros[ros]'"}
+
+
+def add_arguments(parser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument('node', nargs='?', default='/calibrator',
+                        help='full name of the node (default: /calibrator)')
+    parser.add_argument('--once', action='store_true',
+                        help='show the first status that comes and end')
+
+
+def run(args) -> int:
+    """Show the panel until Ctrl-C."""
+    try:
+        from rich.live import Live
+
+        from odocal_ros.live.panel import panel
+        from odocal_ros.live.status_listener import StatusListener
+    except ModuleNotFoundError as error:
+        name = (error.name or '').partition('.')[0]
+        raise BadUsage(f'odocal watch needs the package {name}: '
+                       f'{NEEDS.get(name, NEEDS["rclpy"])}') from None
+    waiting = panel(b'\x03', args.node, {'state': f'no status on {args.node}/status yet'}, '')
+    with StatusListener(args.node) as listener, Live(waiting, auto_refresh=False) as shown:
+        for level, status, hint in listener:
+            shown.update(panel(level, args.node, status, hint), refresh=True)
+            if args.once:
+                break
+    return 0

@@ -1,0 +1,62 @@
+"""What the node says on its console: what it waits for, readiness, silence, faults."""
+
+from types import SimpleNamespace
+
+from bench import wait_for
+
+from odocal_ros.config import Config
+from odocal_ros.live.console import Console
+from odocal_ros.live.session import Session
+from odocal_ros.live.situation import Situation
+from odocal_ros.reasons import Code, Reason
+
+SECOND = 10**9
+
+
+def test_each_thing_is_said_once_or_seldom():
+    said = []
+    console = Console(SimpleNamespace(info=lambda x: said.append(('info', x)),
+                                      warning=lambda x: said.append(('warning', x))))
+    session = Session()
+
+    def tell(second, **known):
+        before = len(said)
+        console.tell(Situation(session, Config(), **known), second * SECOND)
+        return said[before:]
+
+    nothing = {'missing': ['no Imu on /imu/data']}
+    times = [s for s in range(1, 300) if tell(s, **nothing)]
+    assert times[:3] == [6, 16, 36]                      # 5 s, then ever more seldom
+    assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 60
+    assert tell(300, rates_hz={'imu': 100.0})[0] == (
+        'info', 'ready (imu 100 Hz): stand still for 10 s, then call ~/start_leg')
+    assert tell(301) == []
+    assert tell(302, **nothing) == [('warning', 'no Imu on /imu/data')]       # at once now
+    assert tell(303, **nothing) == []
+    assert tell(304) == [('info', 'all inputs are there again')]
+    two = {'doubled': ['/ticks has 2 publishers (/a, /b)']}
+    assert tell(305, **two) == [('warning', two['doubled'][0])]
+    assert tell(306, **two) == []
+    gap = {'faults': (Reason(Code.IMU_GAP, 'the Imu is missing for 3 s'),)}
+    for _ in range(2):                                   # of each leg
+        session.start(1, Config())
+        (level, text), = tell(307, **gap)
+        assert text.startswith(f'leg {session.leg_id}: IMU_GAP: the Imu is missing for 3 s. Mend')
+        assert tell(308, **gap) == []
+        session.cancel()
+
+
+def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connect):
+    from sensor_msgs.msg import Imu
+    from std_msgs.msg import Int64
+    node, client = start(), connect()
+    client.node.create_publisher(Imu, '/my_imu', 10)
+    for _ in range(2):
+        client.node.create_publisher(Int64, '/odometer', 10)
+    line = wait_for(lambda: next((x for x in node.lines if 'waiting: ' in x), ''), 'a word')
+    assert 'no Imu on /imu/data: 0 publishers found' in line
+    assert '(did you mean /my_imu?)' in line
+    doubled = wait_for(lambda: next((x for x in node.lines if '2 publishers' in x), ''), 'a word')
+    assert f'/odometer has 2 publishers (/{client.node.get_name()}' in doubled
+    assert client.call('start_leg').success is False
+    wait_for(lambda: '~/start_leg refused: no leg can be started' in node.text, 'the refusal')
