@@ -95,8 +95,9 @@ class LegRun:
         if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
             distance *= scale.value / self.rough
         shown = tracks(self, paths[scale.method])
-        methods = {name: m if paths[name] is None else replace(
-            m, details=m.details | check_of(self, paths[name])) for name, m in methods.items()}
+        methods = {name: m if path is None else replace(
+            m, details=m.details | check_of(self, path.after))
+            for (name, m), path in zip(methods.items(), paths.values(), strict=True)}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
                           deciding=deciding(self.config.method), **shown)
 

@@ -85,6 +85,8 @@ class Code(Enum):
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
     TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
                                'fixes; drive again on a firm straight road with open sky.')
+    CHECK_WORSE = CAUTION, ('Keep what you had; look in the report where the track leaves the '
+                            'fixes (slip, gaps, bad fixes), and drive again.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '
                            'the sigma was widened by the slip seen.')
     SCALE_VARIES = NOTE, ('Nothing; for one number that holds longer, drive with warm tyres at '

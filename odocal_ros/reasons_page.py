@@ -110,6 +110,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '(`leg.max_yaw_rate`), where wheels run ways of their own.',
         Code.TRACK_MISMATCH: 'Even with the calibrated values the track is farther from the fixes '
         'than noise, drift and 0.2 % of the distance explain. Something else is wrong.',
+        Code.CHECK_WORSE: 'Of pieces of 100 m, 500 m or 1 km, each begun anew at a fix, the track '
+        'with the calibrated values ends farther from the fixes than the one without, beyond '
+        'chance. Both have the same attitude, so the values are to blame: slip, bad fixes or a '
+        'delay went into them.',
         Code.WHEEL_SLIP: 'Over a few seconds the wheel turned farther, or less far, than the '
         'vehicle accelerated, or the two wheels do not fit the turn.',
         Code.SCALE_VARIES: 'Tyres grow with speed and as they warm: the scale is not one number '

@@ -20,7 +20,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
-from odocal_ros.leg_tracks import near
+from odocal_ros.leg_tracks import as_configured, near, Paths
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
@@ -36,7 +36,7 @@ def two_point(run):
 
     Returns
     -------
-    MethodResult, and the antenna's path (t to (n, 3), but for a constant); None where refused.
+    MethodResult, and the antenna's Paths; None where refused.
 
     """
     return TwoPointRun(run).result()
@@ -68,7 +68,9 @@ class TwoPointRun:
         self._reversed(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
             method.estimates, self.run.nominal, self.config)))
-        return method, self.run.path(method.details['f'])
+        f = method.details['f']
+        return method, Paths(*map(self.run.path, (
+            as_configured(self.run, f, method.estimates), f)))
 
     def _slips(self, chord, f):
         """Return slips of the mean between the marks, s and m; name those not named already."""

@@ -12,7 +12,7 @@ from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import DEG, known, MEANING, sentence
-from odocal_ros.output.track_table import overall
+from odocal_ros.output.track_table import check_table
 from odocal_ros.reasons import Reason, Verdict
 
 NAME = 'report.html'
@@ -71,8 +71,6 @@ def report_or_why(calibration: Calibration, config: Config, content: dict) -> tu
 def _context(calibration, config, content):
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
-    checks = [overall([(getattr(leg, name), leg.fixes) for leg in legs])
-              for name in ('before', 'after')]
     methods = _leading(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
@@ -82,7 +80,7 @@ def _context(calibration, config, content):
         'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
                f'{time_span(duration)}',
         'values': tables.value_rows(calibration), 'rotation': _degrees(calibration),
-        'reasons': grouped(calibration.reasons), 'check': tables.check_rows(*checks),
+        'reasons': grouped(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
         'inputs': content['inputs'],
         'settings': tables.changed_settings(config),
@@ -153,7 +151,7 @@ def _leg(number, leg: LegResult, figures, several):
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
             'budgets': _budgets(methods) if several else [],
-            'check': tables.check_rows(leg.before, leg.after) if several else [],
+            'check': check_table((leg,)),
             'reasons': grouped(leg.reasons) if several else [],
             'left_out': rows, 'findings': findings}
 

@@ -51,7 +51,7 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
                                  (False, False, False)):
         parts = [_head(calibration, styled), _values(calibration, width),
                  _leg_table(calibration.legs, width), _method_table(calibration),
-                 track_lines(calibration.legs),
+                 track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
                  reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)

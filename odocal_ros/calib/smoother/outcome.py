@@ -229,9 +229,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
                        'turned': float(turned), 'in_turns': problem.turned,
                        'standing': float(problem.still.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
-        # what dead reckoning begins with: a bias that holds for the whole leg
-        'start': {'t': float(state.t[0]), 'C_nb': state.C_nb[0],
-                  'gyro_bias': state.gyro_bias.mean(axis=0)},
+        'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
     }
 
 
