@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
 from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.combination import combine
@@ -52,7 +53,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         seen = {r.code for r in reasons}
         return leg_result(leg, inputs, reasons + [r for r in missing if r.code not in seen])
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
-    reasons += sanity
+    reasons += with_axes(sanity, inputs)
     if z_down:
         inputs = turned_over(inputs)
     if UNUSABLE & {r.code for r in sanity}:

@@ -57,8 +57,8 @@ class Code(Enum):
                          'imu.gyro_scale.')
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '
                                  'axes are forward-right-down.')
-    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; odocal '
-                        'inspect suggests it.')
+    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; where '
+                        'the drive shows how the Imu sits, the values are named.')
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the like, to what '
                                      'the Imu is; a gyro that sends deg/s looks so too: '
                                      'imu.gyro_scale.')
@@ -100,15 +100,18 @@ class Code(Enum):
     GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
                                     'longer standstill, or another heading source.')
     HEADING_UNAVAILABLE = CAUTION, 'Check the heading source, or set alignment.heading_source.'
-    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that gives ellipsoidal height.'
+    PITCH_NOT_DETERMINED = NOTE, ('Drive longer, with stops and starts, or use a receiver that '
+                                  'gives good ellipsoidal heights.')
     SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
                                        'odometer; odometer.max_scale_deviation is the limit.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
-                                      'at both marks), or combine more legs.')
-    YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of '
-                                    'their own.')
+                                      'at both marks), or combine more legs; '
+                                      'verdict.max_scale_sigma is the limit.')
+    YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, give a better '
+                                    'heading, or combine legs; verdict.max_yaw_sigma is the '
+                                    'limit.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     # left and right wheel
     ODOMETER_CHOSEN = NOTE, ('Nothing, if that is right; else name them: odometer.left and '
@@ -168,15 +171,16 @@ class Code(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A code with what was seen: one sentence with the figures."""
+    """A code with what was seen: one sentence with the figures; ``do`` where that tells more."""
 
     code: Code
     text: str
+    do: str = ''
 
     @property
     def remedy(self) -> str:
         """Return what the reader can do about it."""
-        return self.code.remedy
+        return self.do or self.code.remedy
 
     def as_dict(self) -> dict:
         """Return the entry of calibration.json."""

@@ -111,12 +111,12 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     fix, t_fix = rows('fix')
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
+    _gaps('fix', t_fix, found)       # of the stream: what is screened here is no gap in it
     t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
     _gaps('odometer', travelled.mean.t, found)
     if travelled.right is not None:      # the mean stands on the left wheel's rows
         _gaps('odometer_right', travelled.right.t, found)
     found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
-    _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)

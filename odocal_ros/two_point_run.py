@@ -8,7 +8,6 @@ from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.check import (
     against_travel,
     fix_noise_factor,
-    gyro_against_course,
     mismatch,
     pieces,
     steady,
@@ -21,7 +20,6 @@ from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.leg_tracks import as_configured, near, Paths
-from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
@@ -156,17 +154,14 @@ class TwoPointRun:
         return factor
 
     def _judge_track(self, chord, f, fixes, residual, drift):
-        """Compare the corrected track with the fixes: units, signs, reversing, sanity."""
+        """Compare the corrected track with the fixes: reversing, sanity."""
         run, (t, p) = self.run, fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
         keep, sigma = steady(residual, run.fix_sigma)
-        middle, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
-        C = matrix_from_quat(self.track.q_nb)
-        yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
-        found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
+        _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
         by_imu = Code.REVERSING_UNSIGNED in {r.code for r in run.reasons}
-        if not by_imu:
-            found += against_travel(direction, course, stretch, self.config.odometer.signed)
+        found = () if by_imu else against_travel(direction, course, stretch,
+                                                 self.config.odometer.signed)
         run.reasons += found
         if not (found or by_imu):
             check = track_check(stray(run.path(f), chord.start, fixes), run.distance)

@@ -1,5 +1,6 @@
 """Reasons and bags of legs for a person: the gravest first, what legs share said once."""
 
+from dataclasses import replace
 import re
 import textwrap
 
@@ -14,9 +15,9 @@ def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     for reason in reasons:
         match = OF_LEG.fullmatch(reason.text)
         number, text = match.groups() if match else ('', reason.text)
-        joined.setdefault((reason.code, text, bool(match)), []).append(number)
-    return tuple(Reason(code, f'{_legs(numbers)}: {text}' if of_leg else text)
-                 for (code, text, of_leg), numbers in joined.items())
+        joined.setdefault((replace(reason, text=text), bool(match)), []).append(number)
+    return tuple(replace(reason, text=f'{_legs(numbers)}: {reason.text}') if of_leg else reason
+                 for (reason, of_leg), numbers in joined.items())
 
 
 def _legs(numbers):

@@ -10,10 +10,10 @@ import ros_bags
 from ros_bags import T0
 import ros_messages as make
 
+from odocal_ros.calib.mounting import mounting
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.mounting import mounting
 
 K = 0.02                   # m per pulse
 RATE = 25                  # Hz, Imu
