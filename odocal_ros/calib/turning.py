@@ -57,6 +57,6 @@ def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
                        f'{ratio:.2f} instead of 1)'),)
     degrees = DEGREES[0] < ratio < DEGREES[1]
     wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
-    return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.3g} times as far as the course of the '
-                   'fixes' + ', as deg/s would' * degrees,
+    return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.3g} times as far as the course of '
+                   'the fixes' + ', as deg/s would' * degrees,
                    f'Mend the sender, or set imu.gyro_scale to {wanted:.10g}.'),)

@@ -101,7 +101,8 @@ def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    up_i = np.median(f_i, axis=0) / np.linalg.norm(np.median(f_i, axis=0))
+    up_i = np.median(f_i, axis=0)
+    up_i = up_i / max(np.linalg.norm(up_i), 1e-9)
     ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma)
     found['drive']['gyro_over_course'] = ratio
     findings += gyro_reasons(ratio, config.imu.gyro_scale)
@@ -111,7 +112,7 @@ def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
 
 
 def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
-    """Tell the legs that replay would take, and better ones if those will not do."""
+    """Tell the legs that replay would take, and better ones where the two-point method needs."""
     if not len(drive.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
@@ -131,7 +132,8 @@ def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(drive.stops, *ends)
             for ends in straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
-    if marks or not all(closed(leg) for leg in found['legs']):
+    # of the whole drive the other methods make more than of its pieces
+    if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []
     open_legs = [leg for leg in found['each_stop']
                  if leg['way'] >= config.leg.min_distance and not closed(leg)]
