@@ -31,7 +31,7 @@ from odocal_ros.screen import imu_gap
 ALIGNED = ('two_point', 'wheels')
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
-BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.REVERSING_UNSIGNED}
+BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.01            # relative sigma up to which a scale gives the distance
 

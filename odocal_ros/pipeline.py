@@ -10,6 +10,7 @@ import numpy as np
 
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.reversing import BY_FIT, doubled, said_of
 from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.combination import combine
 from odocal_ros.config import Config
@@ -58,7 +59,21 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         inputs = turned_over(inputs)
     if UNUSABLE & {r.code for r in sanity}:
         return leg_result(leg, inputs, reasons)
-    return LegRun(leg, inputs, config, reasons, alignment, holdout).result()
+    result = LegRun(leg, inputs, config, [*reasons], alignment, holdout).result()
+    back, scale = _reversed(result, inputs)
+    if not len(back):
+        return result
+    reasons += said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
+    return LegRun(leg, inputs.mirrored(back), config, reasons, alignment, holdout).result()
+
+
+def _reversed(result, inputs):
+    """Return where a counter without a sign shows in the smoother's slips, (m, 2) s, and scale."""
+    smoother = result.methods.get('smoother')
+    scale = smoother and smoother.estimates['scale_factor'].value
+    if not scale:
+        return (), None
+    return doubled(smoother.details['slips'], inputs.travel, scale), scale
 
 
 def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:

@@ -48,7 +48,7 @@ class Code(Enum):
                           'one; the smoother hears when the steps change and can do without.')
     COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
                             'farther: a count weighs less the longer the way.')
-    REVERSING_UNSIGNED = REJECT, ('Do not reverse during a leg, or use an odometer that counts '
+    REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
                                   'backwards (odometer.signed).')
     ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '
                                  'faces backwards, set imu.mounting_rpy or imu.nominal_yaw.')

@@ -66,8 +66,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.COUNTER_COARSE: 'There are few counts a metre, so that the way is known to a count '
         'at each moment. Over a long drive that is little, and the sigma holds it; what happens '
         'within a few metres, such as a short slip, does not show.',
-        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up: '
-        'travel backwards was taken for travel forwards.',
+        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up. '
+        'Where the Imu shows it, off a stop, that stretch was counted backwards.',
         Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '
         'mean backwards, or the Imu faces backwards. Or speeding up pushes the Imu backwards.',
         Code.ODOMETER_STILL: 'The fixes move on, the counter stays.',

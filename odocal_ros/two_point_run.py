@@ -159,11 +159,9 @@ class TwoPointRun:
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
         keep, sigma = steady(residual, run.fix_sigma)
         _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
-        by_imu = Code.REVERSING_UNSIGNED in {r.code for r in run.reasons}
-        found = () if by_imu else against_travel(direction, course, stretch,
-                                                 self.config.odometer.signed)
+        found = against_travel(direction, course, stretch, self.config.odometer.signed)
         run.reasons += found
-        if not (found or by_imu):
+        if not found:
             check = track_check(stray(run.path(f), chord.start, fixes), run.distance)
             self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
 

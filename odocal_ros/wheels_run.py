@@ -20,7 +20,7 @@ from odocal_ros.reasons import Code, Reason
 
 ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
                      'and odometer.right name them')
-UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED, Code.REVERSING_UNSIGNED}
+UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
 def wheels(run):

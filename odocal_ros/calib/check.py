@@ -123,7 +123,7 @@ def steady(residual, fix_sigma):
 
 def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ...]:
     """
-    Return REVERSING_UNSIGNED where counts rise while the vehicle drives backwards.
+    Return TRACK_MISMATCH where counts rise while the vehicle drives backwards.
 
     As far as the fixes go back the counter goes on: fixes that only jump go as far as they like.
     """
@@ -136,5 +136,6 @@ def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ..
     if not back.any() or back.mean() > 0.5:
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'
-    return (Reason(Code.REVERSING_UNSIGNED, f'on {int(back.sum())} of {len(back)} pieces the '
-                   f'track runs against the fixes: the vehicle reversed and {how}'),)
+    return (Reason(Code.TRACK_MISMATCH, f'on {int(back.sum())} of {len(back)} pieces the '
+                   f'track runs against the fixes: the vehicle reversed and {how}',
+                   Code.REVERSING_UNSIGNED.remedy),)

@@ -189,7 +189,8 @@ class TestCheck:
         course = np.array([0.1, 0.0, 0.1, 0.0, 3.1, 3.2, 0.1, 0.0])
         as_far = np.full(8, 1.05)
         reasons = against_travel(np.full(8, 0.05), course, as_far, signed=True)
-        assert codes(reasons) == [Code.REVERSING_UNSIGNED]
+        assert codes(reasons) == [Code.TRACK_MISMATCH]
+        assert 'the vehicle reversed' in reasons[0].text
         assert 'on 2 of 8 pieces' in reasons[0].text
         assert against_travel(course + 0.3, course, as_far, signed=True) == ()
         # fixes that jump back 60 m and on again while the vehicle goes on by 20
