@@ -100,8 +100,7 @@ class Code(Enum):
     GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
                                     'longer standstill, or another heading source.')
     HEADING_UNAVAILABLE = CAUTION, 'Check the heading source, or set alignment.heading_source.'
-    PITCH_NOT_DETERMINED = NOTE, ('Drive longer, with stops and starts, or use a receiver that '
-                                  'gives good ellipsoidal heights.')
+    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that gives ellipsoidal height.'
     SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
                                        'odometer; odometer.max_scale_deviation is the limit.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '

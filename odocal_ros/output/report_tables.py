@@ -57,15 +57,25 @@ def value_rows(calibration: Calibration) -> list[dict]:
     rows = []
     for name in calibration.estimates:
         estimate = known(calibration.estimates, name)
-        if name == 'scale_ratio' and estimate.value is None:
-            continue             # no nominal scale was given: nothing is missing
+        if estimate.value is None:
+            continue
         first, other, relative = in_units(name, estimate)
         method = calibration.methods.get(estimate.method)
         rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
-                     'method': label(estimate.method) if estimate.value is not None else '',
-                     'mostly': largest_source(method, name) if estimate.value is not None else '',
-                     'lost': estimate.value is None})
+                     'method': label(estimate.method), 'mostly': largest_source(method, name)})
     return rows
+
+
+def undetermined(calibration: Calibration) -> list[str]:
+    """Return the values that were not determined, axes of one thing together."""
+    axes: dict[str, list[str]] = {}
+    for name in calibration.estimates:
+        # no nominal scale was given: nothing is missing
+        if known(calibration.estimates, name).value is None and name != 'scale_ratio':
+            whole, _, axis = name.rpartition('_')
+            one = axis in ('x', 'y', 'z')
+            axes.setdefault(label(whole if one else name), []).extend([axis] * one)
+    return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
 def largest_source(method: MethodResult | None, name: str) -> str:
