@@ -103,7 +103,7 @@ def _marks(ax, found, at, slips):
                           else ()):
         t = np.linspace(found.t_fix[k], found.t_fix[k + 1], 50)
         ax.plot(*at(t), '-', color=PINK, linewidth=4, alpha=0.6, zorder=1,
-                label='no fix' if i == 0 else None)
+                label='no fix used' if i == 0 else None)
     if len(slips):
         ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
                 markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')

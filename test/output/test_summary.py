@@ -188,3 +188,15 @@ def test_what_many_legs_say_in_other_figures_is_one_reason(good):
     told = [r.text for r in shared((*reasons, GAP))]
     assert told == ['legs 1 to 3, 5 to 29 and 31 to 35; of leg 1: 61 m between the marks',
                     'leg 2: slip of 2 m', 'leg 9: slip of 9 m', GAP.text]
+
+
+@pytest.mark.parametrize(('error', 'sigma', 'shown'), [
+    (0.012, 4e-4, 'gyro scale z        0.98800 ± 0.00040'), (0.004, 4e-4, None),
+    (0.012, 5e-3, None)])
+def test_a_gyro_scale_far_from_one_is_said(good, error, sigma, shown):
+    """A gyro that turns 1.2 % too far is to be multiplied by 0.988; near 1, or unsure: nothing."""
+    method = good.methods['two_point']
+    method = replace(method, details=method.details | {
+        'gyro_scale_z': {'value': error, 'sigma': sigma}})
+    text = screen(replace(good, methods={'two_point': method}))
+    assert (shown in text) if shown else ('gyro scale' not in text)
