@@ -33,7 +33,7 @@ EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
-WORTH = 0.01            # relative sigma up to which a scale gives the distance
+WORTH = 0.05            # relative sigma up to which a scale gives the distance
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
