@@ -125,7 +125,7 @@ def _leg_reasons(legs, good, twice, giving, estimates):
             refused = [m for m in methods if good and m.verdict is Verdict.REJECTED]
             reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
                                + _why(m.reasons)) for m in refused]
-            reasons += [Reason(r.code, prefix + r.text) for r in own
+            reasons += [replace(r, text=prefix + r.text) for r in own
                         if not any(r in m.reasons for m in refused)
                         and not (refused and r.code is Code.METHOD_REJECTED)]
     return reasons

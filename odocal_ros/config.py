@@ -31,7 +31,7 @@ class OdometerConfig:
     wrap: int = setting(0, 'counts', 0, 2**62, ro=True, about='Counter modulus; 0: that of the '
                         'integer type (65536 for 16 bits sent in an Int32).')
     signed: bool = setting(True, ro=True, about='False for pulses without direction: reversing '
-                           'then rejects the leg.')
+                           'is then told from Imu and fixes, or rejects the leg.')
     reversed: bool = setting(False, ro=True, about='Positive counts mean backwards.')
     nominal_scale: float = setting(0.0, 'm/pulse, m/rad or 1', 0.0, 1e6, about='Scale factor as '
                                    'configured, K0; 0: unknown for counts, 1 for speeds.')

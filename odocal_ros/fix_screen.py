@@ -48,14 +48,17 @@ def usable_fixes(fix, sent, gnss):
         found += (Reason(Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {sent} '
                          'fixes come without a usable covariance; taken as '
                          f'{gnss.default_sigma:g} m (gnss.default_sigma)'),)
-    bad = [f'{int(m.sum())} {what}' for m, what in (
-        (no_fix, f'with status below {gnss.min_status}'),
-        (lost & ~no_fix, 'at no real position'),
-        (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m')) if m.any()]
+    bad = [(f'{int(m.sum())} {what}', do) for m, what, do in (
+        (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
+         'gnss.min_status if these fixes are good.'),
+        (lost & ~no_fix, 'at no real position', 'Mend the driver that sends positions nowhere.'),
+        (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m', 'Raise gnss.max_sigma '
+         '(0: no limit) if these sigmas are honest: a fix is weighed by its own.')) if m.any()]
     if bad:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
+        said, do = zip(*bad, strict=True)
         found += (Reason(code, f'{sent - int(use.sum())} of {sent} fixes are not used: '
-                         f'{", ".join(bad)}'),)
+                         f'{", ".join(said)}', ' '.join(do)),)
     return use, covariance, found
 
 

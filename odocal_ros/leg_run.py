@@ -8,11 +8,13 @@ import numpy as np
 from odocal_ros.align import align
 from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over
-from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
+from odocal_ros.calib.drive import judge_drive, not_moving, uncovered, way_and_chord
 from odocal_ros.calib.facing import axes_reasons, facing
 from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
+from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
 from odocal_ros.coarse_odometer import coarse_reasons
 from odocal_ros.fix_screen import origin_amid
@@ -29,20 +31,29 @@ from odocal_ros.screen import imu_gap
 ALIGNED = ('two_point', 'wheels')
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
-BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.REVERSING_UNSIGNED}
+BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
-WORTH = 0.01            # relative sigma up to which a scale gives the distance
+WORTH = 0.05            # relative sigma up to which a scale gives the distance
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
     """Return the result of a leg: its counts, findings and what more there is."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
+    if 'distance' not in more:
+        more['distance'] = _way_of(inputs.t_fix[between], inputs.geodetic[between])
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
-        distance=more.pop('distance', 0.0), imu_samples=len(inputs.t_imu),
+        imu_samples=len(inputs.t_imu),
         pulses=len(inputs.travel.t), fixes=int(between.sum()),
         rejected_fixes=inputs.fixes_rejected, reasons=tuple(reasons), methods=methods or {},
         C_bi=inputs.C_bi, **more)
+
+
+def _way_of(t_fix, geodetic):
+    """Return the way by the fixes, m: what is known of a leg that is refused."""
+    if not len(t_fix):
+        return 0.0
+    return way_and_chord(origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic)))[0]
 
 
 class LegRun:
@@ -94,14 +105,15 @@ class LegRun:
         if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
             distance *= scale.value / self.rough
         shown = tracks(self, paths[scale.method])
-        methods = {name: m if paths[name] is None else replace(
-            m, details=m.details | check_of(self, paths[name])) for name, m in methods.items()}
+        methods = {name: m if path is None else replace(
+            m, details=m.details | check_of(self, path.after))
+            for (name, m), path in zip(methods.items(), paths.values(), strict=True)}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
                           deciding=deciding(self.config.method), **shown)
 
     def examine(self) -> bool:
         """Say all of the leg that needs no method; return whether methods can be run."""
-        if not (self._moves() and self._faces_forward()):
+        if not (self._moves() and self._faces_forward() and self._turns_with_course()):
             return False
         self._prepare()
         return True
@@ -171,8 +183,18 @@ class LegRun:
         inputs = self.inputs
         self.facing = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, self.rough)
         found = axes_reasons(self.facing, self.config.imu.nominal_yaw)
-        self.reasons += found
+        self.reasons += with_axes(found, inputs)
         return Code.IMU_AXES not in {r.code for r in found}
+
+    def _turns_with_course(self):
+        """Tell whether the gyro turns with the course of the fixes, and say how where not."""
+        inputs = self.inputs
+        up_b = np.median(inputs.f_b, axis=0)
+        ratio = turn_ratio(inputs.t_imu, inputs.w_b @ (up_b / np.linalg.norm(up_b)),
+                           inputs.t_fix, self.fixes_n, self.fix_sigma)
+        found = gyro_reasons(ratio, self.config.imu.gyro_scale)
+        self.reasons += found
+        return not found
 
     def _prepare(self):
         """Align, reckon and judge the drive."""

@@ -1,14 +1,43 @@
 """The tracks of a leg, as configured and as calibrated, and how far they stray from the fixes."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 
 from odocal_ros.calib.check import stray, track_check
 from odocal_ros.calib.evidence import evidence
+from odocal_ros.calib.per_distance import check_worse, per_distance
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.reasons import Code, Reason
 
 FEWEST_FIXES = 3        # for a check of the track
 FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
 TRACK_ROWS = 5000       # of a track kept in a result
+
+
+class Paths(NamedTuple):
+    """
+    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
+
+    Both have one attitude, and the fit's angles where it determines none: they differ in what
+    the calibration changes and in nothing else.
+    """
+
+    before: Callable
+    after: Callable
+
+
+def as_configured(run, f, estimates):
+    """
+    Return f = K0 d0 of the settings, (3,) m per unit of travel.
+
+    f : as found; of its angles those are kept that ``estimates`` do not hold.
+    """
+    found = mounting_from_forward(f)
+    angles = [0.0 if estimates[name].value is not None else angle for name, angle in zip(
+        ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
+    return (run.nominal or run.rough) * forward_b(*angles)
 
 
 def near(run, path, pin, between):
@@ -25,13 +54,14 @@ def near(run, path, pin, between):
     return ~far
 
 
-def tracks(run, after) -> dict:
+def tracks(run, paths) -> dict:
     """
     Return the tracks, checks and evidence of a leg as fields of its result.
 
-    run : LegRun, aligned and reckoned.   after : the path as calibrated, t (n,) to (n, 3) m.
+    run : LegRun, aligned and reckoned; takes the reason if the correction makes it worse.
+    paths : Paths
     """
-    before = run.path(np.array([run.nominal or run.rough, 0.0, 0.0]))
+    before, after = paths
     start = _start(run, after)
     if start is None:
         return {}
@@ -46,9 +76,13 @@ def tracks(run, after) -> dict:
     fixes = run.inputs.t_fix[between], run.fixes_n[between]
     more |= {name: track_check(stray(path, pin, fixes), way)
              for name, path in (('before', before), ('after', after))}
+    relative = (np.interp(fixes[0], *driven(run)),
+                *(stray(path, pin, fixes) for path in paths))
+    more['per_distance'] = per_distance(*relative)
+    run.reasons += check_worse(*relative, bool(run.nominal))
     kept = near(run, after, start, between)
     return more | {'evidence': evidence(run.leg, run.inputs, run.track, run.fixes_n, kept, start,
-                                        (before, after), run.config)}
+                                        paths, run.config)}
 
 
 def check_of(run, path) -> dict:
@@ -74,5 +108,10 @@ def _checked(run, path, start):
     between = (run.inputs.t_fix >= begin) & (run.inputs.t_fix <= end)
     if pin is not None:
         between &= near(run, path, pin, between)
-    on_way = (run.track.t >= begin) & (run.track.t <= end)
-    return pin, between, np.abs(np.diff(run.track.s[on_way])).sum() * run.rough
+    a, b = np.interp([begin, end], *driven(run))
+    return pin, between, b - a
+
+
+def driven(run):
+    """Return times of the track, s, and the way driven until then, m."""
+    return run.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s)))) * run.rough

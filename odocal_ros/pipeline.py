@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.reversing import BY_FIT, doubled, said_of
 from odocal_ros.calib.sanity import imu_sanity, UNUSABLE
 from odocal_ros.combination import combine
 from odocal_ros.config import Config
@@ -48,7 +50,15 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
 
     """
     inputs, reasons, run = _begun(leg, config, alignment, notes, holdout)
-    return leg_result(leg, inputs, reasons) if run is None else run.result()
+    if run is None:
+        return leg_result(leg, inputs, reasons)
+    told = [*reasons]
+    result = run.result()
+    back, scale = _reversed(result, inputs)
+    if not len(back):
+        return result
+    told += said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
+    return LegRun(leg, inputs.mirrored(back), config, told, alignment, holdout).result()
 
 
 def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
@@ -73,12 +83,21 @@ def _begun(leg, config, alignment=None, notes=(), holdout=False):
         seen = {r.code for r in reasons}
         return inputs, reasons + [r for r in missing if r.code not in seen], None
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
-    reasons += sanity
+    reasons += with_axes(sanity, inputs)
     if z_down:
         inputs = turned_over(inputs)
     if UNUSABLE & {r.code for r in sanity}:
         return inputs, reasons, None
     return inputs, reasons, LegRun(leg, inputs, config, reasons, alignment, holdout)
+
+
+def _reversed(result, inputs):
+    """Return where a counter without a sign shows in the smoother's slips, (m, 2) s, and scale."""
+    smoother = result.methods.get('smoother')
+    scale = smoother and smoother.estimates['scale_factor'].value
+    if not scale:
+        return (), None
+    return doubled(smoother.details['slips'], inputs.travel, scale), scale
 
 
 def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:

@@ -50,7 +50,7 @@ class Code(Enum):
                           'one; the smoother hears when the steps change and can do without.')
     COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
                             'farther: a count weighs less the longer the way.')
-    REVERSING_UNSIGNED = REJECT, ('Do not reverse during a leg, or use an odometer that counts '
+    REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
                                   'backwards (odometer.signed).')
     ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '
                                  'faces backwards, set imu.mounting_rpy or imu.nominal_yaw.')
@@ -59,8 +59,8 @@ class Code(Enum):
                          'imu.gyro_scale.')
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '
                                  'axes are forward-right-down.')
-    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; odocal '
-                        'inspect suggests it.')
+    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; where '
+                        'the drive shows how the Imu sits, the values are named.')
     IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the like, to what '
                                      'the Imu is; a gyro that sends deg/s looks so too: '
                                      'imu.gyro_scale.')
@@ -87,6 +87,8 @@ class Code(Enum):
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
     TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
                                'fixes; drive again on a firm straight road with open sky.')
+    CHECK_WORSE = CAUTION, ('Keep what you had; look in the report where the track leaves the '
+                            'fixes (slip, gaps, bad fixes), and drive again.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '
                            'the sigma was widened by the slip seen.')
     SCALE_VARIES = NOTE, ('Nothing; for one number that holds longer, drive with warm tyres at '
@@ -106,9 +108,11 @@ class Code(Enum):
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
-                                      'at both marks), or combine more legs.')
-    YAW_SIGMA_TOO_LARGE = CAUTION, ('Give a better heading, or combine legs with headings of '
-                                    'their own.')
+                                      'at both marks), or combine more legs; '
+                                      'verdict.max_scale_sigma is the limit.')
+    YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, give a better '
+                                    'heading, or combine legs; verdict.max_yaw_sigma is the '
+                                    'limit.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     # left and right wheel
     ODOMETER_CHOSEN = NOTE, ('Nothing, if that is right; else name them: odometer.left and '
@@ -168,15 +172,16 @@ class Code(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A code with what was seen: one sentence with the figures."""
+    """A code with what was seen: one sentence with the figures; ``do`` where that tells more."""
 
     code: Code
     text: str
+    do: str = ''
 
     @property
     def remedy(self) -> str:
         """Return what the reader can do about it."""
-        return self.code.remedy
+        return self.do or self.code.remedy
 
     def as_dict(self) -> dict:
         """Return the entry of calibration.json."""

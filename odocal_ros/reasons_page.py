@@ -70,8 +70,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.COUNTER_COARSE: 'There are few counts a metre, so that the way is known to a count '
         'at each moment. Over a long drive that is little, and the sigma holds it; what happens '
         'within a few metres, such as a short slip, does not show.',
-        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up: '
-        'travel backwards was taken for travel forwards.',
+        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up. '
+        'Where the Imu shows it, off a stop, that stretch was counted backwards.',
         Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '
         'mean backwards, or the Imu faces backwards. Or speeding up pushes the Imu backwards.',
         Code.ODOMETER_STILL: 'The fixes move on, the counter stays.',
@@ -114,6 +114,10 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '(`leg.max_yaw_rate`), where wheels run ways of their own.',
         Code.TRACK_MISMATCH: 'Even with the calibrated values the track is farther from the fixes '
         'than noise, drift and 0.2 % of the distance explain. Something else is wrong.',
+        Code.CHECK_WORSE: 'Of pieces of 100 m, 500 m or 1 km, each begun anew at a fix, the track '
+        'with the calibrated values ends farther from the fixes than the one without, beyond '
+        'chance. Both have the same attitude, so the values are to blame: slip, bad fixes or a '
+        'delay went into them.',
         Code.WHEEL_SLIP: 'Over a few seconds the wheel turned farther, or less far, than the '
         'vehicle accelerated, or the two wheels do not fit the turn.',
         Code.SCALE_VARIES: 'Tyres grow with speed and as they warm: the scale is not one number '

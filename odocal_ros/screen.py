@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.reversing import reversed_starts
+from odocal_ros.calib.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
-from odocal_ros.fix_screen import usable_fixes
+from odocal_ros.fix_screen import origin_amid, usable_fixes
 from odocal_ros.glitches import (
     about_clumps,
     beyond,
@@ -27,6 +27,7 @@ from odocal_ros.glitches import (
     speed_glitches,
 )
 from odocal_ros.leg import Leg
+from odocal_ros.nav.dead_reckoning import rough_scale
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
@@ -67,6 +68,14 @@ class Inputs:
     velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
     fixes_rejected: int
     scale_unit: str
+
+    def mirrored(self, spans) -> 'Inputs':
+        """Return them with what was counted in spans, (m, 2) s, counted the other way."""
+        if not len(spans):
+            return self
+        return replace(self, **{name: way and way.mirrored(spans) for name, way in (
+            ('travel', self.travel), ('travel_left', self.travel_left),
+            ('travel_right', self.travel_right))})
 
 
 def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -112,23 +121,21 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     fix, t_fix = rows('fix')
     use, covariance, why = usable_fixes(fix, len(leg.fix.stamp_ns), config.gnss)
     found += why
+    _gaps('fix', t_fix, found)       # of the stream: what is screened here is no gap in it
     t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
     _gaps('odometer', travelled.mean.t, found)
     if travelled.right is not None:      # the mean stands on the left wheel's rows
         _gaps('odometer_right', travelled.right.t, found)
     found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
-    _gaps('fix', t_fix, found)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
     if travelled.right is not None:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
-    found += reversed_starts(travelled.mean, t_imu, w_b, f_b, (0.0, t_stop),
-                             config.odometer.signed)
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
         travelled = replace(travelled, left=None, right=None)
-    return Inputs(
+    inputs = Inputs(
         t_stop=t_stop, t_imu=t_imu, w_b=w_b, f_b=f_b,
         q_ni=imu.q_ni, yaw_variance=imu.yaw_variance, C_bi=C_bi,
         travel=travelled.mean, travel_left=travelled.left, travel_right=travelled.right,
@@ -138,7 +145,20 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         t_velocity=t_velocity, velocity_n=velocity.velocity_n,
         velocity_variance=velocity.variance_n,
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
-        scale_unit=leg.form.scale_unit), tuple(found)
+        scale_unit=leg.form.scale_unit)
+    back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))
+    found += said_of(back, inputs.travel, _metres(inputs) if len(back) else None, BY_IMU,
+                     config.odometer.signed)
+    return inputs.mirrored(back), tuple(found)
+
+
+def _metres(inputs):
+    """Return rough metres per unit of travel, None where the fixes do not tell."""
+    t, geodetic = inputs.t_fix, inputs.geodetic
+    if not len(t):
+        return None
+    return rough_scale(inputs.travel, t, origin_amid(t, geodetic).to_n(np.nan_to_num(geodetic)),
+                       float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0]))))
 
 
 def _turned(vector_i, scale, C_bi):

@@ -6,8 +6,9 @@ import numpy as np
 
 from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.delay_note import note_delays
+from odocal_ros.leg_tracks import as_configured, Paths
 from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.nav.rotations import quat_from_matrix
+from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 
 ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
 
@@ -20,9 +21,8 @@ def smoother(run):
 
     Returns
     -------
-    MethodResult, and the antenna's path (t to (n, 3), but for a constant) that dead reckoning
-    makes from the attitude at the start with all values found, delays and lever arms too; t is as
-    the fixes stamp it. None where refused.
+    MethodResult, and the antenna's Paths by the smoother's own attitude, the calibrated one with
+    all values found, delays and lever arms too; t is as the fixes stamp it. None where refused.
 
     """
     leg = smoother_leg(run.inputs, run.config, run.origin, run.fixes_n, run.spans, run.rough,
@@ -33,16 +33,26 @@ def smoother(run):
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
     note_delays(run, {name: (e.value, e.sigma) for name, e in delays.items()
                       if e.value is not None})
-    start = method.details['start']      # its gyro bias is taken as constant
     # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
     late = {name: e.value or 0.0 for name, e in delays.items()}
     travel = run.inputs.travel
-    track = dead_reckon(*run.attitude_from(start['t'], quat_from_matrix(start['C_nb']),
-                                           start['gyro_bias']),
-                        replace(travel, t=travel.t - late['odometer']))
+    epochs = _attitude(run, method.details)
+    track = dead_reckon(*epochs, replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, run.config), method.details['f']
+    before = run.path(as_configured(run, f, method.estimates), dead_reckon(*epochs, travel))
+    return method, Paths(before, _late_path(track, f, lever_b, late['gnss']))
 
-    return method, _late_path(track, f, lever_b, late['gnss'])
+
+def _attitude(run, details):
+    """
+    Return the smoother's attitude at the Imu's rate: t (m,) s, q_nb (m, 4).
+
+    Between keyframes the gyros turn it; where they end, beyond the fixes fitted, by them alone.
+    """
+    t_key, C_nb = details['key_t'], details['key_C_nb']
+    t, q_nb = run.attitude_from(t_key[0], quat_from_matrix(C_nb[0]), details['gyro_bias'])
+    off = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
+    return t, quat_multiply(quat_at(t, t_key, off), q_nb)
 
 
 def _late_path(track, f, lever_b, late):

@@ -8,7 +8,6 @@ from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.check import (
     against_travel,
     fix_noise_factor,
-    gyro_against_course,
     mismatch,
     pieces,
     steady,
@@ -20,8 +19,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
-from odocal_ros.leg_tracks import near
-from odocal_ros.nav.angles import arctan2
+from odocal_ros.leg_tracks import as_configured, near, Paths
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
@@ -36,7 +34,7 @@ def two_point(run):
 
     Returns
     -------
-    MethodResult, and the antenna's path (t to (n, 3), but for a constant); None where refused.
+    MethodResult, and the antenna's Paths; None where refused.
 
     """
     return TwoPointRun(run).result()
@@ -68,7 +66,9 @@ class TwoPointRun:
         self._reversed(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
             method.estimates, self.run.nominal, self.config)))
-        return method, self.run.path(method.details['f'])
+        f = method.details['f']
+        return method, Paths(*map(self.run.path, (
+            as_configured(self.run, f, method.estimates), f)))
 
     def _slips(self, chord, f):
         """Return slips of the mean between the marks, s and m; name those not named already."""
@@ -154,19 +154,14 @@ class TwoPointRun:
         return factor
 
     def _judge_track(self, chord, f, fixes, residual, drift):
-        """Compare the corrected track with the fixes: units, signs, reversing, sanity."""
+        """Compare the corrected track with the fixes: reversing, sanity."""
         run, (t, p) = self.run, fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
         keep, sigma = steady(residual, run.fix_sigma)
-        middle, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
-        C = matrix_from_quat(self.track.q_nb)
-        yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
-        found = gyro_against_course(np.interp(middle, self.track.t, yaw), course)
-        by_imu = Code.REVERSING_UNSIGNED in {r.code for r in run.reasons}
-        if not by_imu:
-            found += against_travel(direction, course, stretch, self.config.odometer.signed)
+        _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
+        found = against_travel(direction, course, stretch, self.config.odometer.signed)
         run.reasons += found
-        if not (found or by_imu):
+        if not found:
             check = track_check(stray(run.path(f), chord.start, fixes), run.distance)
             self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
 

@@ -12,6 +12,7 @@ from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.search import search
 from odocal_ros.calib.wheels.unseen import drawn_out, with_unseen
 from odocal_ros.delay_note import note_delays
+from odocal_ros.leg_tracks import as_configured, Paths
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
@@ -19,7 +20,7 @@ from odocal_ros.reasons import Code, Reason
 
 ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
                      'and odometer.right name them')
-UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED, Code.REVERSING_UNSIGNED}
+UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
 def wheels(run):
@@ -30,7 +31,7 @@ def wheels(run):
 
     Returns
     -------
-    MethodResult, and the antenna's path (t to (n, 3), but for a constant); None where refused.
+    MethodResult, and the antenna's Paths; None where refused.
 
     """
     if run.inputs.travel_left is None or run.inputs.travel_right is None:
@@ -54,7 +55,7 @@ def wheels(run):
                 if r.code is not Code.TRACK_MISMATCH or not _uneven(run))
     method = replace(method, details=method.details | more, reasons=(
         *own, *reasons, *judge(method.estimates, run.nominal, run.config)))
-    return method, _path(run, leg, method)
+    return method, _paths(run, leg, method)
 
 
 def _leg(run) -> WheelLeg | None:
@@ -92,11 +93,11 @@ def _search(run, leg, pitch):
     return search(planar, ranges_of(wheels, course), wheels.robust)
 
 
-def _path(run, leg, method):
-    """Return the path that the corrected wheels, heading and gyro dead reckon."""
-    e = method.estimates
+def _paths(run, leg, method):
+    """Return the paths that wheels dead reckon with the corrected heading and gyro."""
+    e, f = method.estimates, method.details['f']
     if e['scale_factor_left'].value is None:
-        return run.path(method.details['f'])
+        return Paths(*map(run.path, (as_configured(run, f, e), f)))
     drift = 0.0 if e['gyro_bias_z'].value is None else (
         e['gyro_bias_z'].value - run.alignment.gyro_bias[2])
     error = method.details['gyro_scale_seen']['value']      # 0 where the leg tells nothing of it
@@ -105,9 +106,12 @@ def _path(run, leg, method):
         leg = replace(leg, **{side: _straightened(run, travel, drift, error, since)
                               for side, travel in (('left', run.inputs.travel_left),
                                                    ('right', run.inputs.travel_right))})
-    values = [e[name].value for name in ('scale_factor_left', 'scale_factor_right',
-                                         'heading_error')]
-    return lambda t: positions(leg, t, *values, method.details['pitch']['value'])
+    # heading and mounting error are one: they hold for both
+    angles = e['heading_error'].value, method.details['pitch']['value']
+    both = (run.nominal or run.rough,) * 2, tuple(
+        e[f'scale_factor_{side}'].value for side in ('left', 'right'))
+    return Paths(*(lambda t, scales=scales: positions(leg, t, *scales, *angles)
+                   for scales in both))
 
 
 def _straightened(run, travel, drift, error, since):

@@ -5,6 +5,8 @@ Every test ends in ``sound``: what is given holds within its sigma, what is reje
 """
 
 from dataclasses import replace
+import json
+import re
 
 from drives import (
     changed,
@@ -20,6 +22,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.nav.angles import yaw_from_heading
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Code
 from odocal_ros.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
@@ -261,12 +264,13 @@ def test_reversing_is_fine_for_a_counter_that_counts_back(reversing):
 
 
 @pytest.mark.parametrize('signed', [True, False])
-def test_reversing_without_direction_rejects(reversing, signed):
+def test_reversing_without_direction_is_counted_backwards(reversing, signed):
     def rising(value):
         return value[0] + np.cumsum(np.abs(np.diff(value, prepend=value[:1])))
     leg = replace(reversing.leg, odometer=changed(reversing.leg.odometer, value=rising))
     result, said = run(leg, settings(reversing.made, odometer__signed=signed))
-    assert Code.REVERSING_UNSIGNED in rejecting(result)
+    assert Code.REVERSING_UNSIGNED not in rejecting(result)
+    sound(result, reversing.made.truth)
     assert 'the vehicle reversed' in said[Code.REVERSING_UNSIGNED]
 
 
@@ -335,8 +339,22 @@ def test_a_sideways_imu_is_refused_and_told_so(made, leg):
 
 def test_a_gyro_with_the_wrong_sign_is_named(town):
     leg = replace(town.leg(), imu=changed(town.imu, w_i=lambda a: a * [1.0, 1.0, -1.0]))
+    result, said = run(leg, settings(town))
+    assert set(said) == {Code.GYRO_SIGN}, 'one cause, and nothing that follows from it'
+
+
+def test_a_quarter_turn_is_told_with_the_setting_that_undoes_it(town):
+    """Each vector (x, y, z) comes as (z, y, -x): C_bi takes it back."""
+    def turn(a):
+        return a[:, [2, 1, 0]] * [1, 1, -1]
+    leg = replace(town.leg(), imu=changed(town.imu, w_i=turn, f_i=turn))
     result, _ = run(leg, settings(town))
-    assert rejecting(result) & {Code.GYRO_SIGN, Code.TRACK_MISMATCH, Code.CHORD_TOO_SHORT}
+    (reason,) = (r for r in result.reasons if r.code is Code.IMU_AXES)
+    rpy = json.loads(re.search(r"--set 'imu.mounting_rpy=(\[.*?\])'", reason.remedy)[1])
+    np.testing.assert_allclose(matrix_from_rpy(rpy), [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+                               atol=1e-8)
+    # refused, it still knows how far it was: knots on fixes cut corners by some per cent
+    assert result.distance == pytest.approx(town.truth.distance, rel=0.05)
 
 
 def test_a_leg_too_short(made, leg):

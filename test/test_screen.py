@@ -30,6 +30,15 @@ def said(leg, config=None):
     return inputs, {r.code: r.text for r in found}, [r.text for r in found]
 
 
+def test_fixes_screened_by_a_setting_name_it_and_are_no_gap(leg):
+    poor = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(100, 300), 25 * np.eye(3)))
+    _, found = screen(replace(leg, fix=poor), Config())
+    (reason,) = found
+    assert reason.code is Code.BAD_ROWS_DROPPED
+    assert '200 with sigma above 3 m' in reason.text
+    assert 'gnss.max_sigma' in reason.remedy
+
+
 def test_a_clean_leg_is_used_to_the_last_row(leg):
     inputs, codes, _ = said(leg)
     assert codes == {}

@@ -60,6 +60,22 @@ def test_all_says_of_each_method_why_it_gives_nothing(made):
     assert leg.verdict is Verdict.ACCEPTED
 
 
+def test_before_and_after_differ_in_what_is_calibrated_and_not_in_the_gyros_drift():
+    """One is the other turned by the yaw and stretched by the ratio, but for level and lever."""
+    made = drive(scenario='town', duration=240.0, imu_grade='consumer', seed=13)
+    leg = calibrate(made.leg(), settings(made, **ASKED))
+    found = leg_estimates(leg)
+    before, after = (x[:, 0] + 1j * x[:, 1] for x in (
+        leg.track_before_n - leg.track_before_n[0], leg.track_n - leg.track_n[0]))
+    c = np.vdot(after, before) / np.vdot(after, after)
+    assert abs(c) == pytest.approx(1 / found['scale_ratio'].value, rel=1e-3)
+    assert np.angle(c) == pytest.approx(found['yaw_mounting_angle'].value, abs=2e-3)
+    assert np.abs(before - c * after).max() < 1e-3 * np.abs(after).max()
+    # a piece as configured ends |c - 1| of its chord away, and no chord is longer than its piece
+    (first, *_) = leg.per_distance
+    assert first.after < first.before < np.hypot(abs(c - 1) * first.length, 2 * first.after)
+
+
 def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
     """A late fix lies behind by delay times speed: at rest nowhere, at 15 m/s by 4.5 m."""
     late = drive(scenario='town', duration=240.0, imu_grade='tactical', fix_noise='rtk',

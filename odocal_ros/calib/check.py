@@ -8,7 +8,6 @@ from odocal_ros.reasons import Code, Reason
 
 DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compared
 CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
-SURE_TURN = 0.5           # rad between pieces: five sigmas of such directions
 AS_FAR = (0.6, 1.6)     # of a piece driven backwards, track beside fixes
 LOOSE = 4.0               # sigmas of disagreement that name a mismatch
 SLOP = 0.002              # of the distance: slip, suspension, road
@@ -122,39 +121,9 @@ def steady(residual, fix_sigma):
     return off <= 5 * sigma, sigma
 
 
-def gyro_against_course(yaw, course) -> tuple[Reason, ...]:
-    """
-    Compare turns by gyro and by fixes; name a wrong sign or unit of the gyro.
-
-    yaw, course : (k,) rad at the same times; yaw unwrapped, course not.
-    """
-    if len(course) < 3:
-        return ()
-    gyro, true = np.diff(yaw), wrap(np.diff(course))
-    # only turns that are no noise, and not so sharp that left and right look alike
-    clear = (np.abs(true) > SURE_TURN) & (np.abs(true) < 0.8 * np.pi)
-    gyro, true = gyro[clear], true[clear]
-    if len(true) < 2:
-        return ()
-    ratio = float(true @ gyro / (true @ true))
-    alike = abs(float(true @ gyro)) / np.sqrt((true @ true) * max(gyro @ gyro, 1e-12))
-    if alike < 0.7:
-        return ()
-    if ratio < -0.5:
-        return (Reason(Code.GYRO_SIGN, 'the gyro turns against the course of the fixes (ratio '
-                       f'{ratio:+.2f}): its vertical axis has the wrong sign'),)
-    if not 0.5 < ratio < 2.0:
-        unit = ', as deg/s would' if 40 < ratio < 80 else ''
-        return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:.3g} times as far as the course of '
-                       f'the fixes{unit}; imu.gyro_scale wants {1 / ratio:.6g}'
-                       if not unit else f'the gyro turns {ratio:.3g} times as far as the course '
-                       f'of the fixes{unit}: set imu.gyro_scale to 0.017453292519943295'),)
-    return ()
-
-
 def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ...]:
     """
-    Return REVERSING_UNSIGNED where counts rise while the vehicle drives backwards.
+    Return TRACK_MISMATCH where counts rise while the vehicle drives backwards.
 
     As far as the fixes go back the counter goes on: fixes that only jump go as far as they like.
     """
@@ -167,5 +136,6 @@ def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ..
     if not back.any() or back.mean() > 0.5:
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'
-    return (Reason(Code.REVERSING_UNSIGNED, f'on {int(back.sum())} of {len(back)} pieces the '
-                   f'track runs against the fixes: the vehicle reversed and {how}'),)
+    return (Reason(Code.TRACK_MISMATCH, f'on {int(back.sum())} of {len(back)} pieces the '
+                   f'track runs against the fixes: the vehicle reversed and {how}',
+                   Code.REVERSING_UNSIGNED.remedy),)

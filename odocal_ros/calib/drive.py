@@ -93,3 +93,35 @@ def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, the odometer does not count'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the fixes stay in one place while the odometer counts'
                    if wheels_move else 'the vehicle did not move'),)
+
+
+def way_and_chord(fixes_n) -> tuple[float, float]:
+    """
+    Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes.
+
+    The way goes from fix to fix at least ten times their white noise apart: nearer ones would
+    add it up.
+    """
+    p = fixes_n[:, :2]
+    if len(p) < 2:
+        return 0.0, 0.0
+    knots = [*knots_of(p, max(2.0, 10 * white_noise(p))), len(p) - 1]
+    way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
+    return way, float(np.hypot(*(p[-1] - p[0])))
+
+
+def white_noise(fixes_n) -> float:
+    """Return the white noise of fixes, m, by the median of their second differences."""
+    if len(fixes_n) < 5:
+        return 2.5
+    bend = np.diff(fixes_n[:, :2], n=2, axis=0)
+    return float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6)))
+
+
+def knots_of(fixes_n, least) -> list[int]:
+    """Return fixes at least so far apart, m."""
+    knots = [0] if len(fixes_n) else []
+    for k, point in enumerate(fixes_n[:, :2]):
+        if np.hypot(*(point - fixes_n[knots[-1], :2])) >= least:
+            knots.append(k)
+    return knots

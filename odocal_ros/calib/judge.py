@@ -4,6 +4,26 @@ import numpy as np
 
 from odocal_ros.reasons import Code, Reason
 
+# ratio to the nominal scale, by unit of the scale: what sends such a number
+MISTAKEN = {
+    '1': {1 / 3.6: 'speeds in km/h', 0.44704: 'speeds in mph', 1852 / 3600: 'speeds in knots',
+          0.3048: 'speeds in ft/s', 0.01: 'speeds in cm/s', 1e-3: 'speeds in mm/s'},
+    'm/rad': {np.pi / 180: 'angles in degrees', 2 * np.pi: 'whole turns',
+              np.pi / 30: 'rates in rpm'},
+    'm/pulse': {0.25: 'a counter of the four edges of a pulse',
+                0.5: 'a counter of both edges of a pulse'}}
+LIKE = 0.04         # of such a ratio
+
+
+def _unit(ratio, unit, nominal) -> tuple[str, str]:
+    """Return which unit a scale so far from its nominal looks like, and what to set then."""
+    for known, what in MISTAKEN.get(unit, {}).items():
+        if abs(ratio / known - 1) < LIKE:
+            return f', as {what} would be', (
+                f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or mend the sender; '
+                'else check the odometer: odometer.max_scale_deviation is the limit.')
+    return '', ''
+
 
 def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
     """Return what the asked sigmas and the nominal values say of estimates."""
@@ -17,9 +37,10 @@ def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
         if nominal_scale:
             off = scale.value / nominal_scale - 1
             if abs(off) > config.odometer.max_scale_deviation:
+                why, do = _unit(off + 1, scale.unit, nominal_scale)
                 reasons.append(Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale.value:.6g} '
                                       f'{scale.unit} is {100 * off:+.1f} % from the nominal '
-                                      f'{nominal_scale:.6g}'))
+                                      f'{nominal_scale:.6g}{why}', do))
     if yaw.value is not None and yaw.sigma > config.verdict.max_yaw_sigma:
         sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
         reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '

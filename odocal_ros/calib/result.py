@@ -73,6 +73,16 @@ class TrackCheck:
     percent_of_distance: float
 
 
+@dataclass(frozen=True)
+class PerDistance:
+    """Error of dead reckoning that begins at a fix, after some way driven: rms in m."""
+
+    length: float       # m driven
+    before: float
+    after: float
+    pieces: float       # that the way holds, end to end
+
+
 @dataclass(frozen=True, eq=False)
 class LegResult:
     """Everything computed from one leg."""
@@ -89,6 +99,7 @@ class LegResult:
     methods: dict[str, MethodResult]
     before: TrackCheck | None = None
     after: TrackCheck | None = None
+    per_distance: tuple[PerDistance, ...] = ()
     track_n: NDArray | None = None            # (m, 3) corrected dead reckoning, n, m
     track_before_n: NDArray | None = None     # (m, 3) as configured
     reference_n: NDArray | None = None        # (k, 3) fixes used

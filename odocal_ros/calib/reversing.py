@@ -18,12 +18,17 @@ BEFORE = 1.0        # s of the stop that belong to it
 STANDS = 0.02       # of the top speed: below it is a stop
 COUNTS = 20.0       # counts a second at top speed, below which a counter shows no acceleration
 SURE = 5.0          # sigmas
+LEAST = 1.0         # m of way
+TWICE = (0.8, 1.2)  # of twice the way, that a stretch slips by
+BY_IMU = 'the Imu is pushed the other way than at the other starts'
+BY_FIT = 'Imu and fixes go back'
+SHOWN = 3           # stretches told in the sentence
 ALIKE = (0.5, 2.0)  # of the usual ratio: a start that is like the others
 
 
-def reversed_starts(travel, t_imu, w_b, f_b, between, signed=True) -> tuple[Reason, ...]:
+def reversed_starts(travel, t_imu, w_b, f_b, between) -> np.ndarray:
     """
-    Return REVERSING_UNSIGNED where the vehicle drives off backwards and the counter counts up.
+    Return where the vehicle drives off backwards and the counter counts up: (m, 2) s.
 
     Parameters
     ----------
@@ -33,23 +38,22 @@ def reversed_starts(travel, t_imu, w_b, f_b, between, signed=True) -> tuple[Reas
         s, turn rate, rad/s, bias and all, specific force, m/s^2.
     between : (2,)
         The marks, s; what was driven before tells what is usual.
-    signed : bool
-        Whether the counter is said to tell the direction.
 
     Returns
     -------
-    At most one reason. Travel that counts down in reverse gives none, nor does an Imu whose x
-    axis lies across the vehicle.
+    Begin and end of each such stretch. Travel that counts down in reverse gives none, nor does an
+    Imu whose x axis lies across the vehicle.
 
     """
+    none = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:
-        return ()
+        return none
     t = np.arange(max(travel.t[0], t_imu[0]) + HALF, min(travel.t[-1], t_imu[-1]) - HALF, STEP)
     if len(t) < 2 * (BEFORE + HALF) / STEP:
-        return ()
+        return none
     begins, ends = _stretches(t, travel)
     if len(begins) < 2:
-        return ()
+        return none
     force = _forces(t, t_imu, w_b, f_b)
     push = _second(t, travel.t, travel.s)
     ratio, sigma = np.array([_ratio(t, push, force, a, b)
@@ -59,19 +63,51 @@ def reversed_starts(travel, t_imu, w_b, f_b, between, signed=True) -> tuple[Reas
     onward = np.sign((way * np.sign(ratio))[clear].sum())
     usual = clear & (np.sign(ratio) == onward)
     if not onward or not usual.any():
-        return ()
+        return none
     level = np.median(np.abs(ratio[usual]))
     back = clear & ~usual & (np.abs(ratio) > ALIKE[0] * level) & (
         np.abs(ratio) < ALIKE[1] * level)
     back &= (t[ends] > between[0]) & (t[begins] < between[1])
-    if not back.any():
+    # the grid's last step still moves
+    return np.stack([t[begins[back]] - HALF, t[ends[back]] + HALF], -1)
+
+
+def doubled(slips, travel, metres_per_unit) -> np.ndarray:
+    """
+    Return the stretches between stops that slipped by twice their way: reversed, (m, 2) s.
+
+    slips : of the smoother, dicts of t and duration, s, and metres that the wheel turned beyond
+    the ground.   A wheel that spins on the spot slips by its way once.
+    """
+    t = np.arange(travel.t[0] + HALF, travel.t[-1] - HALF, STEP)
+    begins, ends = _stretches(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
+    spans = np.stack([t[begins] - HALF, t[ends] + HALF], -1)
+    way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
+    middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
+    size = np.array([s['metres'] for s in slips])
+    slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
+    twice = slipped / np.maximum(2 * way, LEAST)
+    return spans[(way > LEAST) & (twice > TWICE[0]) & (twice < TWICE[1])]
+
+
+def said_of(spans, travel, metres_per_unit, seen, signed=True) -> tuple[Reason, ...]:
+    """
+    Return REVERSING_UNSIGNED with the stretches that are counted backwards, none without.
+
+    metres_per_unit : of travel, rough, None unknown.   seen : BY_IMU or BY_FIT.
+    signed : whether the counter is said to tell the direction.
+    """
+    if not len(spans):
         return ()
-    first = begins[np.argmax(back)]
     how = 'the counter does not count down' if signed else 'odometer.signed is false'
-    times = int(back.sum())
-    return (Reason(Code.REVERSING_UNSIGNED, f'{times} time{"s" * (times > 1)} the Imu is pushed '
-                   f'the other way than at the other starts, first at t = {t[first]:.1f} s, and '
-                   f'the odometer counts on: the vehicle reversed and {how}'),)
+    way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
+    each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
+            for (a, b), m in zip(spans.tolist(), way.tolist(), strict=True)]
+    more = f' and {len(each) - SHOWN} more' if len(each) > SHOWN else ''
+    times = f'{len(each)} time{"s" * (len(each) > 1)}'
+    return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen}, and the odometer counts on: the '
+                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:SHOWN])}'
+                   f'{more}'),)
 
 
 def _stretches(t, travel):

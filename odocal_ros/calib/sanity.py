@@ -6,7 +6,8 @@ from odocal_ros.reasons import Code, Reason
 
 G = 9.80665
 AXES = 'xyz'
-UNUSABLE = {Code.NO_IMU, Code.IMU_AXES}     # nothing follows from such an Imu
+# nothing follows from such an Imu; what is computed all the same says it in other words
+UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
 MAX_RATE = 8.0       # rad/s: no road vehicle turns so fast
 NOTHING = 0.01       # m/s^2, far below what gravity is in any unit
 TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up
@@ -25,8 +26,8 @@ def imu_sanity(f_b, w_b, C_bi):
 
     Returns
     -------
-    reasons, and whether the body frame must be turned over (z down) to be used. NO_IMU and
-    IMU_AXES: there is nothing to compute with.
+    reasons, and whether the body frame must be turned over (z down) to be used. Of what is
+    UNUSABLE there is nothing to compute with.
 
     """
     mean = np.median(f_b, axis=0)

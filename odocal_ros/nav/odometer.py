@@ -1,6 +1,6 @@
 """Odometer: counters, increments and speeds to travel, with rollover and resets undone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,15 @@ class Travel:
     def at(self, t):
         """Return travel at times t, linear between rows, constant outside."""
         return np.interp(t, self.t, self.s)
+
+    def mirrored(self, spans) -> 'Travel':
+        """Return it with what was counted in spans, (m, 2) s, counted the other way."""
+        def way(t):
+            return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
+                            -1.0, 1.0)
+        step = np.diff(self.s, prepend=self.s[:1]) * way(self.t)
+        coarse = self.coarse and replace(self.coarse, value=self.coarse.value * way(self.coarse.t))
+        return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 
 def travel(t, value, form, reversed_counts=False,

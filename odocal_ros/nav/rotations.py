@@ -52,6 +52,18 @@ def quat_conjugate(q):
     return np.asarray(q, dtype=float) * [-1.0, -1.0, -1.0, 1.0]
 
 
+def quat_at(t_new, t, q):
+    """
+    Return attitude at times, of attitudes that turn little from one to the next: (k, 4).
+
+    t, q : (m,) rising, (m, 4).   Outside of t the first and the last are held.
+    """
+    sides = np.einsum('ki,ki->k', q[1:], q[:-1])
+    q = q * np.cumprod(np.append(1.0, np.where(sides < 0, -1.0, 1.0)))[:, None]
+    found = np.stack([np.interp(t_new, t, column) for column in q.T], -1)
+    return found / np.linalg.norm(found, axis=-1)[..., None]
+
+
 def matrix_from_quat(q):
     """Return the rotation matrix of a quaternion of any length but zero: (..., 4)."""
     q = np.asarray(q, dtype=float)

@@ -7,6 +7,7 @@ import sys
 from odocal_ros.offline.say import say
 
 HELP = 'change between calibrations against their sigmas'
+ANOTHER = 0.1    # relative change of a scale beyond what tyres do
 FINE = 1e-3      # relative change below which a scale's is said in ppm
 CAUSES = {
     'scale': 'tyre pressure, wear, load or another tyre; calibrate again to be sure, then use the '
@@ -74,7 +75,11 @@ def verdict(found, stored) -> tuple[str, bool | None]:
 
 def _cause(change, difference, stored):
     words = change.parameter.split('_')
-    cause = next(text for key, text in CAUSES.items() if key in words or key == 'lever')
+    cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
+    if 'scale' in words and abs(
+            difference.change) > ANOTHER * stored[difference.since].value(change.parameter):
+        cause = ('another vehicle, gear, counter or unit: no tyre changes so much; compare '
+                 'calibrations of one odometer')
     return (f'{_label(change.parameter)} changed by {_amount(change, difference, stored)} '
             f'({abs(difference.sigmas):.1f} sigma) since {stored[difference.since].name}: {cause}')
 

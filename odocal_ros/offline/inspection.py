@@ -20,6 +20,9 @@ from odocal_ros.offline.wheel_survey import FIELDS as LISTS, in_words, suggested
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import take
 
+# what only a method that begins with an alignment, or sees the ends alone, minds
+ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}
+
 
 class _Tap:
     """Keeps what one reader reads, for itself; what cannot be read is kept as ``trouble``."""
@@ -66,7 +69,11 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     if {'imu', 'odometer'} <= mapping.keys():
         extra += look(bag, _together(taps, mapping), config, found, findings)
     findings += _lacking(found, mapping, config)
-    found['findings'] = [reason.as_dict() for reason in dict.fromkeys(findings)]
+    wheels = config.odometer.left or any('odometer.left=' in option for option in extra)
+    ends = ENDS - {Code.NO_STANDSTILL} if wheels else ENDS
+    found['findings'] = [reason.as_dict() | {'only': 'two_point' if (
+        config.method != 'two_point' and reason.code in ends) else None}
+        for reason in dict.fromkeys(findings)]
     found['open'] = left_open(bag.topics, config, overrides)
     found['command'] = command(path, bag.topics, config, overrides, mapping, extra)
     return _plain(found)
@@ -190,13 +197,15 @@ def _lacking(found, mapping, config) -> list[Reason]:
                           for leg in legs for _, stop in found['standstills']):
         lacking.append(Reason(Code.NO_STANDSTILL, 'no standstill before the drive: the first is '
                               f'at {found["standstills"][0][0]:.1f} s'))
-    for leg in legs:
-        name = f'the leg {leg["start"]:.1f}:{leg["stop"]:.1f} s'
-        if leg['way'] < config.leg.min_distance:
-            lacking.append(Reason(Code.LEG_TOO_SHORT, f'{name} is {leg["way"]:.0f} m long'))
-        elif closed(leg):
-            lacking.append(Reason(Code.CHORD_TOO_SHORT, f'{name} is a loop: {leg["way"]:.0f} m of '
-                                  f'way, {leg["chord"]:.0f} m from start to end'))
+    short = [leg for leg in legs if leg['way'] < config.leg.min_distance]
+    loops = [leg for leg in legs if leg not in short and closed(leg)]
+    for some, code, said in ((short, Code.LEG_TOO_SHORT, '{way:.0f} m long'), (
+            loops, Code.CHORD_TOO_SHORT, 'a loop: {way:.0f} m of way, {chord:.0f} m from start '
+            'to end')):
+        if some:
+            many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs, as '
+            lacking.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s is '.format(
+                **some[0]) + said.format(**some[0])))
     if 0 < drive['fastest'] < config.leg.min_speed:
         lacking.append(Reason(Code.SPEED_TOO_LOW, f'never faster than {drive["fastest"]:.1f} m/s'))
     return lacking + _heading(found, mapping, config)

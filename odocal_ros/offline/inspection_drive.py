@@ -5,18 +5,18 @@ import math
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
+from odocal_ros.calib.drive import way_and_chord
+from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.sanity import imu_sanity, MAX_RATE
+from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.config import Config
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.leg import LegRecorder
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.legs import EACH_STOP, find_legs, LegSpan, marked_legs
-from odocal_ros.offline.mounting import mounting
 from odocal_ros.offline.stretches import (
     straight_stretches,
     survey_drive,
-    turn_ratio,
-    way_and_chord,
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screen import screen
@@ -53,7 +53,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey_drive(inputs, config.odometer.nominal_scale, config.leg.standstill)
-    way, chord = way_and_chord(drive, -math.inf, math.inf)
+    way, chord = way_and_chord(drive.fixes_n)
     driven = _driven(inputs, drive)
     found['drive'] = {
         'way': way, 'chord': chord, 'fix_sigma': drive.sigma,
@@ -78,7 +78,7 @@ def _driven(inputs, drive) -> float:
 
 def _units(inputs, config, findings):
     """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
-    findings += imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)[0]
+    findings += with_axes(imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)[0], inputs)
     w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
     options = []
     if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:
@@ -101,30 +101,26 @@ def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    up_i = np.median(f_i, axis=0) / np.linalg.norm(np.median(f_i, axis=0))
-    ratio = turn_ratio(inputs, drive, w_i @ up_i)
+    up_i = np.median(f_i, axis=0)
+    up_i = up_i / max(np.linalg.norm(up_i), 1e-9)
+    ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma)
     found['drive']['gyro_over_course'] = ratio
-    if ratio is not None and ratio < -0.5:
-        findings.append(Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right '
-                               f'(ratio {ratio:.2f} instead of 1)'))
-    elif ratio is not None and not 0.7 < ratio < 1.4:
-        what = ', as deg/s would' if 40 < ratio < 80 else ''
-        findings.append(Reason(Code.IMU_UNITS, f'the gyro turns {ratio:.2f} times as far as the '
-                               f'course of the fixes{what}'))
+    findings += gyro_reasons(ratio, config.imu.gyro_scale)
     if m.rpy is None or not found['mounting']['needed']:
         return []
     return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
 def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
-    """Tell the legs that replay would take, and better ones if those will not do."""
+    """Tell the legs that replay would take, and better ones where the two-point method needs."""
     if not len(drive.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
 
     def described(start_ns, stop_ns, **more):
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
-        way, chord = way_and_chord(drive, start, stop)
+        way, chord = way_and_chord(
+            drive.fixes_n[(drive.t_fix >= start) & (drive.t_fix <= stop)])
         return {'start': base + start, 'stop': base + stop, 'way': way, 'chord': chord} | more
 
     marks = marked_legs(bag)
@@ -136,7 +132,8 @@ def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(drive.stops, *ends)
             for ends in straight_stretches(inputs, drive, config.leg.min_distance)[:5])]
-    if marks or not all(closed(leg) for leg in found['legs']):
+    # of the whole drive the other methods make more than of its pieces
+    if marks or config.method != 'two_point' or not all(closed(leg) for leg in found['legs']):
         return []
     open_legs = [leg for leg in found['each_stop']
                  if leg['way'] >= config.leg.min_distance and not closed(leg)]

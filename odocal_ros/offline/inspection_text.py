@@ -6,6 +6,7 @@ import textwrap
 from odocal_ros.outside import one_line
 
 WIDTH = 98
+FEW = 3        # legs told in a line each
 QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
 
@@ -158,14 +159,25 @@ def _drive(found) -> list[str]:
     shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
     lines += _wrapped(f'standstills: {shown} s' if stops else 'standstills: none, never at rest',
                       2)
-    for leg in found['legs']:
-        lines.append(f'  leg {"marked by the node" if leg["marked"] else "that replay takes"}: '
-                     + _leg(leg))
+    lines += _legs(found['legs'])
     if len(found['each_stop']) > 1:
         lines.append(f'  --leg each-stop: {len(found["each_stop"])} legs, '
                      + ', '.join(f'{leg["way"]:.0f} m' for leg in found['each_stop'][:8]))
     lines += [f'  straight: {_leg(leg)}' for leg in found['straight'][:3]]
     return lines + _mounting(found['mounting'])
+
+
+def _legs(legs) -> list[str]:
+    """Return a line for each leg, of many a table."""
+    if not legs:
+        return []
+    whose = 'marked by the node' if legs[0]['marked'] else 'that replay takes'
+    if len(legs) <= FEW:
+        return [f'  leg {whose}: {_leg(leg)}' for leg in legs]
+    return [f'  {len(legs)} legs {whose}, s and m', f'    {"leg":>3}{"from":>10}{"to":>10}'
+            f'{"way":>8}{"start to end":>14}'] + [
+        f'    {i:>3}{leg["start"]:>10.1f}{leg["stop"]:>10.1f}{leg["way"]:>8.0f}'
+        f'{leg["chord"]:>14.0f}' for i, leg in enumerate(legs, 1)]
 
 
 def _leg(leg) -> str:
@@ -191,9 +203,13 @@ def _mounting(mounting) -> list[str]:
 def _findings(found) -> list[str]:
     if not found['findings']:
         return ['nothing is lacking for a calibration']
-    lines = ['to know before calibrating']
-    for reason in found['findings']:
-        lines += _wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}', 2)
+    lines = []
+    for only, title in ((None, 'to know before calibrating'), (
+            'two_point', 'of the two-point method alone (the others do without)')):
+        some = [reason for reason in found['findings'] if reason['only'] == only]
+        lines += [title] * bool(some)
+        for reason in some:
+            lines += _wrapped(f'{reason["code"]}: {reason["text"]}. {reason["remedy"]}', 2)
     return lines
 
 

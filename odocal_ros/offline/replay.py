@@ -252,9 +252,9 @@ def _report(calibration, config, inputs, output, args) -> int:
 def _show(calibration, output, written, args, drawn) -> None:
     """Print the result and where it is."""
     from odocal_ros.output.report import NAME as REPORT
-    from odocal_ros.output.summary import screen
+    from odocal_ros.output.summary import screen, sentence
     columns, rows = _size(sys.stdout)
-    say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 7))
+    say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 9))
     if args.holdout:
         say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
     others = ', '.join(p.name for p in written if p.name != REPORT)
@@ -263,3 +263,4 @@ def _show(calibration, output, written, args, drawn) -> None:
                      break_on_hyphens=False) if rows else text))
     if output / REPORT in written and drawn:
         say(f'report:  {output / REPORT}')
+    say(sentence(calibration))      # what scrolled away, once more

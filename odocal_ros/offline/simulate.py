@@ -157,7 +157,7 @@ def _with_figures(args, given):
 def run(args) -> int:
     """Simulate, write the bag and the two files beside it; return 0."""
     out = Path(args.out)
-    beside = [out.parent / name for name in (TRUTH, SETTINGS)]
+    beside = _beside(out)
     for path in beside:
         _check_beside(path, args.force)
     known = args.known_heading_sigma_deg
@@ -182,6 +182,15 @@ def run(args) -> int:
             f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
             f'{for_shell(replay)}')
     return 0
+
+
+def _beside(out: Path) -> list[Path]:
+    """Return where truth and settings go: with the bag's name where another bag's are there."""
+    plain = [out.parent / name for name in (TRUTH, SETTINGS)]
+    text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
+    if MADE_HERE in text and one_line(f'Truth of {out.name}.') not in text:
+        return [path.with_name(f'{out.name}.{path.name}') for path in plain]
+    return plain
 
 
 def _check_beside(path: Path, force: bool) -> None:

@@ -1,18 +1,17 @@
-"""How a recording was driven: way, stops, straight stretches, and whether the gyro agrees."""
+"""How a recording was driven: way, stops, straight stretches."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.nav.angles import arctan2
+from odocal_ros.calib.drive import white_noise
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screen import Inputs
 
 STRAIGHT = 0.97      # chord over way: a stretch at least this straight suits the two-point method
 POINTS = 600         # fixes looked at for straight stretches, evenly taken
-TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
 AT_SPEED = 1.0       # s, over which a speed is taken
 
 
@@ -55,30 +54,8 @@ def survey_drive(inputs: Inputs, nominal_scale: float, shortest: float) -> Drive
         if scale and len(t):
             speed = np.abs(inputs.travel.at(t + AT_SPEED) - inputs.travel.at(t)) * scale / AT_SPEED
             slowest, fastest = float(speed.min()), float(speed.max())
-    return Drive(scale, sigma, _white(fixes_n), stops, inputs.t_fix, fixes_n, slowest, fastest)
-
-
-def _white(fixes_n) -> float:
-    """Return the white noise of fixes, m, by the median of their second differences."""
-    if len(fixes_n) < 5:
-        return 2.5
-    bend = np.diff(fixes_n[:, :2], n=2, axis=0)
-    return float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6)))
-
-
-def way_and_chord(drive: Drive, start: float, stop: float) -> tuple[float, float]:
-    """
-    Return the way driven and the distance between the ends, m, by the fixes from start to stop.
-
-    The way goes from fix to fix at least ten times their white noise apart: nearer ones would
-    add it up.
-    """
-    p = drive.fixes_n[(drive.t_fix >= start) & (drive.t_fix <= stop), :2]
-    if len(p) < 2:
-        return 0.0, 0.0
-    knots = [*_knots(p, max(2.0, 10 * drive.white)), len(p) - 1]
-    way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
-    return way, float(np.hypot(*(p[-1] - p[0])))
+    return Drive(scale, sigma, white_noise(fixes_n), stops, inputs.t_fix, fixes_n, slowest,
+                 fastest)
 
 
 def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tuple[float, float]]:
@@ -103,41 +80,3 @@ def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tu
         found.append((float(t[i]), float(t[j])))
         fit[:j + 1, i:] = False            # whatever overlaps it
     return found
-
-
-def turn_ratio(inputs: Inputs, drive: Drive, w_up) -> float | None:
-    """
-    Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
-
-    w_up : (n,) turn rate about the upward axis, rad/s. None where the drive hardly turns or the
-    two have little to do with each other.
-    """
-    knots = _knots(drive.fixes_n, max(5.0, 10 * drive.sigma))
-    if len(knots) < 5:
-        return None
-    step = np.diff(drive.fixes_n[knots, :2], axis=0)
-    t = (drive.t_fix[knots][:-1] + drive.t_fix[knots][1:]) / 2
-    course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
-    angle = np.concatenate([[0.0], np.cumsum((w_up[:-1] + w_up[1:]) / 2 * np.diff(inputs.t_imu))])
-    # the mean angle over each chord; what a bias adds goes with the time
-    way_of = np.concatenate([[0.0], np.cumsum((angle[:-1] + angle[1:]) / 2
-                                              * np.diff(inputs.t_imu))])
-    ends = drive.t_fix[knots]
-    gyro = np.diff(np.interp(ends, inputs.t_imu, way_of)) / np.diff(ends)
-    drift = np.stack([np.ones_like(t), t], -1)
-    course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
-    power = float(gyro @ gyro)
-    if course @ course < TURNED**2 or power == 0:
-        return None
-    slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
-    alike = abs(slope) * np.sqrt(power / (course @ course))
-    return 1 / slope if alike > 0.9 else None
-
-
-def _knots(fixes_n, least) -> list[int]:
-    """Return fixes at least so far apart, m."""
-    knots = [0] if len(fixes_n) else []
-    for k, point in enumerate(fixes_n[:, :2]):
-        if np.hypot(*(point - fixes_n[knots[-1], :2])) >= least:
-            knots.append(k)
-    return knots

@@ -15,7 +15,7 @@ from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
-from odocal_ros.output.track_table import overall
+from odocal_ros.output.track_table import in_pieces, overall
 
 SCHEMA = 1
 MAIN = 'calibration.json'
@@ -62,7 +62,8 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
         'result': result,
         'methods': {name: _method(m) for name, m in calibration.methods.items()},
         'legs': [_leg(leg) for leg in calibration.legs],
-        'check': {name: _check(check) for name, check in checks.items()},
+        'check': {name: _check(check) for name, check in checks.items()} | {
+            'per_distance': _per_distance(calibration.legs)},
         'inputs': inputs,
         'config': flat(config)})
 
@@ -93,7 +94,12 @@ def _leg(leg: LegResult) -> dict:
             'pulses': leg.pulses, 'fixes': leg.fixes, 'rejected_fixes': leg.rejected_fixes,
             'verdict': leg.verdict.value, 'reasons': [r.as_dict() for r in leg.reasons],
             'methods': {name: _method(m) for name, m in leg.methods.items()},
-            'check': {'before': _check(leg.before), 'after': _check(leg.after)}}
+            'check': {'before': _check(leg.before), 'after': _check(leg.after),
+                      'per_distance': _per_distance([leg])}}
+
+
+def _per_distance(legs) -> list[dict]:
+    return [{'length': x.length, 'before': x.before, 'after': x.after} for x in in_pieces(legs)]
 
 
 def _plain(value):

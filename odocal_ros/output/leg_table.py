@@ -30,7 +30,9 @@ def leg_table(calibration: Calibration, config: Config, content: dict) -> dict[s
 
 def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
     """Return a row; what a leg does not know is an empty cell."""
-    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+    giving = {e.method for e in calibration.estimates.values() if e.value is not None}
+    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
+                               if m.name in giving or not giving)]
     row = {'leg': number, 'bag': for_table(leg.bag), 'start [UTC]': _iso(leg.start_ns),
            'start [ns]': leg.start_ns, 'stop [ns]': leg.stop_ns,
            'duration [s]': leg.duration, 'distance [m]': leg.distance,

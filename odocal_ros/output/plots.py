@@ -20,12 +20,14 @@ from odocal_ros.output.plots_svg import (
     thinned,
 )
 
+GAP = 5.0       # median intervals between fixes: more is marked
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
           1: ('satellite based aid, SBAS (1)', 's', GREEN),
           2: ('ground based aid, GBAS or RTK (2)', '^', PINK)}
 
 
-def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None) -> list[tuple]:
+def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
+                before_word: str = 'as configured', smoothed: dict | None = None) -> list[tuple]:
     """
     Draw a leg.
 
@@ -37,6 +39,10 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None) ->
         Put before the ids of each figure.
     scale_sigma : float, optional
         Relative sigma of the leg's scale: the band about zero of the sections.
+    before_word : str
+        What the track before the correction rests on.
+    smoothed : dict, optional
+        Details of the smoother: slips, and biases at its keyframes.
 
     Returns
     -------
@@ -45,18 +51,21 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None) ->
     """
     if not len(found.t):
         return []
-    figures = [_track(found, name)]
+    smoothed = smoothed or {}
+    figures = [_track(found, name, before_word, smoothed.get('slips', ()))]
     if len(found.t_fix):
-        figures.append(_residuals(found, name))
+        figures.append(_residuals(found, name, before_word))
     if np.isfinite(found.sections.ratio).any():
         figures.append(_sections(found, name, scale_sigma))
     figures.append(_motion(found, name))
     if len(found.t_fix) or len(found.t_excluded):
         figures.append(_fixes(found, name))
+    if 'key_biases' in smoothed:
+        figures.append(_biases(smoothed['key_t'], smoothed['key_biases'], name))
     return figures
 
 
-def _track(found, name):
+def _track(found, name, before_word, slips):
     start = found.track_n[0]
     factor, unit = lengths(np.ptp(found.track_n[:, :2], axis=0).max())
     after, before, fixes = (factor * (x - start)[:, :2] for x in (
@@ -64,7 +73,7 @@ def _track(found, name):
     figure, (ax,) = sheet(5.2)
     few = evenly(len(fixes))
     ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
-    ax.plot(*before[thinned(before)].T, '--', color=RED, label='as configured', linewidth=1.2)
+    ax.plot(*before[thinned(before)].T, '--', color=RED, label=before_word, linewidth=1.2)
     ax.plot(*after[thinned(after)].T, '-', color=BLUE, label='as calibrated')
     ax.plot(*after[0], 'o', color='black', markersize=6, markerfacecolor='white', zorder=5)
     ax.plot(*after[-1], 's', color='black', markersize=5, zorder=5)
@@ -74,6 +83,7 @@ def _track(found, name):
         side, up = np.where(point < middle, -1, 1)
         ax.annotate(word, point, xytext=(7 * side, 6 * up), textcoords='offset points',
                     ha='right' if side < 0 else 'left', va='top' if up < 0 else 'bottom')
+    _marks(ax, found, lambda t: np.stack([np.interp(t, found.t, x) for x in after.T]), slips)
     ax.set(xlabel=f'east of the start, {unit}', ylabel=f'north of the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.06)
@@ -83,7 +93,23 @@ def _track(found, name):
     return 'Track', says, svg(figure, f'{name}-track', says)
 
 
-def _residuals(found, name):
+def _marks(ax, found, at, slips):
+    """Mark on the track what is odd: fixes not used, times without any, slips."""
+    few = found.t_excluded[evenly(len(found.t_excluded))]
+    if len(few):
+        ax.plot(*at(few), 'x', color=RED, markersize=5, zorder=4, label='fix not used')
+    step = np.diff(found.t_fix)
+    for i, k in enumerate(np.flatnonzero(step > max(GAP * np.median(step), 1.0)) if len(step)
+                          else ()):
+        t = np.linspace(found.t_fix[k], found.t_fix[k + 1], 50)
+        ax.plot(*at(t), '-', color=PINK, linewidth=4, alpha=0.6, zorder=1,
+                label='no fix used' if i == 0 else None)
+    if len(slips):
+        ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
+                markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')
+
+
+def _residuals(found, name, before_word):
     factor, unit = lengths(found.distance[-1])
     way, sigma = factor * found.fix_distance, found.fix_sigma
     figure, axes = sheet(5.2, 3)
@@ -101,9 +127,9 @@ def _residuals(found, name):
     for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
                                   strict=True):
         axes[2].plot(way[rows], column[rows], dash, color=RED, linewidth=1.3,
-                     label=f'as configured, {word}')
+                     label=f'{before_word}, {word}')
     axes[2].axhline(0.0, color=GREY, linewidth=0.8)
-    axes[2].set(xlabel=f'distance driven, {unit}', ylabel='as configured, m')
+    axes[2].set(xlabel=f'distance driven, {unit}', ylabel=f'{before_word}, m')
     axes[2].legend(loc='lower center', bbox_to_anchor=(0.5, 0.97), ncols=2, borderaxespad=0.0)
     figure.subplots_adjust(hspace=0.24)
     key(figure, axes[0])
@@ -173,3 +199,20 @@ def _fixes(found, name):
     says = ('Horizontal sigma of each axis, as stated (or gnss.default_sigma), by status. '
             'Crosses at the foot: fixes that were not used.')
     return 'Fix quality', says, svg(figure, f'{name}-fixes', says)
+
+
+def _biases(t, biases, name):
+    figure, axes = sheet(3.6, 2)
+    for ax, columns, factor, word in zip(axes, biases, (np.rad2deg(3600.0), 1e3), (
+            'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True):
+        for column, colour, dash, axis in zip(columns.T, (BLUE, RED, GREEN), ('-', '--', ':'),
+                                              'xyz', strict=True):
+            rows = thinned(column)
+            ax.plot(t[rows], factor * column[rows], dash, color=colour, linewidth=1.2, label=axis)
+        ax.set_ylabel(word)
+    axes[1].set_xlabel('time since the start mark, s')
+    key(figure, axes[0])
+    figure.align_ylabels(axes)
+    says = ('Biases of the Imu as the smoother finds them along the drive. They wander with '
+            'temperature; a step, or a walk far beyond the grade, is another fault.')
+    return 'Biases', says, svg(figure, f'{name}-biases', says)

@@ -1,10 +1,12 @@
 """Reasons and bags of legs for a person: the gravest first, what legs share said once."""
 
+from dataclasses import replace
 import re
 import textwrap
 
 from odocal_ros.reasons import Reason, Verdict
 
+FEW = 2      # reasons of a code that differ from leg to leg, told one by one
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 
@@ -14,15 +16,39 @@ def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     for reason in reasons:
         match = OF_LEG.fullmatch(reason.text)
         number, text = match.groups() if match else ('', reason.text)
-        joined.setdefault((reason.code, text, bool(match)), []).append(number)
-    return tuple(Reason(code, f'{_legs(numbers)}: {text}' if of_leg else text)
-                 for (code, text, of_leg), numbers in joined.items())
+        joined.setdefault((replace(reason, text=text), bool(match)), []).append(number)
+    of_code: dict[object, list[tuple[Reason, list[str]]]] = {}
+    for (reason, of_leg), numbers in joined.items():
+        of_code.setdefault(reason.code if of_leg else reason, []).append((reason, numbers))
+    return tuple(line for found in of_code.values() for line in _of_legs(found))
+
+
+def _of_legs(found):
+    """Return the reasons of a code with their legs; of many that differ, the first one."""
+    if not found[0][1][0]:
+        return [found[0][0]]
+    if len(found) <= FEW:
+        return [replace(reason, text=f'{_legs(numbers)}: {reason.text}')
+                for reason, numbers in found]
+    reason, first = found[0]
+    every = sorted({int(n) for _, numbers in found for n in numbers})
+    return [replace(reason, text=f'{_legs([str(n) for n in every])}; of leg {first[0]}: '
+                                 f'{reason.text}')]
 
 
 def _legs(numbers):
+    """Return leg numbers, rising, as people say them."""
     if len(numbers) == 1:
         return f'leg {numbers[0]}'
-    return f'legs {", ".join(numbers[:-1])} and {numbers[-1]}'
+    runs: list[list[str]] = []
+    for number in numbers:
+        if runs and int(number) == int(runs[-1][-1]) + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    said = [word for run in runs for word in (
+        run if len(run) < 3 else [f'{run[0]} to {run[-1]}'])]
+    return f'legs {", ".join(said[:-1])} and {said[-1]}' if len(said) > 1 else f'legs {said[0]}'
 
 
 def bag_lines(legs, width: int) -> list[str]:

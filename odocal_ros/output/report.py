@@ -5,14 +5,14 @@ from datetime import datetime, UTC
 from html import escape
 from importlib.resources import files
 
-from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import DEG, known, MEANING, sentence
-from odocal_ros.output.track_table import overall
+from odocal_ros.output.track_table import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
 
 NAME = 'report.html'
@@ -47,7 +47,11 @@ def report_html(calibration: Calibration, config: Config, content: dict) -> str:
         (folder / 'report.html').read_text(encoding='utf-8'))
     style = (folder / 'report.css').read_text(encoding='utf-8')
     legs, compared, missing = _drawn(calibration)
-    return page.render(style=style, legs=legs, compared=compared, missing=missing,
+    # the track stands beside the verdict, once
+    first = legs[0]['figures'][:1] if legs else []
+    if first:
+        legs[0]['figures'] = legs[0]['figures'][1:]
+    return page.render(style=style, legs=legs, compared=compared, missing=missing, first=first,
                        **_context(calibration, config, content)) + '\n'
 
 
@@ -71,8 +75,6 @@ def report_or_why(calibration: Calibration, config: Config, content: dict) -> tu
 def _context(calibration, config, content):
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
-    checks = [overall([(getattr(leg, name), leg.fixes) for leg in legs])
-              for name in ('before', 'after')]
     methods = _leading(calibration.methods, calibration.estimates)
     bags = list(dict.fromkeys(str(i['bag']) for i in content['inputs'] if i.get('bag')))
     return {
@@ -82,13 +84,22 @@ def _context(calibration, config, content):
         'sentence': sentence(calibration).partition(': ')[2],
         'way': f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
                f'{time_span(duration)}',
-        'values': tables.value_rows(calibration), 'rotation': _degrees(calibration),
-        'reasons': grouped(calibration.reasons), 'check': tables.check_rows(*checks),
+        'values': tables.value_rows(calibration), 'lost': tables.undetermined(calibration),
+        'why': _why(calibration.reasons), 'rotation': _degrees(calibration),
+        'reasons': grouped(calibration.reasons), 'check': check_table(legs),
         'methods': tables.method_table(methods, legs), 'budgets': _budgets(methods),
         'inputs': content['inputs'],
         'settings': tables.changed_settings(config),
         'versions': tables.versions(content['software']),
         'digits': tables.full_digits(content)}
+
+
+def _why(reasons) -> Reason | None:
+    """Return the gravest reason that keeps a result from being accepted, the first of such."""
+    groups = grouped(reasons)
+    if not groups or groups[0][0] == Verdict.ACCEPTED.value:
+        return None
+    return min(groups[0][2], key=lambda r: r.code not in ABOUT)      # of a value, before others
 
 
 def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
@@ -134,7 +145,8 @@ def _drawn(calibration):
         for number, leg in enumerate(calibration.legs, 1):
             figures = []
             if leg.evidence is not None and size < MOST_BYTES:
-                figures = leg_figures(leg.evidence, f'leg{number}', _relative(leg))
+                figures = leg_figures(leg.evidence, f'leg{number}', _relative(leg),
+                                      before_label([leg]), _smoothed(leg))
                 size += sum(len(drawing) for _, _, drawing in figures)
                 if size > MOST_BYTES:
                     figures, missing = [], missing + 1
@@ -154,9 +166,16 @@ def _leg(number, leg: LegResult, figures, several):
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
             'budgets': _budgets(methods) if several else [],
-            'check': tables.check_rows(leg.before, leg.after) if several else [],
+            'check': check_table((leg,)),
             'reasons': grouped(leg.reasons) if several else [],
-            'left_out': rows, 'findings': findings}
+            'left_out': rows, 'findings': findings,
+            'normalised': _smoothed(leg).get('residuals', {}).get('normalised')}
+
+
+def _smoothed(leg):
+    """Return what the smoother tells of a leg beside its values, empty without it."""
+    method = leg.methods.get('smoother')
+    return method.details if method else {}
 
 
 def _relative(leg):

@@ -8,7 +8,7 @@ import numpy as np
 from odocal_ros.calib.result import BESIDE, Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.config import Config, flat, SETTINGS
 from odocal_ros.output.budget_table import LABELS as SOURCES
-from odocal_ros.output.figures import beyond_one, length, share, two_digits, with_sigma
+from odocal_ros.output.figures import beyond_one, share, two_digits, with_sigma
 from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
 from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
@@ -26,7 +26,6 @@ OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOP
            Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
            Code.WHEEL_COUNTERS_DIFFER, Code.ODOMETER_CHOSEN, Code.DELAY_SEEN,
            Code.REVERSING_UNSIGNED}
-CHECKS = (('as configured', 'before'), ('as calibrated', 'after'))
 
 
 def label(name: str) -> str:
@@ -58,15 +57,25 @@ def value_rows(calibration: Calibration) -> list[dict]:
     rows = []
     for name in calibration.estimates:
         estimate = known(calibration.estimates, name)
-        if name == 'scale_ratio' and estimate.value is None:
-            continue             # no nominal scale was given: nothing is missing
+        if estimate.value is None:
+            continue
         first, other, relative = in_units(name, estimate)
         method = calibration.methods.get(estimate.method)
         rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
-                     'method': label(estimate.method) if estimate.value is not None else '',
-                     'mostly': largest_source(method, name) if estimate.value is not None else '',
-                     'lost': estimate.value is None})
+                     'method': label(estimate.method), 'mostly': largest_source(method, name)})
     return rows
+
+
+def undetermined(calibration: Calibration) -> list[str]:
+    """Return the values that were not determined, axes of one thing together."""
+    axes: dict[str, list[str]] = {}
+    for name in calibration.estimates:
+        # no nominal scale was given: nothing is missing
+        if known(calibration.estimates, name).value is None and name != 'scale_ratio':
+            whole, _, axis = name.rpartition('_')
+            one = axis in ('x', 'y', 'z')
+            axes.setdefault(label(whole if one else name), []).extend([axis] * one)
+    return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
 def largest_source(method: MethodResult | None, name: str) -> str:
@@ -142,13 +151,6 @@ def _column(name, estimate):
         return f'{label(name)}, deg', DEG
     factor, unit = SMALL.get(estimate.unit, (1.0, estimate.unit))
     return f'{label(name)}, {unit}', factor
-
-
-def check_rows(before, after) -> list[tuple]:
-    """Return the rows of dead reckoning against the fixes."""
-    return [(word, length(c.rms), length(c.mean), length(c.max), length(c.end),
-             f'{c.percent_of_distance:.3f} %')
-            for (word, _), c in zip(CHECKS, (before, after), strict=True) if c is not None]
 
 
 def left_out(leg: LegResult) -> tuple[list[tuple[str, str]], list[Reason]]:

@@ -14,6 +14,7 @@ from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
 WIDTH = 98
+FAR_SCALE = 0.005    # of a gyro's scale from 1
 SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
@@ -51,7 +52,7 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
                                  (False, False, False)):
         parts = [_head(calibration, styled), _values(calibration, width),
                  _leg_table(calibration.legs, width), _method_table(calibration),
-                 track_lines(calibration.legs),
+                 track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
                  reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)
@@ -142,6 +143,7 @@ def _values(calibration, width):
                     '   heading and (reversed) mounting together' if width >= WIDTH else '')
             lines.append(_line(name.replace('_', ' '), text))
     lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
+    lines.append(_gyro_scale(calibration))
     biases = [known(estimates, name) for name in BIASES]
     if all(bias.value is not None for bias in biases):
         shown = ', '.join(with_sigma(b.value, b.sigma, DEG_PER_HOUR, signed=True) for b in biases)
@@ -153,6 +155,15 @@ def _values(calibration, width):
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return [line if len(line) <= width or width >= WIDTH else line.partition('   mostly ')[0]
             for line in lines if line]
+
+
+def _gyro_scale(calibration):
+    """Return by what the gyro's turns are to be multiplied, '' where that is near 1."""
+    method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
+    error = method.details.get('gyro_scale_z') if method else None
+    if not error or abs(error['value']) < max(FAR_SCALE, 3 * error['sigma']):
+        return ''
+    return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
 
 def _arm(estimates, arm, word):

@@ -2,8 +2,11 @@
 
 import math
 
-from odocal_ros.calib.result import TrackCheck
+from odocal_ros.calib.result import PerDistance, TrackCheck
 from odocal_ros.output.figures import length
+
+SIDES = 'before', 'after'
+LABEL, CELL = 22, 9      # columns
 
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
@@ -23,15 +26,45 @@ def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
            for name in ('max', 'end', 'percent_of_distance')})
 
 
-def track_lines(legs) -> list[str]:
-    """Return the table of dead reckoning against the fixes, none without fixes."""
+def in_pieces(legs) -> list[PerDistance]:
+    """Return the error per distance driven of all legs, pooled over pieces."""
+    found: dict[float, list[PerDistance]] = {}
+    for one in (x for leg in legs for x in leg.per_distance):
+        found.setdefault(one.length, []).append(one)
+    whole = {length: sum(x.pieces for x in parts) for length, parts in found.items()}
+    return [PerDistance(length, *(math.sqrt(sum(
+        x.pieces * getattr(x, name)**2 for x in parts) / whole[length]) for name in SIDES),
+        whole[length]) for length, parts in sorted(found.items())]
+
+
+def before_label(legs) -> str:
+    """Return what the track before the correction rests on: settings, or none of the scale."""
+    configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
+                     for leg in legs for m in leg.methods.values())
+    return 'as configured' if configured else 'with a rough scale'
+
+
+def check_table(legs) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
+    pieces = in_pieces(legs)
     rows = []
-    for label, name in (('as configured', 'before'), ('as calibrated', 'after')):
+    for label, name in zip((before_label(legs), 'as calibrated'), SIDES, strict=True):
         check = overall([(getattr(leg, name), leg.fixes) for leg in legs])
         if check is not None:
-            cells = (length(check.rms), length(check.mean), length(check.max), length(check.end),
-                     f'{check.percent_of_distance:.3f} %')
-            rows.append(f'  {label:<20}' + ''.join(f'{cell:>11}' for cell in cells))
-    head = ('rms', 'mean', 'max', 'at the end', 'of the way')
-    return [f'  {"track against fixes":<20}' + ''.join(f'{word:>11}' for word in head), *rows] \
-        if rows else []
+            rows.append((label, [
+                *(length(getattr(x, name)) for x in pieces), length(check.rms),
+                length(check.max), length(check.mean), length(check.end),
+                f'{check.percent_of_distance:.3f} %']))
+    heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
+             for x in pieces]
+    return [*heads, 'rms', 'max', 'mean', 'at end', 'of way'], rows
+
+
+def track_lines(legs, width: int) -> list[str]:
+    """Return the table of dead reckoning against the fixes, as wide as there is room."""
+    heads, rows = check_table(legs)
+    if not rows:
+        return []
+    most = (width - LABEL) // CELL
+    return [f'  {label:<{LABEL - 2}}' + ''.join(f'{cell:>{CELL}}' for cell in cells[:most])
+            for label, cells in (('track against fixes', heads), *rows)]

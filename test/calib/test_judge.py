@@ -6,7 +6,6 @@ import pytest
 from odocal_ros.calib.check import (
     against_travel,
     fix_noise_factor,
-    gyro_against_course,
     mismatch,
     pieces,
     steady,
@@ -16,6 +15,7 @@ from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.sanity import imu_sanity
 from odocal_ros.calib.slow_errors import slow_variance
+from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.config import Config, with_settings
 from odocal_ros.reasons import Code
 
@@ -47,6 +47,20 @@ def test_each_limit_has_its_sentence(values, nominal, code, text):
     assert codes(reasons) == [code]
     assert text in reasons[0].text
     assert code.gravity.value == 'caution'
+
+
+@pytest.mark.parametrize(('kmh', 'unit', 'nominal', 'word', 'wanted'), [
+    (1.0084 / 3.6, '1', 1.0, 'km/h', 1 / 3.6), (0.4507, '1', 1.0, 'mph', 0.44704),
+    (0.0051, 'm/pulse', 0.02, 'four edges', 0.005), (0.6, '1', 1.0, '', None)])
+def test_a_scale_that_a_mistaken_unit_makes_names_it(kmh, unit, nominal, word, wanted):
+    found = {'scale_factor': Estimate(kmh, 1e-6, unit),
+             'yaw_mounting_angle': Estimate(None, None, 'rad')}
+    (reason,) = judge(found, nominal, CONFIG)
+    assert word in reason.text
+    if wanted is None:
+        assert reason.remedy == Code.SCALE_FAR_FROM_NOMINAL.remedy
+    else:
+        assert f'odometer.nominal_scale to {wanted:.6g}' in reason.remedy
 
 
 def test_what_is_not_determined_is_not_judged():
@@ -156,22 +170,27 @@ class TestCheck:
         assert mismatch(check, 1.5, 0.0, 5000.0) == ()
 
     @pytest.mark.parametrize(('factor', 'code', 'text'), [
-        (1.0, None, ''), (-1.0, Code.GYRO_SIGN, 'wrong sign'),
-        (57.3, Code.IMU_UNITS, 'set imu.gyro_scale to 0.017453292519943295'),
-        (1 / 57.3, None, ''), (0.3, Code.IMU_UNITS, 'imu.gyro_scale wants 3.3')])
+        (1.0, None, ''), (-1.0, Code.GYRO_SIGN, 'ratio -1.'),
+        (57.3, Code.IMU_UNITS, 'set imu.gyro_scale to 0.01745329252'),
+        (14.0, Code.IMU_UNITS, 'set imu.gyro_scale to 0.07'),
+        (0.3, Code.IMU_UNITS, 'set imu.gyro_scale to 3.3')])
     def test_turns_by_gyro_and_by_fixes(self, factor, code, text):
-        course = np.cumsum([0.0, 1.2, -0.9, 1.0, 0.7, -1.3])
-        reasons = gyro_against_course(factor * course, np.angle(np.exp(1j * course)))
-        if code is None and factor != 1.0:
-            code, text = Code.IMU_UNITS, 'imu.gyro_scale wants 57.3'
+        """Round a slalom of radius 100 m at 10 m/s: the course turns by -+0.1 rad/s."""
+        t = np.arange(0.0, 300.0, 0.05)
+        rate = 0.1 * np.sign(np.sin(t / 10))
+        course = np.cumsum(rate) * 0.05
+        way = np.cumsum(np.exp(1j * course)) * 0.5
+        fixes = np.stack([way.real, way.imag], -1)[::10]
+        reasons = gyro_reasons(turn_ratio(t, factor * rate + 0.01, t[::10], fixes, 0.5), 1.0)
         assert codes(reasons) == ([code] if code else [])
-        assert not code or text in reasons[0].text
+        assert all(text in f'{r.text} {r.remedy}' for r in reasons)
 
     def test_reversing_with_rising_counts_is_seen(self):
         course = np.array([0.1, 0.0, 0.1, 0.0, 3.1, 3.2, 0.1, 0.0])
         as_far = np.full(8, 1.05)
         reasons = against_travel(np.full(8, 0.05), course, as_far, signed=True)
-        assert codes(reasons) == [Code.REVERSING_UNSIGNED]
+        assert codes(reasons) == [Code.TRACK_MISMATCH]
+        assert 'the vehicle reversed' in reasons[0].text
         assert 'on 2 of 8 pieces' in reasons[0].text
         assert against_travel(course + 0.3, course, as_far, signed=True) == ()
         # fixes that jump back 60 m and on again while the vehicle goes on by 20

@@ -74,6 +74,24 @@ def test_a_yaw_about_half_a_turn_changes_by_the_short_way(compare):
     assert found['yaw_mounting_angle'][1]['to_first']['change'] == pytest.approx(2e-4)
 
 
+@pytest.mark.parametrize(('scale', 'word'), [(0.0202, 'tyre'), (0.03, 'another vehicle')])
+def test_a_change_that_no_tyre_makes_is_another_odometer(compare, scale, word):
+    _, out, _ = compare(content(), content(scale, start=2 * START))
+    assert word in out
+    assert ('tyre pressure' in out) == (word == 'tyre')
+
+
+def test_a_delay_that_changes_is_no_lever_arm(compare):
+    def late(value):
+        one = content(start=START + round(1e15 * value))
+        one['result']['gnss_delay'] = {'value': value, 'sigma': 1e-3, 'unit': 's',
+                                       'method': 'smoother'}
+        return one
+    _, out, _ = compare(late(0.0), late(0.1))
+    assert 'gnss delay changed by +0.1 s' in out
+    assert 'a driver, bus or receiver was set differently' in out
+
+
 def test_a_small_change_of_scale_is_told_in_ppm(compare):
     # 2e-6 of 0.02 is 100 ppm
     code, out, _ = compare(content(), content(0.020002, 4e-6, start=2 * START))

@@ -113,7 +113,12 @@ def test_nothing_is_replaced_unasked(tmp_path, capsys):
     first = (tmp_path / 'truth.yaml').read_text()
     assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
     assert 'truth.yaml is there already; give --force' in capsys.readouterr().err
-    assert odocal(*SHORT, '--out', tmp_path / 'other', '--seed', 2) == 2
+    # another bag has a truth of its own beside it, and leaves this one alone
+    for _ in range(2):
+        assert odocal(*SHORT, '--out', tmp_path / 'other', '--seed', 2, '--force') == 0
+    assert 'truth in ' + str(tmp_path / 'other.truth.yaml') in capsys.readouterr().out
+    assert load(tmp_path / 'other.truth.yaml')['bag'] == 'other'
+    assert (tmp_path / 'truth.yaml').read_text() == first
     (tmp_path / 'truth.yaml').unlink()
     (tmp_path / 'calibrator.yaml').unlink()
     assert odocal(*SHORT, '--out', out, '--seed', 2) == 2

@@ -64,7 +64,7 @@ def test_json_holds_no_nan_and_says_null_for_what_is_not_known(good, nothing):
     assert empty['verdict'] == 'rejected'
     assert empty['result']['scale_factor'] == {'value': None, 'sigma': None, 'unit': None,
                                                'method': None}
-    assert empty['check'] == {'before': None, 'after': None}
+    assert empty['check'] == {'before': None, 'after': None, 'per_distance': []}
     json.dumps(empty, allow_nan=False)
 
 

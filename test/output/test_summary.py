@@ -4,10 +4,12 @@ from dataclasses import replace
 import math
 import re
 
+from conftest import GAP
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate, TrackCheck
 from odocal_ros.output.figures import beyond_one, length, time_span, with_sigma
+from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import screen, sentence
 from odocal_ros.output.track_table import overall
 from odocal_ros.reasons import Code, Reason
@@ -176,3 +178,25 @@ def test_a_low_terminal_leaves_the_lesser_things_to_the_report(good):
     assert 'notes, see the report: TOPIC_GAP' in fits[30]
     assert 'error budget' not in fits[30]
     assert 'Drive gently' in fits[30], 'what to do is never left out'
+
+
+def test_what_many_legs_say_in_other_figures_is_one_reason(good):
+    """Of 35 legs each is too short by its own way: one line, not 35, and each leg is in it."""
+    reasons = [Reason(Code.LEG_TOO_SHORT, f'leg {n}: {60 + n} m between the marks')
+               for n in range(1, 36) if n not in (4, 30)]
+    reasons += [Reason(Code.WHEEL_SLIP, f'leg {n}: slip of {n} m') for n in (2, 9)]
+    told = [r.text for r in shared((*reasons, GAP))]
+    assert told == ['legs 1 to 3, 5 to 29 and 31 to 35; of leg 1: 61 m between the marks',
+                    'leg 2: slip of 2 m', 'leg 9: slip of 9 m', GAP.text]
+
+
+@pytest.mark.parametrize(('error', 'sigma', 'shown'), [
+    (0.012, 4e-4, 'gyro scale z        0.98800 ± 0.00040'), (0.004, 4e-4, None),
+    (0.012, 5e-3, None)])
+def test_a_gyro_scale_far_from_one_is_said(good, error, sigma, shown):
+    """A gyro that turns 1.2 % too far is to be multiplied by 0.988; near 1, or unsure: nothing."""
+    method = good.methods['two_point']
+    method = replace(method, details=method.details | {
+        'gyro_scale_z': {'value': error, 'sigma': sigma}})
+    text = screen(replace(good, methods={'two_point': method}))
+    assert (shown in text) if shown else ('gyro scale' not in text)

@@ -7,6 +7,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.mismatch import mismatch
+from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.remarks import beside, FLOOR, level_pitch, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
@@ -21,7 +22,9 @@ from odocal_ros.calib.smoother.state import (
     LN_K,
     M,
     ODO_ARM,
+    PHI,
     PITCH,
+    V,
     YAW,
 )
 from odocal_ros.nav.angles import wrap
@@ -195,7 +198,8 @@ def _undetermined(sigma, limit, config, yaw):
                               'nominal one'))
     if sigma[PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'the drive tells the pitch mounting to '
-                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only'))
+                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only', 'Drive longer, with '
+                              'stops and starts; good ellipsoidal heights help too.'))
     return reasons
 
 
@@ -222,17 +226,26 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
-                      'fixes': len(t_fix),
+                      'fixes': len(t_fix), 'normalised': _normalised(fit.weighted),
                       'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float(turned), 'in_turns': problem.turned,
                        'standing': float(problem.still.sum())},
         'track_t': state.t[::step], 'track_n': (state.p_n + state.C_nb @ arm)[::step],
-        # what dead reckoning begins with: a bias that holds for the whole leg
-        'start': {'t': float(state.t[0]), 'C_nb': state.C_nb[0],
-                  'gyro_bias': state.gyro_bias.mean(axis=0)},
+        'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
+        'key_biases': np.stack([state.gyro_bias, state.accel_bias]),
     }
+
+
+def _normalised(weighted):
+    """Return how the rows of each sensor lie in their sigmas, before weights take off tails."""
+    motion, fixes = weighted['motion'].r, weighted['fixes']
+    white = fixes.r / np.sqrt(fixes.weight / fixes.thin)
+    return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
+                   'beyond_3_sigma': float((np.abs(r) > 3).mean())}
+            for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
+                            ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
 
 
 def _outside(leg, problem, fit, sigma):

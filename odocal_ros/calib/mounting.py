@@ -1,6 +1,6 @@
 """How an Imu sits in the vehicle: up from gravity, forward from what driving does to it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.facing import LEAST, pushes
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
+from odocal_ros.reasons import Code, Reason
 
 SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
 NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it
@@ -38,6 +39,24 @@ class Mounting:
         if self.C_bi is None:
             return None
         return [float(x) for x in np.round(rpy_from_matrix(self.C_bi), 12) + 0.0]
+
+
+def remedy(found: Mounting) -> str:
+    """Return what to set, '' where the drive does not tell."""
+    if found.rpy is None:
+        return ''
+    rpy = ','.join(f'{x:.10g}' for x in found.rpy)
+    return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy=[{rpy}]'"
+            + ", if the Imu's x axis points forward." * found.assumed + '.' * (not found.assumed))
+
+
+def with_axes(reasons, inputs) -> list[Reason]:
+    """Return reasons, IMU_AXES with what to set where the screened inputs show it."""
+    if not any(r.code is Code.IMU_AXES for r in reasons):
+        return list(reasons)
+    found = mounting(inputs.t_imu, inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi,
+                     inputs.travel, 1.0)
+    return [replace(r, do=remedy(found)) if r.code is Code.IMU_AXES else r for r in reasons]
 
 
 def mounting(t, w_i, f_i, travel: Travel, metres_per_unit: float) -> Mounting:

@@ -1,0 +1,71 @@
+"""Error of dead reckoning per distance driven, before and after: what scale and yaw make of it."""
+
+import numpy as np
+
+from odocal_ros.calib.result import PerDistance
+from odocal_ros.reasons import Code, Reason
+
+LENGTHS = 100.0, 500.0, 1000.0      # m
+BEGINNINGS = 10     # of pieces, on the length of one
+TOO_LONG = 1.2      # times the length: fixes are missing in there
+FEWEST = 3.0        # pieces end to end, for a word on them
+SURE = 3.0          # sigmas of the difference of two mean squares
+WORSE = 1.1         # times as far, below which nobody would mind
+
+
+def per_distance(way, before, after) -> tuple[PerDistance, ...]:
+    """
+    Return the relative error of two tracks, pinned anew to a fix for each piece.
+
+    Parameters
+    ----------
+    way : (k,) array
+        m driven at each fix.
+    before, after : (k, 3) arrays
+        Track less fixes, m, pinned anywhere.
+
+    Returns
+    -------
+    One entry for each length that the way holds: rms of what track and fixes differ by at the end
+    of a piece that begin together, the fixes' own noise at both ends in it.
+
+    """
+    return tuple(PerDistance(length, *(float(np.sqrt(x.mean())) for x in squares), pieces)
+                 for length, pieces, squares in _lengths(way, before, after))
+
+
+def _lengths(way, before, after):
+    for length in LENGTHS:
+        a, b = _ends(way, length)
+        if len(a):
+            squares = [((x[b] - x[a])[:, :2]**2).sum(axis=1) for x in (before, after)]
+            yield length, len(a) / BEGINNINGS, squares
+
+
+def _ends(way, length):
+    """Return the rows at which pieces of a length begin and end, a tenth of it apart."""
+    begin = np.arange(way[0], way[-1] - length, length / BEGINNINGS) if len(way) else np.empty(0)
+    a = np.searchsorted(way, begin)
+    b = np.searchsorted(way, way[a] + length)
+    whole = b < len(way)
+    a, b = a[whole], b[whole]
+    near = way[b] - way[a] <= TOO_LONG * length
+    return a[near], b[near]
+
+
+def check_worse(way, before, after, configured) -> list[Reason]:
+    """
+    Return CHECK_WORSE where the correction takes the track farther from the fixes, beyond chance.
+
+    way, before, after : as for ``per_distance``.   configured : whether a nominal scale is.
+    """
+    for length, pieces, (was, now) in _lengths(way, before, after):
+        more = now - was
+        if pieces < FEWEST or now.mean() < WORSE**2 * was.mean() \
+                or more.mean() < SURE * more.std() / np.sqrt(pieces):
+            continue
+        return [Reason(Code.CHECK_WORSE, f'in {length:g} m the track as calibrated strays '
+                       f'{np.sqrt(now.mean()):.2g} m rms from the fixes, '
+                       + ('as configured' if configured else 'with a rough scale')
+                       + f' {np.sqrt(was.mean()):.2g} m')]
+    return []

@@ -1,0 +1,62 @@
+"""Turns by the gyro beside turns of the course: a wrong sign or unit, before all that follows."""
+
+import numpy as np
+
+from odocal_ros.calib.drive import knots_of
+from odocal_ros.nav.angles import arctan2
+from odocal_ros.reasons import Code, Reason
+
+TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
+APART = 5.0, 10.0    # m, and fix sigmas: between fixes that give a course
+ALIKE = 0.9          # correlation from which they are the same turns
+RIGHT = 0.6, 1.6     # of the ratio: no scale error, skid or lean is so large
+DEGREES = 40.0, 80.0     # the same, of deg/s
+
+
+def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
+    """
+    Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
+
+    None where the drive hardly turns or the two have little to do with each other.
+
+    Parameters
+    ----------
+    t_imu, w_up : (n,) arrays
+        s, and turn rate about the upward axis.
+    t_fix, fixes_n, sigma : (k,), (k, 2 or more), float
+        s, m, and m horizontally.
+
+    """
+    knots = knots_of(fixes_n, max(APART[0], APART[1] * sigma))
+    if len(knots) < 5:
+        return None
+    step = np.diff(fixes_n[knots, :2], axis=0)
+    t = (t_fix[knots][:-1] + t_fix[knots][1:]) / 2
+    course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
+    angle = np.concatenate([[0.0], np.cumsum((w_up[:-1] + w_up[1:]) / 2 * np.diff(t_imu))])
+    # the mean angle over each chord; what a bias adds goes with the time
+    way_of = np.concatenate([[0.0], np.cumsum((angle[:-1] + angle[1:]) / 2 * np.diff(t_imu))])
+    ends = t_fix[knots]
+    gyro = np.diff(np.interp(ends, t_imu, way_of)) / np.diff(ends)
+    drift = np.stack([np.ones_like(t), t], -1)
+    course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
+    power = float(gyro @ gyro)
+    if course @ course < TURNED**2 or power == 0:
+        return None
+    slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
+    alike = abs(slope) * np.sqrt(power / (course @ course))
+    return 1 / slope if alike > ALIKE else None
+
+
+def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
+    """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, tells it."""
+    if ratio is None or RIGHT[0] < ratio < RIGHT[1]:
+        return ()
+    if ratio < -RIGHT[0]:
+        return (Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right (ratio '
+                       f'{ratio:.2f} instead of 1)'),)
+    degrees = DEGREES[0] < ratio < DEGREES[1]
+    wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
+    return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.3g} times as far as the course of '
+                   'the fixes' + ', as deg/s would' * degrees,
+                   f'Mend the sender, or set imu.gyro_scale to {wanted:.10g}.'),)
