@@ -46,6 +46,12 @@ class ImuRows:
         t = leg.t_imu[rows]
         return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
 
+    def between(self, first, last):
+        """Return the rows from one keyframe to another, both with them."""
+        a, b = self.key[first], self.key[last]
+        return ImuRows(self.t[a:b + 1], self.f_b[a:b + 1], self.turn[a:b],
+                       self.key[first:last + 1] - a)
+
 
 def mended(imu, constants):
     """Return rotation vectors (n - 1, 3) and forces (n, 3) without the Imu's own errors."""

@@ -93,6 +93,7 @@ class Problem:
     def sums_near(self, state: State) -> 'Sums':
         """Return the last sums where they were made near a state, else those about it."""
         if self.kept is None or not self.kept.hold_at(state):
+            self.kept = None        # two at a time are as much as all else
             self.kept = self.sums(state)
         return self.kept
 

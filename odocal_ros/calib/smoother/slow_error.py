@@ -57,15 +57,16 @@ class SlowError(Part):
         """Return of each level its quadratic sum and what is expected of it."""
         i, n = np.arange(SLOW.start, SLOW.stop), self.n
         a, q = self.decay, self.drive
-        var = near[:, n + i, n + i] + a**2 * near[:, i, i] - 2 * a * near[:, i, n + i]
+        var = near.entries(n + i, n + i) + a**2 * near.entries(i, i) \
+            - 2 * a * near.entries(i, n + i)
         num = (self.residual()**2 / q).sum(axis=0) + self.state.slow_n[0]**2 / self.power
-        den = (1 - var / q).sum(axis=0) + (1 - near[0, i, i] / self.power)
+        den = (1 - var / q).sum(axis=0) + (1 - near[0][i, i] / self.power)
         return {'slow': (float(num[:2].sum()), float(den[:2].sum())),
                 'slow_up': (float(num[2]), float(den[2]))}
 
     def effects(self, near):
         """Yield what unit errors of what drives it, and of its first value, do."""
-        told, n = self.to_told(near), self.n
+        told, n = self.all_told(near), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = told[:, :, end] - self.decay[:, :, None] * told[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]

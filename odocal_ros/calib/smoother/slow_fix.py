@@ -95,12 +95,12 @@ def with_slow_errors(problem, first: Fit, asked: float, trace=None) -> Fit:
         fix=WHITE_SHARE * first.levels['fix'], fix_up=WHITE_SHARE * first.levels['fix_up'])
     if not np.isnan(asked):
         return fit(problem, first.state, levels, trace=trace)
-    best = fit(problem, first.state, levels, FIRST, trace=trace)
+    best = fit(problem, first.state, levels, FIRST, trace=trace).outline()
     tries = {TIMES[1]: best}
     for tau in (TIMES[0], TIMES[2]):
         power = {k: best.levels[k] * min(2.0, (tau / TIMES[1])**0.5) for k in ('slow', 'slow_up')}
         tries[tau] = fit(problem, best.state, best.levels.but(correlation_time=tau, **power),
-                         TRIAL, about=best, trace=trace)
+                         TRIAL, about=best, trace=trace).outline()
     tau = _peak([np.log(x) for x in TIMES], [tries[x].likelihood for x in TIMES])
     start = min(tries.items(), key=lambda item: abs(np.log(item[0]) - tau))[1]
     last = fit(problem, start.state, start.levels.but(correlation_time=float(np.exp(tau))),
