@@ -26,7 +26,6 @@ from odocal_ros.nav.rotations import (
 from odocal_ros.nav.strapdown import prefix_product
 
 Floats = NDArray[np.float64]
-CHUNK = 8192      # samples worked on at a time: their arrays stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +121,8 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
     """
     key, out, points = imu.key, [], []
     owner = np.clip(np.searchsorted(imu.t[key], t_points, side='right') - 1, 0, len(key) - 2)
-    per = max(1, int(CHUNK * (len(key) - 1) / max(len(imu.t), 1)))
-    for first in range(0, len(key) - 1, per):
-        last = min(first + per, len(key) - 1)
+    for first, last, rows in imu.parts():
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
-        rows = imu.between(first, last)
         part = _Chunk(rows, mended(rows, constants), gyro_bias[first:last],
                       accel_bias[first:last], derivatives)
         out.append(part.intervals(travel, forward))
