@@ -33,12 +33,14 @@ def judge_clocks(leg, offsets, labels) -> list[Reason]:
         return found
     base = imu.received_ns[0]
     arrival, lag = (imu.received_ns - base) * 1e-9, _lag(imu)
-    order = np.argsort(arrival, kind='stable')
+    if not (np.diff(arrival) >= 0).all():
+        order = np.argsort(arrival, kind='stable')
+        arrival, lag = arrival[order], lag[order]
     for slot in TOPICS:
         samples = _stamped(getattr(leg, slot))
         if not len(samples.stamp_ns):
             continue
-        there = np.interp((samples.received_ns - base) * 1e-9, arrival[order], lag[order])
+        there = np.interp((samples.received_ns - base) * 1e-9, arrival, lag)
         ahead = float(np.median(there - _lag(samples))) + offsets[slot]
         if abs(ahead) > LIMIT:
             found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '

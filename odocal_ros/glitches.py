@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.nav.integral import by_row, by_step
 from odocal_ros.reasons import Code, Reason
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
@@ -32,17 +33,24 @@ def beyond(name, column):
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
+    most = BEYOND.get(name, LARGEST)
+
+    def odd(x):
+        size = np.abs(x)
+        usable = (size <= most) & ((size >= TINY) | (size == 0))
+        return ~usable.all(axis=tuple(range(1, x.ndim)))
     with np.errstate(invalid='ignore'):
-        size = np.abs(column)
-        usable = (size <= BEYOND.get(name, LARGEST)) & ((size >= TINY) | (size == 0))
-    return ~usable.all(axis=tuple(range(1, column.ndim)))
+        return by_row(odd, column)
 
 
 def oriented(samples):
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
+    def no_attitude(wild, q_ni, variance):
+        length = np.linalg.norm(np.where(wild[:, None], 0.0, q_ni), axis=1)
+        return (length < 1 / UNIT) | (length > UNIT) | (np.abs(variance) > WIDEST)
+
     wild = beyond('q_ni', samples.q_ni)
-    length = np.linalg.norm(np.where(wild[:, None], 0.0, samples.q_ni), axis=1)
-    none = (length < 1 / UNIT) | (length > UNIT) | (np.abs(samples.yaw_variance) > WIDEST)
+    none = by_row(no_attitude, wild, samples.q_ni, samples.yaw_variance)
     if not (wild | none & ~np.isnan(samples.yaw_variance)).any():
         return samples
     return replace(samples, q_ni=np.where(none[:, None], 0.0, samples.q_ni),
@@ -87,7 +95,7 @@ def alone(t, x, least):
 
     """
     found = np.zeros(len(x), bool)
-    bound = np.abs(np.diff(x, axis=0)).max(axis=1, initial=0.0)
+    bound = by_step(lambda x: np.abs(np.diff(x, axis=0)).max(axis=1, initial=0.0), x)
     if not (bound > least).any():
         return found
     least = max(least, CLEAR * float(np.median(bound)))
@@ -126,7 +134,7 @@ def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
-    same = (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1)
+    same = by_step(lambda w: (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1), w)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     begin, end = t[edges[::2]], t[edges[1::2]]
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)

@@ -13,7 +13,6 @@ from odocal_ros.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
-    join,
     no_fix,
     no_heading,
     no_imu,
@@ -24,6 +23,7 @@ from odocal_ros.samples import (
     take,
     VelocitySamples,
 )
+from odocal_ros.spool import Rows
 
 EMPTY = {
     'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
@@ -62,7 +62,7 @@ class LegRecorder:
     """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
 
     def __init__(self) -> None:
-        self._blocks: dict[str, list] = {slot: [] for slot in SLOTS}
+        self._rows = {slot: Rows(nothing) for slot, nothing in EMPTY.items()}
         self._newest = dict.fromkeys(SLOTS, 0)
         self.form = COUNTER
         self.form_right: OdometerForm | None = None
@@ -70,7 +70,7 @@ class LegRecorder:
     def feed(self, slot: str, block) -> None:
         """Append a block (one row or many) to a slot of SLOTS."""
         if len(block.stamp_ns):
-            self._blocks[slot].append(block)
+            self._rows[slot].feed(block)
             self._newest[slot] = int(block.stamp_ns[-1])
 
     def newest_ns(self, slot: str) -> int:
@@ -79,12 +79,7 @@ class LegRecorder:
 
     def rows(self, slot: str):
         """Return all rows of a slot as one block, in order of arrival."""
-        blocks = self._blocks[slot]
-        if not blocks:
-            return EMPTY[slot]()
-        if len(blocks) > 1:
-            self._blocks[slot] = blocks = [join(blocks)]
-        return blocks[0]
+        return self._rows[slot].all()
 
     def snapshot(self) -> 'LegRecorder':
         """
@@ -96,17 +91,13 @@ class LegRecorder:
         copy = LegRecorder()
         copy.form, copy.form_right = self.form, self.form_right
         copy._newest = dict(self._newest)
-        copy._blocks = {slot: list(blocks) for slot, blocks in self._blocks.items()}
+        copy._rows = {slot: rows.snapshot() for slot, rows in self._rows.items()}
         return copy
 
     def forget_before(self, stamp_ns: int, slots=SLOTS) -> None:
         """Drop blocks that lie whole before a stamp, to bound memory."""
         for slot in slots:
-            blocks = self._blocks[slot]
-            keep = 0
-            while keep < len(blocks) and _key(blocks[keep]).max() < stamp_ns:
-                keep += 1
-            del blocks[:keep]
+            self._rows[slot].forget(lambda block: _key(block) < stamp_ns)
 
     def clear(self) -> None:
         """Drop everything, as after a jump of time."""
@@ -146,4 +137,8 @@ def _cut(samples, first_ns: int, stop_ns: int):
     after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)
-    return samples if keep.all() else take(samples, keep)
+    if keep.all():
+        return samples
+    edges = np.flatnonzero(np.diff(keep, prepend=False, append=False))
+    # in order, as rows are wont to come, they are a view and no copy
+    return take(samples, slice(*edges) if len(edges) == 2 else keep)

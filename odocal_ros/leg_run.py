@@ -25,6 +25,7 @@ from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.samples import let_go
 from odocal_ros.screen import imu_gap
 
 # methods that begin with the alignment: what it had to say is said of them
@@ -90,6 +91,7 @@ class LegRun:
             return leg_result(self.leg, self.inputs, self.reasons)
         methods, paths = {}, {}
         for name in self._asked():
+            let_go(*vars(self.leg.imu).values())
             method, paths[name] = run_method(name, self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
@@ -240,11 +242,12 @@ class LegRun:
     def attitude_from(self, t_begin, q_nb, gyro_bias):
         """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
         inputs = self.inputs
-        pick = (inputs.t_imu >= t_begin - 1e-9) & (inputs.t_imu <= inputs.t_stop + 1.0)
-        t = inputs.t_imu[pick]
+        rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
+                     np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
+        t = inputs.t_imu[rows]
         rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
-        return attitude(t, inputs.w_b[pick] - gyro_bias, q_nb,
-                        earth_rate_n(self.origin.latitude), max(1, int(rate / EPOCH_RATE)))
+        return attitude(t, inputs.w_b[rows], q_nb, earth_rate_n(self.origin.latitude),
+                        max(1, int(rate / EPOCH_RATE)), gyro_bias)
 
     def _four_fifths(self):
         """Return when four fifths of the distance are driven, s."""

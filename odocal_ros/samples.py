@@ -8,6 +8,7 @@ to compare clocks and never enters a result.
 """
 
 from dataclasses import dataclass, fields
+import mmap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,7 @@ def freeze(owner, **rows) -> None:
 
 def take(samples, index):
     """Return the rows that a numpy index picks, as the same type."""
-    return _owned(type(samples), {f.name: getattr(samples, f.name)[index]
+    return of_columns(type(samples), {f.name: getattr(samples, f.name)[index]
                                   for f in fields(samples)})
 
 
@@ -139,17 +140,28 @@ def join(blocks):
     if len(blocks) == 1:
         return blocks[0]
     names = [f.name for f in fields(blocks[0])]
-    return _owned(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
+    return of_columns(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
                                     for n in names})
 
 
-def _owned(kind, columns):
+def of_columns(kind, columns):
     """Return samples of arrays that were checked before and that nobody else holds: no copy."""
     samples = object.__new__(kind)
     for name, array in columns.items():
         array.setflags(write=False)
         object.__setattr__(samples, name, array)
     return samples
+
+
+def let_go(*arrays) -> None:
+    """Give back the memory of arrays that are mapped from a file; they can be read as before."""
+    for array in arrays:
+        while isinstance(array, np.ndarray):
+            array = array.base
+        if isinstance(array, memoryview):
+            array = array.obj
+        if isinstance(array, mmap.mmap):
+            array.madvise(mmap.MADV_DONTNEED)
 
 
 def no_imu() -> ImuSamples:

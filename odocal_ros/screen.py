@@ -31,7 +31,7 @@ from odocal_ros.nav.dead_reckoning import rough_scale
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.samples import take
+from odocal_ros.samples import let_go, take
 from odocal_ros.wheel_travel import wheels
 
 GAP_FACTOR = 5.0         # a gap in odometer or fixes, in median intervals
@@ -133,6 +133,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
     if travelled.right is not None:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
+    let_go(*vars(leg.imu).values())
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
         travelled = replace(travelled, left=None, right=None)
     inputs = Inputs(
@@ -202,7 +203,7 @@ def _finite(samples, slot, leg, found):
         column = getattr(samples, name)
         odd = beyond(name, column)
         finite &= ~odd
-        wild |= odd & np.isfinite(column).all(axis=tuple(range(1, column.ndim)))
+        wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
+from odocal_ros.nav.integral import medians
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.samples import let_go
 
 BIN = 1.0                      # s, accelerations are compared as means over it
 LEAST = 20                     # bins
@@ -72,10 +74,17 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
     edges = np.arange(t0, t1, BIN)
     cell = np.searchsorted(edges, t) - 1
     inside = (cell >= 0) & (cell < len(edges) - 1)
-    count = np.bincount(cell[inside], minlength=len(edges) - 1)
-    mean_of = [np.bincount(cell[inside], column[inside], len(edges) - 1) / np.maximum(count, 1)
-               for column in (*f.T, w @ up)]
-    f, turn_rate = np.stack(mean_of[:3], -1), mean_of[3]
+    cell = cell[inside]
+    count = np.bincount(cell, minlength=len(edges) - 1)
+
+    def mean_of(column):
+        return np.bincount(cell, column[inside], len(edges) - 1) / np.maximum(count, 1)
+
+    means = [mean_of(column) for column in f.T]
+    let_go(f)
+    means.append(mean_of(w @ up))
+    let_go(w)
+    f, turn_rate = np.stack(means[:3], -1), means[3]
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
     middle = (edges[:-1] + edges[1:]) / 2
     onward = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
@@ -103,7 +112,7 @@ def facing(t, w_b, f_b, travel, metres_per_unit) -> Facing | None:
         As for ``pushes``.
 
     """
-    mean = np.median(f_b, axis=0)
+    mean = medians(f_b)
     size = float(np.linalg.norm(mean))
     found = pushes(t, w_b, f_b, mean / size, travel, metres_per_unit) if size else None
     if found is None:

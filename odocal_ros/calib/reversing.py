@@ -9,6 +9,7 @@ that only once the stretch is long beside their noise; a few metres are enough f
 import numpy as np
 
 from odocal_ros.calib.sanity import G
+from odocal_ros.nav.integral import Integral, integral_at, interpolated, pieces
 from odocal_ros.reasons import Code, Reason
 
 STEP = 0.1          # s, grid
@@ -54,7 +55,7 @@ def reversed_starts(travel, t_imu, w_b, f_b, between) -> np.ndarray:
     begins, ends = _stretches(t, travel)
     if len(begins) < 2:
         return none
-    force = _forces(t, t_imu, w_b, f_b)
+    force = _Forces(t, t_imu, w_b, f_b)
     push = _second(t, travel.t, travel.s)
     ratio, sigma = np.array([_ratio(t, push, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
@@ -131,31 +132,41 @@ def _second(t, t_in, s):
     return (before - 2 * here + after) / HALF**2
 
 
-def _forces(t, t_imu, w_b, f_b):
-    """Return integrals to be differenced: (n,) of f_x twice, (n, 3) of the turn, and f itself."""
-    step = np.diff(t_imu)[:, None]
+class _Forces:
+    """
+    Integrals of the Imu's rows at the steps of a grid t: (m,).
 
-    def integral(x):
-        return np.concatenate([np.zeros((1, x.shape[1])),
-                               np.cumsum((x[1:] + x[:-1]) / 2 * step, axis=0)])
-    speed = integral(f_b)
-    return t_imu, integral(speed[:, :1])[:, 0], integral(w_b), speed
+    turned, speed : (m, 3) of w and f.   speed_before : (m, 3), HALF before.   push : (m,) second
+    difference of the way that f_x makes.
+    """
+
+    def __init__(self, t, t_imu, w_b, f_b):
+        self.turned = integral_at(t, t_imu, w_b)
+        self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-HALF, 0.0))
+        before, here, after = (_way(t + d, t_imu, f_b[:, 0]) for d in (-HALF, 0.0, HALF))
+        self.push = (before - 2 * here + after) / HALF**2
+
+
+def _way(times, t, x):
+    """Return the integral of the integral of x at rising times."""
+    speed, way, out = Integral(), Integral(), np.empty(len(times))
+    for where, rows in pieces(times, t, x):
+        interpolated(times[where], t[rows], way.over(t[rows], speed.over(t[rows], x[rows])),
+                     out[where])
+    return out
 
 
 def _ratio(t, push, force, a, b):
     """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
-    t_imu, way, turned, speed = force
     low = max(0, a - round((BEFORE + HALF) / STEP))
     high = min(len(t), b + 1, a + round(LONGEST / STEP))
     span = t[low:high]
     # which way is up, at rest: as the vehicle pitches, gravity goes into x or out of it
-    rest = [np.array([np.interp(x, t_imu, v) for v in speed.T])
-            for x in (span[0] - HALF, t[max(a - round(HALF / STEP), 0)])]
+    rest = force.speed_before[low], force.speed[max(a - round(HALF / STEP), 0)]
     up = (rest[1] - rest[0]) / max(np.linalg.norm(rest[1] - rest[0]), 1e-9)
-    turn = np.stack([np.interp(span, t_imu, v) for v in turned.T], -1)
-    turn -= turn[0]
+    turn = force.turned[low:high] - force.turned[low]
     tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
-    y = _second(span, t_imu, way) - G * tilt
+    y = force.push[low:high] - G * tilt
     A = np.stack([push[low:high], np.ones(len(span)), span - span.mean()], -1)
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     spread = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.reasons import Code, Reason
 
 G = 9.80665
@@ -30,9 +31,9 @@ def imu_sanity(f_b, w_b, C_bi):
     UNUSABLE there is nothing to compute with.
 
     """
-    mean = np.median(f_b, axis=0)
+    mean, rest = medians(f_b), medians(w_b)
     size = float(np.linalg.norm(mean))
-    fast = float(np.percentile(np.linalg.norm(w_b - np.median(w_b, axis=0), axis=1), 99.9))
+    fast = float(np.percentile(by_row(lambda w: np.linalg.norm(w - rest, axis=1), w_b), 99.9))
     reasons = []
     if not w_b.any():       # what messages hold that have none
         reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '

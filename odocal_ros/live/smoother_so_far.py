@@ -160,7 +160,7 @@ class SmootherSoFar:
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
-        best = judge_running(best, problem.grade)      # more of a drive tells more of it
+        best = judge_running(best, problem.grade).outline()     # more of a drive tells more of it
         best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
         if not best.settled:
             best = fit(problem, best.state, best.levels, MORE, about=best, trace=trace)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from odocal_ros.nav.integral import integral_at
+
 CELL = 0.1            # s, grid of the detector
 WINDOW = 0.5          # s, each side
 MOVE = 0.03           # m, travel within the window that still counts as standing
@@ -73,15 +75,14 @@ def _still_wheels(middle, travel, metres_per_unit):
 def _gyro(edges, t_imu, w_b):
     """Return the mean turn rate about each cell, (m, 3), and where it wanders less than TURN."""
     dt = np.diff(t_imu)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(
-        (w_b[:-1] + w_b[1:]) / 2 * dt[:, None], axis=0)])
-    angle = np.stack([np.interp(edges, t_imu, total[:, k]) for k in range(3)], -1)
-    rate = np.diff(angle, axis=0) / np.diff(edges)[:, None]
+    rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
     reach = round(WINDOW / CELL)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
-    unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > WINDOW, dt, 0.0))])
-    seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing is known within a gap
+    seen = np.ones(len(rate), bool)
+    if (dt > WINDOW).any():
+        unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > WINDOW, dt, 0.0))])
+        seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing known within a gap
     return windows.mean(axis=-1), (windows.std(axis=-1) < TURN).all(axis=-1) & seen
 
 

@@ -8,6 +8,8 @@ without any per-sample loop.
 
 import numpy as np
 
+from odocal_ros.samples import let_go
+
 BLOCK = 64       # quaternions a scan multiplies up in step; 40 to 800 make no difference
 CHUNK = 16384    # intervals worked on at a time: their arrays stay in the cache
 EVEN = 2.0       # ratio of neighbouring intervals up to which a cubic is laid through them
@@ -28,14 +30,15 @@ def rotation_increments(t, w_b):
     phi = np.empty((3, n))
     for first in range(0, n, CHUNK):
         phi[:, first:first + CHUNK] = _increments(t, w_b, first, min(first + CHUNK, n))
+        let_go(w_b)
     return phi
 
 
-def _increments(t, w_b, first, last):
+def _increments(t, w_b, first, last, bias=0.0):
     """Return the rotation vectors of the intervals from first up to last: (3, last - first)."""
     low, high = max(first - 1, 0), min(last + 1, len(t) - 1)     # with a neighbour each side
     h = np.diff(t[low:high + 1])
-    w = np.ascontiguousarray(w_b[low:high + 1].T)
+    w = np.ascontiguousarray((w_b[low:high + 1] - bias).T)
     rise = w[:, 1:] - w[:, :-1]
     mid = w[:, :-1] + w[:, 1:]
     mid *= 0.5
@@ -125,7 +128,7 @@ def _scan(a, b):
     return A.T.reshape(-1)[:n], B.T.reshape(-1)[:n]
 
 
-def _products(t, w_b, every):
+def _products(t, w_b, every, bias):
     """Return the rotation over each ``every`` intervals, the last group may be short: pairs."""
     n = len(t) - 1
     groups = -(-n // every)
@@ -133,7 +136,7 @@ def _products(t, w_b, every):
     step = max(1, CHUNK // every)
     for g in range(0, groups, step):
         first, last = g * every, min((g + step) * every, n)
-        c, d = _pairs_from_rotvec(_increments(t, w_b, first, last))
+        c, d = _pairs_from_rotvec(_increments(t, w_b, first, last, bias))
         if missing := -(last - first) % every:
             c = np.concatenate([c, np.ones(missing)])
             d = np.concatenate([d, np.zeros(missing)])
@@ -142,10 +145,11 @@ def _products(t, w_b, every):
         for k in range(1, every):
             c, d = _times(c, d, C[:, k], D[:, k])
         a[g:g + step], b[g:g + step] = c, d
+        let_go(w_b)
     return a, b
 
 
-def attitude(t, w_b, q_nb0, earth_rate_n, every=1):
+def attitude(t, w_b, q_nb0, earth_rate_n, every=1, bias=0.0):
     """
     Propagate attitude through gyro samples.
 
@@ -154,13 +158,15 @@ def attitude(t, w_b, q_nb0, earth_rate_n, every=1):
     t : (n,) array
         Sample times, s, rising; the attitude ``q_nb0`` holds at ``t[0]``.
     w_b : (n, 3) array
-        Turn rate of b against inertial space, rad/s, bias removed.
+        Turn rate of b against inertial space, rad/s.
     q_nb0 : (4,) array
         Attitude at t[0], x y z w.
     earth_rate_n : (3,) array
         Earth rate in n, rad/s (n is fixed to the Earth).
     every : int
         Keep one epoch in this many.
+    bias : (3,) array, optional
+        Of the gyro, taken out, rad/s.
 
     Returns
     -------
@@ -175,7 +181,7 @@ def attitude(t, w_b, q_nb0, earth_rate_n, every=1):
         return t, np.empty((0, 4))
     t_out = np.append(t[:-1:every], t[-1])
     a0, b0 = _pairs(q_nb0)
-    a, b = _products(t, w_b, every)
+    a, b = _products(t, w_b, every, bias)
     a, b = _scan(np.append(a0, a), np.append(b0, b))
     # n turns with the Earth under the inertial frame it was at t[0]
     earth = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))

@@ -25,9 +25,13 @@ def _dense(seed=0, rows=8):
 def _as_chain(H, g):
     b = [slice(k * SIZE, (k + 1) * SIZE) for k in range(N)]
     c = slice(N * SIZE, TOTAL)
-    return Normal(np.stack([H[s, s] for s in b]),
-                  np.stack([H[b[k], b[k + 1]] for k in range(N - 1)]),
-                  np.stack([H[s, c] for s in b]), H[c, c], g[:N * SIZE].reshape(N, SIZE), g[c])
+    out = Normal(N, SIZE, BORDER)
+    out.diagonal[:] = [H[s, s] for s in b]
+    out.beside[:] = [H[b[k], b[k + 1]] for k in range(N - 1)]
+    out.border[:] = [H[s, c] for s in b]
+    out.g[:] = g[:N * SIZE].reshape(N, SIZE)
+    out.corner[:], out.g_border[:] = H[c, c], g[c]
+    return out
 
 
 def test_step_and_covariances_are_those_of_a_dense_solve():

@@ -140,7 +140,7 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, na
     wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'velocity_up', 'heading', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighed(levels)
-    normal = Normal.zeros(len(state.t), N, M)
+    normal = Normal(len(state.t), N, M)
     part.add(normal)
     rng = np.random.default_rng(2)
     x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(M)

@@ -4,9 +4,15 @@ Least squares on a chain: blocks that touch their neighbours only, and a border 
 The normal matrix is block tridiagonal with a border of constants. Blocks are eliminated one after
 the other by Cholesky; the way back gives the step, and the covariance of each pair of neighbours
 with the border. Unknowns are scaled to a unit diagonal first: they differ by 1e20 in size.
+
+An hour has thousands of blocks: the equations, their elimination and the covariances stand one
+after the other in the same memory.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,31 +20,32 @@ from numpy.typing import NDArray
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
+BLOCK = 64        # intervals worked on at a time: their matrices stay in the cache
+SHORT = 1200      # intervals of a leg so short that what is made of them may be kept
 
 
 class NotPositive(OdocalError):
     """The normal matrix is not positive definite: nothing holds some unknown."""
 
 
-@dataclass(eq=False)
 class Normal:
-    """Normal equations H x = g of N blocks of n unknowns and a border of m."""
+    """
+    Normal equations H x = g of N blocks of n unknowns and a border of m, at first all zero.
 
-    diagonal: Floats      # (N, n, n)
-    beside: Floats        # (N - 1, n, n): row k, column k + 1
-    border: Floats        # (N, n, m)
-    corner: Floats        # (m, m)
-    g: Floats             # (N, n)
-    g_border: Floats      # (m,)
+    diagonal : (N, n, n).   beside : (N - 1, n, n), row k, column k + 1.   border : (N, n, m).
+    corner : (m, m).   g, g_border : (N, n), (m,).
+    """
 
-    @classmethod
-    def zeros(cls, N, n, m):
-        """Return equations that say nothing."""
-        return cls(np.zeros((N, n, n)), np.zeros((N - 1, n, n)), np.zeros((N, n, m)),
-                   np.zeros((m, m)), np.zeros((N, n)), np.zeros(m))
+    def __init__(self, N, n, m):
+        self.diagonal = np.zeros((N, n, n))
+        self.wide = np.zeros((N, n, n + m + 1))     # what elimination carries, side by side
+        self.beside = self.wide[:-1, :, :n]
+        self.border = self.wide[:, :, n:n + m]
+        self.g = self.wide[:, :, n + m]
+        self.corner, self.g_border = np.zeros((m, m)), np.zeros(m)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Solved:
     """Step, and what the covariances are made from."""
 
@@ -48,49 +55,112 @@ class Solved:
     log_determinant: float    # of H
     reduced: Floats           # (m, m) of the border, all blocks eliminated
     g_reduced: Floats         # (m,)
-    _back: Floats             # (N, n, n + m)
-    _own: Floats              # (N, n, n)
+    _chain: tuple[Floats, Floats] | None    # (N, n, n + m + 1), (N, n, n), until neighbours
     _scale: Floats            # (N, n)
     _scale_border: Floats     # (m,)
 
-    def neighbours(self):
-        """
-        Return the covariance of block k, block k + 1 and the border: (N - 1, 2n + m, 2n + m).
-
-        Also, in the last place, nothing is lost: block N - 1 stands second in the last one.
-        """
+    def neighbours(self) -> 'Neighbours':
+        """Return the covariances of neighbours; once, for they take the place of the chain."""
+        assert self._chain is not None, 'the chain was used up'
+        (wide, own), self._chain = self._chain, None
         N, n = self.step.shape
         m = len(self.step_border)
         z = np.empty((n + m, n + m))          # of block k + 1 and the border, scaled
-        out = np.empty((N - 1, 2 * n + m, 2 * n + m))
         corner = self.covariance / np.multiply.outer(self._scale_border, self._scale_border)
-        H = self._back[N - 1][:, n:]
+        H = wide[N - 1][:, n:n + m]
         z[n:, n:] = corner
         z[:n, n:] = -H @ corner
         z[n:, :n] = z[:n, n:].T
-        z[:n, :n] = self._own[N - 1] - z[:n, n:] @ H.T
+        z[:n, :n] = own[N - 1] - z[:n, n:] @ H.T
+        own[N - 1], wide[N - 1, :, n:n + m] = z[:n, :n], z[:n, n:]
         for k in range(N - 2, -1, -1):
-            G = self._back[k]
+            G = wide[k][:, :n + m]
             across = -G @ z
-            here = out[k]
-            here[n:, n:] = z
-            here[:n, n:] = across
-            here[n:, :n] = across.T
-            here[:n, :n] = self._own[k] - across @ G.T
-            z = z.copy()
-            z[:n, :n] = here[:n, :n]
+            own[k] -= across @ G.T
+            G[:] = across
+            z[:n, :n] = own[k]
             z[:n, n:] = across[:, n:]
             z[n:, :n] = across[:, n:].T
-        scale = np.concatenate([self._scale[:-1], self._scale[1:],
-                                np.tile(self._scale_border, (N - 1, 1))], axis=1)
+        return Neighbours(own, wide[:, :, :n + m], corner, self._scale, self._scale_border)
+
+    def forget(self):
+        """Let go of what the covariances are made from."""
+        self._chain = None
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """
+    The covariance of block k, block k + 1 and the border, for each of N - 1 intervals.
+
+    In full it is (N - 1, 2n + m, 2n + m), which is made some intervals at a time.
+    """
+
+    _own: Floats              # (N, n, n) scaled covariance of each block
+    _across: Floats           # (N, n, n + m) with the next block and the border
+    _corner: Floats           # (m, m)
+    _scale: Floats
+    _scale_border: Floats
+
+    def __len__(self) -> int:
+        return len(self._own) - 1
+
+    def __getitem__(self, k: int) -> Floats:
+        """Return the covariance of one interval: (2n + m, 2n + m)."""
+        return self.of(np.array([k % len(self)]))[0]
+
+    def of(self, rows) -> Floats:
+        """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
+        return self._made(rows) if len(self) > SHORT else self._whole[rows]
+
+    @cached_property
+    def _whole(self):
+        return self._made(np.arange(len(self)))
+
+    def _made(self, rows):
+        n, size = self._own.shape[1], self._across.shape[2] + self._own.shape[1]
+        out = np.empty((len(rows), size, size))
+        across, after = self._across[rows], self._across[rows + 1][:, :, n:]
+        out[:, :n, :n], out[:, :n, n:] = self._own[rows], across
+        out[:, n:, :n] = np.swapaxes(across, 1, 2)
+        out[:, n:2 * n, n:2 * n], out[:, n:2 * n, 2 * n:] = self._own[rows + 1], after
+        out[:, 2 * n:, n:2 * n] = np.swapaxes(after, 1, 2)
+        out[:, 2 * n:, 2 * n:] = self._corner
+        scale = np.concatenate([self._scale[rows], self._scale[rows + 1],
+                                np.tile(self._scale_border, (len(rows), 1))], axis=1)
         out *= scale[:, :, None]
         out *= scale[:, None, :]
         return out
 
+    def blocks(self) -> Iterator[tuple[slice, Floats]]:
+        """Yield all of them, some intervals at a time."""
+        for rows in blocks(len(self)):
+            at = np.arange(rows.start, rows.stop) if len(self) > SHORT else rows
+            yield rows, self.of(at)
+
+    def entries(self, i, j) -> Floats:
+        """Return the entries of index arrays i, j of each interval: (N - 1, len(i))."""
+        out = np.empty((len(i), len(self)))
+        for rows, block in self.blocks():
+            out[:, rows] = block[:, i, j].T
+        return out.T
+
+
+def blocks(n: int) -> Iterator[slice]:
+    """
+    Yield slices of n rows, as even as can be.
+
+    None of one row, where there are more: numpy multiplies a single matrix by another way than
+    those of a stack, and results are to be the same whatever the chunks.
+    """
+    edges = np.linspace(0, n, max(1, -(-n // BLOCK)) + 1).astype(int)
+    for first, last in pairwise(edges.tolist()):
+        yield slice(first, last)
+
 
 def solve(normal: Normal) -> Solved:
     """
-    Solve the normal equations.
+    Solve the normal equations, which are used up by it.
 
     Raises
     ------
@@ -99,22 +169,19 @@ def solve(normal: Normal) -> Solved:
 
     """
     from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+    diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
-    s = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', normal.diagonal), 1e-300))
+    s = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal), 1e-300))
     s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
-    diagonal = normal.diagonal * s[:, :, None] * s[:, None, :]
-    # columns to be carried: the next block, the border, the right side
-    wide = np.concatenate([
-        np.concatenate([normal.beside * s[:-1, :, None] * s[1:, None, :],
-                        np.zeros((1, n, n))]),
-        normal.border * s[:, :, None] * s_c, (normal.g * s)[:, :, None]], axis=2)
+    for block in (diagonal, wide):
+        block *= s[:, :, None]
+    diagonal *= s[:, None, :]
+    normal.beside *= s[1:, None, :]
+    normal.border *= s_c
     corner = np.zeros((m + 1, m + 1))
     corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
     corner[:m, m] = corner[m, :m] = normal.g_border * s_c
-    back = np.empty((N, n, n + m))
-    right = np.empty((N, n))
-    own = np.empty((N, n, n))
     logdet = -2 * np.log(s).sum() - 2 * np.log(s_c).sum()
     D = diagonal[0]
     for k in range(N):
@@ -123,17 +190,15 @@ def solve(normal: Normal) -> Solved:
             raise NotPositive(f'nothing holds keyframe {k} of {N}')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
-        back[k], right[k] = X[:, :n + m], X[:, n + m]
-        own[k] = dpotri(root, lower=1)[0]
         logdet += 2 * np.log(root.diagonal()).sum()
         corner -= W[:, n:].T @ X[:, n:]
         if k + 1 < N:
             E = W[:, :n].T
             D = diagonal[k + 1] - E @ X[:, :n]
             wide[k + 1, :, n:] -= E @ X[:, n:]
-    # dpotri fills one triangle
-    lower = np.tril(own)
-    own = lower + np.swapaxes(np.tril(own, -1), 1, 2)
+        lower = np.tril(dpotri(root, lower=1)[0])       # it fills one triangle
+        diagonal[k] = lower + np.tril(lower, -1).T
+        W[:] = X
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
@@ -141,10 +206,8 @@ def solve(normal: Normal) -> Solved:
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
-    x = np.empty((N, n))
-    x[N - 1] = right[N - 1] - back[N - 1][:, n:] @ c
-    fixed = right - back[:, :, n:] @ c
+    x = wide[:, :, n + m] - wide[:, :, n:n + m] @ c
     for k in range(N - 2, -1, -1):
-        x[k] = fixed[k] - back[k][:, :n] @ x[k + 1]
+        x[k] -= wide[k][:, :n] @ x[k + 1]
     return Solved(x * s, c * s_c, covariance * np.multiply.outer(s_c, s_c), float(logdet),
-                  reduced, corner[:m, m] / s_c, back, own, s, s_c)
+                  reduced, corner[:m, m] / s_c, (wide, diagonal), s, s_c)

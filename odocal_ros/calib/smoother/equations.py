@@ -54,7 +54,7 @@ class Weighted:
 
     def normal(self) -> Normal:
         """Return the normal equations of the step."""
-        out = Normal.zeros(len(self.state.t), self.n, M)
+        out = Normal(len(self.state.t), self.n, M)
         for part in self.parts.values():
             part.add(out)
         return out
@@ -66,6 +66,11 @@ class Weighted:
         for part in self.parts.values():
             part.after(step, constants, reached)
         return self
+
+    def forget(self):
+        """Let go of what can be made again."""
+        for part in self.parts.values():
+            part.forget()
 
     def cost(self) -> float:
         """Return the weighted sum of squares of all rows, robust in those of an instant."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import solve, Solved
+from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
@@ -61,17 +61,25 @@ class Fit:
     priors: Priors           # as the data left them
     first: Priors            # as they were before any gave way
     spread: np.ndarray       # (K, 3) factors on the odometer's variances: slips
-    weighted: Weighted
+    weighted: Weighted       # both None in an outline
     solved: Solved
     settled: bool
     creeping: bool           # near enough, but its noise levels still move
     iterations: int
+    likelihood: float = np.nan   # restricted, its logarithm but for a constant
 
-    @property
-    def likelihood(self) -> float:
-        """Return the restricted log likelihood, but for a constant."""
-        return -0.5 * (self.weighted.cost() + self.weighted.log_R_total()
-                       + self.solved.log_determinant)
+    def __post_init__(self):
+        for large in (self.weighted, self.solved):
+            if large is not None:
+                large.forget()
+
+    def outline(self) -> 'Fit':
+        """Return what another fit can set out from, without the equations: they are large."""
+        return replace(self, weighted=None, solved=None)
+
+    def neighbours(self) -> Neighbours:
+        """Return the covariances of neighbours; not kept, for they are large."""
+        return solve(self.weighted.normal()).neighbours()
 
 
 def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=False, about=None,
@@ -98,6 +106,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
     tails, pace, slipping = 1 if about else FIRST_TAILS, {}, False
     for count in range(1, most + 1):
+        sums = weighted = solved = None     # of the pass before: the most that a long leg takes
         sums = problem.sums_near(state)
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
@@ -126,9 +135,11 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             spread = found
             if tail:
                 priors = beliefs(first, priors, state, solved, near)
+            near = None
     creeping = not settled and bool(still < CREEPS and change < CREEPS)
+    likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     return Fit(state, levels, priors, first, spread, weighted, solved, settled or creeping,
-               creeping, count)
+               creeping, count, likelihood)
 
 
 def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Levels:

@@ -136,5 +136,6 @@ def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
     about = judge_running(now, problem.grade)
     if about is now:
         return now
+    now = about = about.outline()
     last = fit(problem, now.state, now.levels, FEW, about=about, frozen=True, trace=trace)
     return replace(last, iterations=now.iterations + last.iterations)

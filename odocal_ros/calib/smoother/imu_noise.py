@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from odocal_ros.nav.integral import by_step
+
 LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
 # noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
 # (or a simulator's) is silent at rest
@@ -18,8 +20,9 @@ def sensor_noise(grade) -> dict[str, float]:
 def at_rest(imu, leg, still) -> dict:
     """Return white noise levels of gyro and accelerometer as standstills show them."""
     turn = np.add.reduceat(imu.turn, imu.key[:-1])
-    dt = np.diff(imu.t)[:, None]
-    force = np.add.reduceat((imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt, imu.key[:-1])
+    force = np.concatenate([
+        np.add.reduceat((rows.f_b[:-1] + rows.f_b[1:]) / 2 * np.diff(rows.t)[:, None],
+                        rows.key[:-1]) for _, _, rows in imu.parts()])
     T = np.diff(imu.t[imu.key])[:, None]
     inside = still[:-1] & still[1:]
     rest = np.flatnonzero(inside)
@@ -46,10 +49,13 @@ def shaken(imu) -> dict:
     What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
     down from.
     """
+    def jumps(x):
+        return (np.diff(x, axis=0)**2).sum(axis=1)
+
     dt = np.diff(imu.t)
-    rate = imu.turn / dt[:, None]
     out = {}
-    for name, x in (('gyro', rate), ('accel', imu.f_b)):
-        jump = np.median((np.diff(x, axis=0)**2).sum(axis=1)) / 2.366     # of chi2 with 3
-        out[name] = float(jump / 2 * np.median(dt))
+    for name, jump in (
+            ('gyro', by_step(lambda turn, dt: jumps(turn / dt[:, None]), imu.turn, dt)),
+            ('accel', by_step(jumps, imu.f_b))):
+        out[name] = float(np.median(jump) / 2.366 / 2 * np.median(dt))     # of chi2 with 3
     return out

@@ -14,8 +14,10 @@ from odocal_ros.calib.smoother.state import (
     GYRO_SIGNAL,
 )
 from odocal_ros.nav.strapdown import rotation_increments
+from odocal_ros.samples import let_go
 
 Floats = NDArray[np.float64]
+CHUNK = 8192      # samples worked on at a time: their arrays stay in the cache
 
 
 def keyframes(t, t_begin, t_end, spacing):
@@ -45,6 +47,21 @@ class ImuRows:
         rows = slice(key[0], key[-1] + 1)
         t = leg.t_imu[rows]
         return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
+
+    def parts(self):
+        """Yield first and last of the keyframes of some intervals, and their rows."""
+        K = len(self.key) - 1
+        per = max(1, int(CHUNK * K / max(len(self.t), 1)))
+        for first in range(0, K, per):
+            last = min(first + per, K)
+            yield first, last, self.between(first, last)
+            let_go(self.f_b)
+
+    def between(self, first, last):
+        """Return the rows from one keyframe to another, both with them."""
+        a, b = self.key[first], self.key[last]
+        return ImuRows(self.t[a:b + 1], self.f_b[a:b + 1], self.turn[a:b],
+                       self.key[first:last + 1] - a)
 
 
 def mended(imu, constants):

@@ -15,7 +15,7 @@ OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said t
 WIDEN = 2.0            # factor on the sigmas where the model does not hold
 
 
-def mismatch(problem, fit, neighbours, config):
+def mismatch(problem, fit, config):
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
     told, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))

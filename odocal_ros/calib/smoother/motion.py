@@ -7,6 +7,8 @@ turns with the Earth, so Coriolis and the turn of n within the interval are take
 of the Earth rate (what is left is below 1e-8 of the motion), gravity where the vehicle is.
 """
 
+from copy import copy
+
 import numpy as np
 
 from odocal_ros.calib.smoother.preintegrate import turn
@@ -41,6 +43,9 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
 D = slice(15, 18)       # rows of the odometer
 ROWS = 18
+# of Motion, what each interval has
+EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'accel_v',
+        'from_mean', 'varied', 'travelled', 'residual')
 SPRUNG = 0.07       # s, 2 z / w of a body on springs: 1.3 Hz, damped by 0.3
 RESISTANCE, AIR = 0.1, 1e-4     # m/s^2, 1/m: what a car's tyres pull at a steady speed
 
@@ -110,7 +115,8 @@ class Motion:
         way = turn(intervals.S, self.f + self.leaned) * self.varied
         if np.any(change[0]):
             way = way + turn(intervals.S_by, change[0])
-        self.way = turn(half @ self.C, way) + self._faster() * change[1]
+        self.faster = self._faster()
+        self.way = turn(half @ self.C, way) + self.faster * change[1]
         self.unsaid = self._unsaid(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
@@ -132,6 +138,15 @@ class Motion:
         self.residual = np.concatenate(
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
+
+    def take(self, rows) -> 'Motion':
+        """Return the motion of the intervals of a slice, for derivatives and noises of its own."""
+        part = copy(self)
+        part.sums = self.sums.take(rows)
+        for name in EACH:
+            whole = getattr(self, name)
+            setattr(part, name, whole if whole is None else whole[rows])
+        return part
 
     def _vary(self):
         """Work out how scale and forward axis change with speed, time and acceleration."""
@@ -203,7 +218,7 @@ class Motion:
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
-        c[:, D, ODO_DELAY] = -self._faster()
+        c[:, D, ODO_DELAY] = -self.faster
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
         if self.fitted:

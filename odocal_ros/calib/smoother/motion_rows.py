@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import blocks, SHORT
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
-from odocal_ros.calib.smoother.motion import Motion
+from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
-from odocal_ros.calib.smoother.part import Part
+from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.slide import least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.state import M
 
@@ -21,7 +22,12 @@ ODOMETER_AXES = (ALONG, ('side', 'side_turn'), ('up',))
 
 
 class MotionRows(Part):
-    """Rows of ``Motion`` in the noise of ``IntervalNoise``; weighed: r (K, 18), J, whiten."""
+    """
+    Rows of ``Motion`` in the noise of ``IntervalNoise``; weighed: r (K, 18), whiten (K, 18, 18).
+
+    Unit noises, and the derivatives of a long leg, are made again whenever they are wanted, some
+    intervals at a time: they would take more memory than all else.
+    """
 
     name = 'motion'
 
@@ -44,43 +50,65 @@ class MotionRows(Part):
 
     def weigh(self, levels):
         """Whiten the rows by the Cholesky root of their covariance."""
-        Q = self.noise.covariance(levels)
-        scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
-        root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
-        self.whiten = np.linalg.inv(root) * scale[:, None, :]
+        self._kept: dict = {}
+        self.whiten = np.empty((len(self.raw), ROWS, ROWS))
+        for rows in blocks(len(self.raw)):
+            Q = self.noise.covariance(levels, rows)
+            scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
+            root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
+            self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
         self.log_R = -2 * np.log(np.einsum('kii->ki', self.whiten)).sum()
-        self.J = self.whiten @ np.concatenate(self.jacobians(self.n), axis=2)
         self.r = np.einsum('kij,kj->ki', self.whiten, self.raw)
 
     def after(self, step, constants, reached):
         """Bring the residuals to where the step leads."""
         both = np.concatenate([step[:-1], step[1:],
-                               np.broadcast_to(constants, (len(self.J), M))], axis=1)
-        self.r = self.r + np.einsum('kij,kj->ki', self.J, both)
+                               np.broadcast_to(constants, (len(self.r), M))], axis=1)
+        self.r = self.r + np.concatenate([
+            np.einsum('kij,kj->ki', self._J(rows), both[rows]) for rows in blocks(len(self.r))])
+
+    def _J(self, rows):
+        """Return the whitened derivatives of some intervals: (k, 18, 2n + M)."""
+        if rows.start in self._kept:
+            return self._kept[rows.start]
+        J = self.whiten[rows] @ np.concatenate(self.motion.take(rows).jacobians(self.n), axis=2)
+        if len(self.r) <= SHORT:
+            self._kept[rows.start] = J
+        return J
+
+    def forget(self):
+        """Let go of the derivatives."""
+        self._kept = {}
 
     def add(self, out):
         """Add the rows to normal equations."""
         n = self.n
-        H = np.swapaxes(self.J, 1, 2) @ self.J
-        g = -np.einsum('kij,ki->kj', self.J, self.r)
-        out.diagonal[:-1] += H[:, :n, :n]
-        out.diagonal[1:] += H[:, n:2 * n, n:2 * n]
-        out.beside += H[:, :n, n:2 * n]
-        out.border[:-1] += H[:, :n, 2 * n:]
-        out.border[1:] += H[:, n:2 * n, 2 * n:]
-        out.corner += H[:, 2 * n:, 2 * n:].sum(axis=0)
-        out.g[:-1] += g[:, :n]
-        out.g[1:] += g[:, n:2 * n]
-        out.g_border += g[:, 2 * n:].sum(axis=0)
+        corner, g_border = Total(), Total()
+        for rows in blocks(len(self.r)):
+            ends = slice(rows.start + 1, rows.stop + 1)
+            J = self._J(rows)
+            H = np.swapaxes(J, 1, 2) @ J
+            g = -np.einsum('kij,ki->kj', J, self.r[rows])
+            out.diagonal[rows] += H[:, :n, :n]
+            out.diagonal[ends] += H[:, n:2 * n, n:2 * n]
+            out.beside[rows] += H[:, :n, n:2 * n]
+            out.border[rows] += H[:, :n, 2 * n:]
+            out.border[ends] += H[:, n:2 * n, 2 * n:]
+            corner.add(H[:, 2 * n:, 2 * n:])
+            out.g[rows] += g[:, :n]
+            out.g[ends] += g[:, n:2 * n]
+            g_border.add(g[:, 2 * n:])
+        out.corner += corner.sum
+        out.g_border += g_border.sum
 
     def cost(self):
         """Return the sum of squares, in sigmas."""
         return (self.r**2).sum()
 
-    def _units(self):
-        """Return the whitened unit noises of the intervals, (K, 18, c), and J' of them."""
-        A = self.whiten @ (self.noise.columns * self.roots())
-        return A, np.swapaxes(self.J, 1, 2) @ A
+    def _units(self, rows):
+        """Return the whitened unit noises of some intervals, (k, 18, c), and J' of them."""
+        A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
+        return A, np.swapaxes(self._J(rows), 1, 2) @ A
 
     def roots(self):
         """Return the standard deviation of each unit noise, (c,), per root second."""
@@ -92,15 +120,21 @@ class MotionRows(Part):
 
     def components(self, near):
         """Return for each level its quadratic sum and what is expected of it."""
-        A, Y = self._units()
-        quadratic = (np.einsum('kic,ki->kc', A, self.r)**2).sum(axis=0)
-        expected = (A**2).sum(axis=(0, 1)) - (Y * (near @ Y)).sum(axis=(0, 1))
+        estimates, power, taken = [], Total(), Total()
+        for rows, block in near.blocks():
+            A, Y = self._units(rows)
+            estimates.append(np.einsum('kic,ki->kc', A, self.r[rows]))
+            power.add((A**2).reshape(-1, A.shape[2]))
+            taken.add((Y * (block @ Y)).reshape(-1, A.shape[2]))
+        quadratic = (np.concatenate(estimates)**2).sum(axis=0)
+        expected = power.sum - taken.sum
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
     def effects(self, near):
         """Yield what the unit noises of each level do."""
-        X = self.to_told(near) @ self._units()[1]
+        X = np.concatenate([self.to_told(block) @ self._units(rows)[1]
+                            for rows, block in near.blocks()])
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.of(name)]
 
@@ -111,9 +145,19 @@ class MotionRows(Part):
         First the best estimate in its own sigmas, second the variance that it should have: of 1,
         what the data can see.
         """
-        A, Y = self._units()
-        estimate = np.einsum('kic,ki->kc', A, self.r)
-        seen = (A**2).sum(axis=1) - (Y * (near @ Y)).sum(axis=1)
+        estimates, variances = [], []
+        for rows, block in near.blocks():
+            A, Y = self._units(rows)
+            estimates.append(np.einsum('kic,ki->kc', A, self.r[rows]))
+            variances.append((A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1))
+        estimate, seen = np.concatenate(estimates), np.concatenate(variances)
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
+
+    def along_size(self):
+        """Return how far a unit of the noise along moves the end of each interval, m: (K,)."""
+        pick = self.of(*ALONG)
+        return np.concatenate([
+            np.linalg.norm(self.noise.columns(rows)[:, D, pick] * self.roots()[pick], axis=1)
+            .sum(axis=1) for rows in blocks(len(self.r))])

@@ -7,11 +7,12 @@ make. Columns of one component times the root of its level are independent unit 
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.smoother.motion import D, ROWS
+from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.state import BA, BG, ODO_DELAY, P, PHI, V
 from odocal_ros.nav.rotations import skew
 
@@ -19,6 +20,8 @@ Floats = NDArray[np.float64]
 # level: variance per second of the white noise or walk
 INTERVAL = ('gyro', 'accel', 'gyro_walk', 'accel_walk', 'along', 'along_hard', 'side',
             'side_turn', 'up')
+IMU = INTERVAL[:4]
+ROAD = (('along', 0), ('along_hard', 0), ('side', 1), ('side_turn', 1), ('up', 2))   # and axis
 SLOW_LEVELS = ('slow', 'slow_up')
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
@@ -71,21 +74,55 @@ class Levels:
 
 @dataclass(eq=False)
 class IntervalNoise:
-    """Columns of unit noises of K intervals, (K, 18, c), and the component of each column."""
+    """
+    The noises of K intervals; of a unit of each what it does to the rows, (K, 18, c), by parts.
 
-    columns: Floats
-    component: NDArray[np.int64]       # (c,)
+    component : (c,) index in INTERVAL of each column.
+    """
+
+    motion: Motion
+    axes: Floats                       # (K, 3, 3) rows: forward, left, up
+    road: Floats                       # (K, 5) what the wheels' unit noises do along their axes
     extra: Floats                      # (K, 18) variances that are given, not estimated
     given: Floats                      # (K, 18, g) columns of unit noises, the same
+    component: ClassVar[NDArray[np.int64]] = np.array(
+        len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
+        + [INTERVAL.index(name) for name, _ in ROAD])
 
-    def covariance(self, levels: Levels) -> Floats:
-        """Return the covariance of the rows, (K, 18, 18)."""
+    def columns(self, rows: slice) -> Floats:
+        """Return what unit noises do in the intervals of a slice: (k, 18, c)."""
+        motion = self.motion.take(rows)
+        T, C = motion.T[:, 0], motion.C
+        force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
+        one = np.broadcast_to(np.eye(3), (len(T), 3, 3))
+        out = np.zeros((len(T), ROWS, len(self.component)))
+        for point, (x, weight) in enumerate(zip(GAUSS_X, GAUSS_W, strict=True)):
+            u = ((1 - x) * T)[:, None, None]
+            root = np.sqrt(weight * T)[:, None, None]
+            gyro, accel, gyro_walk, accel_walk = (
+                out[:, :, first:first + 3] for first in 12 * point + 3 * np.arange(4))
+            gyro[:, PHI], gyro[:, V] = -one * root, force * u * root
+            gyro[:, P], gyro[:, D] = force * (u**2 / 2) * root, way * u * root
+            accel[:, V], accel[:, P] = one * root, one * u * root
+            gyro_walk[:, PHI], gyro_walk[:, V] = -C * u * root, force @ C * (u**2 / 2) * root
+            gyro_walk[:, P] = force @ C * (u**3 / 6) * root
+            gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2) * root, one * root
+            accel_walk[:, V], accel_walk[:, P] = -C * u * root, -C * (u**2 / 2) * root
+            accel_walk[:, BA] = one * root
+        for column, (_, axis) in enumerate(ROAD, 12 * len(GAUSS_X)):
+            root = self.road[rows, column - 12 * len(GAUSS_X)]
+            out[:, D, column] = self.axes[rows, axis] * root[:, None]
+        return out
+
+    def covariance(self, levels: Levels, rows: slice = slice(None)) -> Floats:
+        """Return the covariance of the rows of the intervals of a slice, (k, 18, 18)."""
         root = np.sqrt([levels[INTERVAL[i]] for i in self.component])
-        W = self.columns * root
+        W = self.columns(rows) * root
         Q = W @ np.swapaxes(W, 1, 2)
-        if self.given.shape[2]:
-            Q += self.given @ np.swapaxes(self.given, 1, 2)
-        Q[:, range(ROWS), range(ROWS)] += self.extra
+        given = self.given[rows]
+        if given.shape[2]:
+            Q += given @ np.swapaxes(given, 1, 2)
+        Q[:, range(ROWS), range(ROWS)] += self.extra[rows]
         return Q
 
 
@@ -98,47 +135,22 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
     spread : (K, 3) factors on the odometer's variances along, to the side and up (slips).
     """
     K, T = len(motion.T), motion.T[:, 0]
-    force, way = skew(motion.dv / motion.T), skew(motion.way / motion.T)
-    C = motion.C
-    one = np.broadcast_to(np.eye(3), (K, 3, 3))
-    parts, component = [], []
-
-    def add(name, rows, width):
-        block = np.zeros((K, ROWS, width))
-        for where, matrix in rows:
-            block[:, where] = matrix
-        parts.append(block)
-        component.extend([INTERVAL.index(name)] * width)
-
-    for x, weight in zip(GAUSS_X, GAUSS_W, strict=True):
-        u = ((1 - x) * T)[:, None, None]
-        root = np.sqrt(weight * T)[:, None, None]
-        add('gyro', [(PHI, -one * root), (V, force * u * root), (P, force * (u**2 / 2) * root),
-                     (D, way * u * root)], 3)
-        add('accel', [(V, one * root), (P, one * u * root)], 3)
-        add('gyro_walk', [(PHI, -C * u * root), (V, force @ C * (u**2 / 2) * root),
-                          (P, force @ C * (u**3 / 6) * root),
-                          (D, way @ C * (u**2 / 2) * root), (BG, one * root)], 3)
-        add('accel_walk', [(V, -C * u * root), (P, -C * (u**2 / 2) * root),
-                           (BA, one * root)], 3)
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up
-    axes = axes + np.swapaxes(C @ motion.state.C_bv, 1, 2)
+    axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.way, axis=1) / T
     share = np.sqrt(np.clip(speed, SLOWEST, 1.0) * T)
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, 3)) if spread is None else spread
-    for name, axis, where in (('along', 0, ~hard), ('along_hard', 0, hard), ('side', 1, ~turning),
-                              ('side_turn', 1, turning), ('up', 2, np.ones(K, bool))):
-        root = share * (where & ~rest) * np.sqrt(spread[:, axis])
-        add(name, [(D, (axes[:, axis] * root[:, None])[:, :, None])], 1)
+    acting = ~hard, hard, ~turning, turning, np.ones(K, bool)
+    road = np.stack([share * (where & ~rest) * np.sqrt(spread[:, axis])
+                     for (_, axis), where in zip(ROAD, acting, strict=True)], -1)
     extra = _extra(motion, leg)
     still = rest_noise(speed, rest)
     extra[rest, D] += still
     slow = ~rest & (speed < 1.0)
     extra[slow, D] += still * (1 - speed[slow, None])
-    return IntervalNoise(np.concatenate(parts, axis=2), np.array(component), extra,
-                         _given(motion, leg, axes, rest))
+    return IntervalNoise(motion, axes, road, extra, _given(motion, leg, axes, rest))
 
 
 def _given(motion, leg, axes, rest):

@@ -61,7 +61,7 @@ def not_settled(leg, problem, fit, config) -> MethodResult:
     lacks += ['does not stop'] * (not problem.still.any())
     if lacks:
         text += f'; the drive {" and ".join(lacks)}'
-    _, odd = mismatch(problem, fit, fit.solved.neighbours(), config)
+    _, odd = mismatch(problem, fit, config)
     return refused([Reason(Code.NOT_CONVERGED, text), *odd], leg.scale_unit)
 
 
@@ -74,8 +74,8 @@ def _unknown(scale_unit):
 
 def outcome(leg, problem, fit, config) -> MethodResult:
     """Return what a settled fit says of the leg."""
-    near = fit.solved.neighbours()
-    widen, reasons = mismatch(problem, fit, near, config)
+    near = fit.neighbours()
+    widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
     slips = find_slips(fit, near, count)
     reasons += slip_reasons(fit, slips, count)

@@ -46,7 +46,8 @@ class Part:
 
     A sensor's own class has ``__init__(problem, here)`` and what differs from this; one with rows
     of its own also raw, its residuals, and ``jacobians(n)``, their derivatives by the keyframes
-    and by the constants. ``near`` is what ``Solved.neighbours`` returns: (K, 2n + M, 2n + M).
+    and by the constants. ``near`` is what ``Solved.neighbours`` returns, or a block of it,
+    (k, 2n + M, 2n + M), where that is said.
     """
 
     name: ClassVar[str]
@@ -84,6 +85,9 @@ class Part:
         """Bring the residuals to where a step (N, n), (M,) leads, were all linear."""
         self.state = reached
 
+    def forget(self):
+        """Let go of what can be made again."""
+
     def cost(self) -> float:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
@@ -96,9 +100,25 @@ class Part:
         """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
         return ()
 
-    def to_told(self, near):
-        """Return the covariance of scale, yaw and pitch with the unknowns: (K, 3, 2n + M)."""
-        return near[:, 2 * self.n:2 * self.n + TOLD, :]
+    def to_told(self, block):
+        """Return the covariance of scale, yaw and pitch with the unknowns: (k, 3, 2n + M)."""
+        return block[:, 2 * self.n:2 * self.n + TOLD, :]
+
+    def all_told(self, near):
+        """Return that of all intervals: (K, 3, 2n + M)."""
+        return np.concatenate([self.to_told(block) for _, block in near.blocks()])
+
+
+class Total:
+    """A sum of rows that come by parts, to the last bit as if all were there at once."""
+
+    sum: np.ndarray | None = None
+
+    def add(self, rows):
+        """Add rows: numpy adds them one after the other."""
+        if self.sum is not None:
+            rows = np.concatenate([self.sum[None], rows])
+        self.sum = rows.sum(axis=0)
 
 
 def hold(out, k, columns, variance, residual, weight=1.0):

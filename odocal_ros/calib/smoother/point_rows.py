@@ -5,11 +5,13 @@ Each hangs on the keyframe before it, on the constants, and, where slow fix erro
 on those of the keyframe after it. What lies far out loses weight as a heavy tail has it.
 """
 
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from odocal_ros.calib.smoother.part import Part, TOLD
+from odocal_ros.calib.smoother.chain import blocks
+from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
 
 FAR = 3.0              # sigmas beyond which a row loses weight as a heavy tail has it
@@ -61,13 +63,27 @@ class PointRows(Part):
         self.weight = self._weights(white)
         each = np.sqrt(self.weight / self.thin)
         self.r = each * white
-        root = (each * factor)[:, :, None]
-        self.J = np.concatenate([self.stated(x) for x in self.jacobians(self.n)], axis=2) * root
+        self._root = (each * factor)[:, :, None]
         self.J_end = None
         if self.n == WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
-            self.J_end = -self.stated(one) * root * self.share[:, None, None]
+            self.J_end = -self.stated(one) * self._root * self.share[:, None, None]
         self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.thin
+
+    @cached_property
+    def J(self):
+        """Return the whitened derivatives: (m, d, n + M)."""
+        rows, constants = self.jacobians(self.n)
+        out = np.empty((*self.raw.shape, self.n + M))
+        out[:, :, :self.n] = self.stated(rows)
+        del rows
+        out[:, :, self.n:] = self.stated(constants)
+        out *= self._root
+        return out
+
+    def forget(self):
+        """Let go of the derivatives: they are made again if they are wanted again."""
+        self.__dict__.pop('J', None)
 
     def _sizes(self, white):
         for columns in self.levels_of.values():
@@ -98,31 +114,47 @@ class PointRows(Part):
 
     def add(self, out):
         """Add the rows to normal equations."""
-        n, present = self.n, np.unique(self.k)
-        J, r = self.by_interval(self.J), self.by_interval(self.r[:, :, None])
-        H = np.swapaxes(J, 1, 2) @ J
-        g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
-        out.diagonal[present] += H[:, :n, :n]
-        out.border[present] += H[:, :n, n:]
-        out.corner += H[:, n:, n:].sum(axis=0)
-        out.g[present] += g[:, :n]
-        out.g_border += g[:, n:].sum(axis=0)
-        if self.J_end is None:
-            return
-        B = self.by_interval(self.J_end)
-        X = np.swapaxes(J, 1, 2) @ B
-        out.beside[present, :, SLOW] += X[:, :n]
-        out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
-        out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
-        out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
+        n, corner, g_border = self.n, Total(), Total()
+        for present, gather in self._intervals():
+            J, r = gather(self.J), gather(self.r[:, :, None])
+            H = np.swapaxes(J, 1, 2) @ J
+            g = -(np.swapaxes(J, 1, 2) @ r)[:, :, 0]
+            out.diagonal[present] += H[:, :n, :n]
+            out.border[present] += H[:, :n, n:]
+            corner.add(H[:, n:, n:])
+            out.g[present] += g[:, :n]
+            g_border.add(g[:, n:])
+            if self.J_end is None:
+                continue
+            B = gather(self.J_end)
+            X = np.swapaxes(J, 1, 2) @ B
+            out.beside[present, :, SLOW] += X[:, :n]
+            out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
+            out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
+            out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
+        if corner.sum is not None:
+            out.corner += corner.sum
+            out.g_border += g_border.sum
 
-    def by_interval(self, rows):
-        """Return rows (m, d, c) by interval, padded: (present, d most, c)."""
+    def _intervals(self):
+        """
+        Yield the intervals that have rows, some at a time, and what gathers rows by them.
+
+        That takes rows (m, d, c) to (intervals, d most, c), padded.
+        """
         present, first, count = np.unique(self.k, return_index=True, return_counts=True)
-        place = np.arange(len(self.k)) - np.repeat(first, count)
-        out = np.zeros((len(present), int(count.max(initial=1)), *rows.shape[1:]))
-        out[np.repeat(np.arange(len(present)), count), place] = rows
-        return out.reshape(len(present), -1, rows.shape[2])
+        for some in blocks(len(present)):
+            counts, most = count[some], count.max()
+            rows = slice(first[some.start], first[some.start] + counts.sum())
+            own = np.repeat(np.arange(len(counts)), counts)
+            place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+            def gather(x, rows=rows, own=own, place=place, counts=counts, most=most):
+                out = np.zeros((len(counts), most, *x.shape[1:]))
+                out[own, place] = x[rows]
+                return out.reshape(len(counts), -1, x.shape[2])
+
+            yield present[some], gather
 
     def _columns(self):
         """Return the columns of J and of J_end among those of neighbours."""
@@ -133,29 +165,35 @@ class PointRows(Part):
         """Return for each level its quadratic sum and what is expected of it."""
         if len(self.k) < FEWEST_ROWS:
             return {}
-        (own, end), J = self._columns(), self.by_interval(self.J)
-        block = near[np.unique(self.k)]
-        taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
-        if self.J_end is not None:
-            B = self.by_interval(self.J_end)
-            taken = taken + 2 * ((J @ block[:, own[:, None], end]) * B).sum(axis=2)
-            taken = taken + ((B @ block[:, end[:, None], end]) * B).sum(axis=2)
-        d = self.r.shape[1]
-        taken = taken.reshape(len(block), -1, d)
+        taken = np.concatenate([self._taken(near.of(present), gather)
+                                for present, gather in self._intervals()])
         known = np.broadcast_to(self.known(), self.r.shape)
         r2 = np.where(known, self.r, 0.0)**2 * self.thin
         return {level: (float(r2[:, columns].sum()),
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
 
+    def _taken(self, block, gather):
+        """Return what the unknowns take up of the rows of some intervals: (k, most, d)."""
+        (own, end), J = self._columns(), gather(self.J)
+        taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
+        if self.J_end is not None:
+            B = gather(self.J_end)
+            taken = taken + 2 * ((J @ block[:, own[:, None], end]) * B).sum(axis=2)
+            taken = taken + ((B @ block[:, end[:, None], end]) * B).sum(axis=2)
+        return taken.reshape(len(block), -1, self.r.shape[1])
+
     def effects(self, near):
         """Yield what a unit error of each row does."""
         own, end = self._columns()
-        block = near[np.unique(self.k), 2 * self.n:2 * self.n + TOLD]
-        X = block[:, :, own] @ np.swapaxes(self.by_interval(self.J), 1, 2)
-        if self.J_end is not None:
-            X = X + block[:, :, end] @ np.swapaxes(self.by_interval(self.J_end), 1, 2)
-        yield self.source, X
+        parts = []
+        for present, gather in self._intervals():
+            told = np.ascontiguousarray(self.to_told(near.of(present)))
+            X = told[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
+            if self.J_end is not None:
+                X = X + told[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
+            parts.append(X)
+        yield self.source, np.concatenate(parts)
 
 
 def alike(rows: PointRows) -> float:

@@ -26,7 +26,6 @@ from odocal_ros.nav.rotations import (
 from odocal_ros.nav.strapdown import prefix_product
 
 Floats = NDArray[np.float64]
-CHUNK = 8192      # samples worked on at a time: their arrays stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +55,10 @@ class Intervals:
     def derived_as(self, other: 'Intervals') -> 'Intervals':
         """Return these sums with the derivatives of others."""
         return _with(self, other, 'AA', 'F', 'FF', 'turned', 'dv_by', 'dp_by', 'S_by')
+
+    def take(self, rows) -> 'Intervals':
+        """Return the intervals of a slice."""
+        return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def shifted(self, gyro, accel_bias, accel) -> 'Intervals':
         """
@@ -130,17 +133,11 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
     Intervals, Points.
 
     """
-    key, out, points = imu.key, [], []
-    turn_b, f_b = mended(imu, constants)
+    out, points = [], []
     owner = owners(imu, t_points) if owner is None else owner
-    per = max(1, int(CHUNK * (len(key) - 1) / max(len(imu.t), 1)))
-    for first in range(0, len(key) - 1, per):
-        last = min(first + per, len(key) - 1)
+    for first, last, rows in imu.parts():
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
-        rows = slice(key[first], key[last] + 1)
-        steps = slice(key[first], key[last])
-        part = _Chunk(imu.t[rows], (imu.f_b[rows], imu.turn[steps]), (f_b[rows], turn_b[steps]),
-                      key[first:last + 1] - key[first], gyro_bias[first:last],
+        part = _Chunk(rows, mended(rows, constants), gyro_bias[first:last],
                       accel_bias[first:last], derivatives)
         out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], owner[mine] - first, first))
@@ -178,9 +175,10 @@ def _cross(a, M):
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
-    def __init__(self, t, measured, mended, key, gyro_bias, accel_bias, derivatives):
-        self.t, self.key, (self.f_b, self.turn) = t, key, measured
-        f, turn = mended
+    def __init__(self, imu, mended, gyro_bias, accel_bias, derivatives):
+        t, key = self.t, self.key = imu.t, imu.key
+        self.f_b, self.turn = imu.f_b, imu.turn
+        turn, f = mended
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
         dt = self.dt = np.diff(t)
         q = np.empty((len(t), 4))

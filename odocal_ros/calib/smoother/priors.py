@@ -78,7 +78,7 @@ class PriorRows(Part):
 
     def effects(self, near):
         """Yield what the turn-on biases do."""
-        first = self.to_told(near)[0]
+        first = self.to_told(near[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 

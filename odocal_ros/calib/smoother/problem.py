@@ -98,7 +98,9 @@ class Problem:
         kept = self.kept
         if kept is None or not kept.hold_at(state):
             alike = kept is not None and kept.derived_at.hold_at(state, LIKE)
-            self.kept = self.sums(state, kept.derived_at if alike else None)
+            derived = kept.derived_at if alike else None
+            kept = self.kept = None        # two at a time are as much as all else
+            self.kept = self.sums(state, derived)
         return self.kept
 
     def sums(self, state: State, derived: 'Sums | None' = None) -> 'Sums':

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.motion import D
-from odocal_ros.calib.smoother.motion_rows import ALONG
 from odocal_ros.reasons import Code, Reason
 
 FAR_OUT = 1.5           # factor on the variance of an interval from which it is a slip
@@ -31,9 +29,7 @@ def along(fit, neighbours):
     """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
     rows = fit.weighted['motion']
     estimate, _ = rows.road_noise(neighbours)
-    pick = rows.of(*ALONG)
-    size = np.linalg.norm(rows.noise.columns[:, D, pick] * rows.roots()[pick], axis=1).sum(axis=1)
-    return -estimate[:, 0] * size
+    return -estimate[:, 0] * rows.along_size()
 
 
 def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:

@@ -65,10 +65,10 @@ class SlowError(Part):
         """Return of each level its quadratic sum and what is expected of it."""
         i, n, s = np.arange(SLOW.start, SLOW.stop), self.n, self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
-        before, both, after = near[:, i, i], near[:, i, n + i], near[:, n + i, n + i]
+        before, both, after = (near.entries(*at) for at in ((i, i), (i, n + i), (n + i, n + i)))
         var = after + a**2 * before - 2 * a * both
         num, den = r**2 / q, 1 - var / q
-        begin, begin_var = s[0]**2 / self.power, near[0, i, i] / self.power
+        begin, begin_var = s[0]**2 / self.power, near[0][i, i] / self.power
         level = num.sum(axis=0) + begin, den.sum(axis=0) + (1 - begin_var)
         found = {'slow': tuple(float(x[:2].sum()) for x in level),
                  'slow_up': tuple(float(x[2]) for x in level)}
@@ -95,7 +95,7 @@ class SlowError(Part):
 
     def effects(self, near):
         """Yield what unit errors of what drives it, and of its first value, do."""
-        told, n = self.to_told(near), self.n
+        told, n = self.all_told(near), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
         push = told[:, :, end] - self.decay[:, :, None] * told[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]

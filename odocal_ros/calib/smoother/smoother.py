@@ -60,8 +60,9 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
 
 def best_fit(problem, config, trace=None):
     """Return the likeliest fit, what is imperfect in odometer and Imu judged."""
-    found = judge_offset(problem, likeliest_fit(problem, config, trace), trace)
-    return judge_imperfect(problem, found, trace)
+    # no name for what is passed on: the equations of one fit at a time
+    return judge_imperfect(problem, judge_offset(
+        problem, likeliest_fit(problem, config, trace), trace), trace)
 
 
 def likeliest_fit(problem, config, trace=None):
@@ -81,7 +82,8 @@ def likeliest_fit(problem, config, trace=None):
     best = max(fits, key=lambda f: f.likelihood)
     problem.thin = {name: alike(best.weighted[name])
                     for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
-    if are_slow(problem, best):
+    slow, best, fits = are_slow(problem, best), best.outline(), []
+    if slow:
         return with_slow_errors(problem, best, trace)
     return fit(problem, best.state, best.levels, about=best, trace=trace)
 

@@ -34,6 +34,7 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
+    now = now.outline()
     about = replace(now, **{name: _held(getattr(now, name), known, EXACT * coarse.step)
                             for name in ('priors', 'first')})
     last = fit(problem, replace(now.state, constants=constants), now.levels, FEW, about=about,

@@ -42,13 +42,14 @@ class TravelError(Part):
     def components(self, near):
         """Return of the level its quadratic sum and what is expected of it, in motion."""
         e, moving = self.variance, ~self.still
-        spread = np.concatenate([near[:, E, E], near[-1:, self.n + E, self.n + E]])
+        last = near[-1][self.n + E, self.n + E]
+        spread = np.append(near.entries([E], [E])[:, 0], last)
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
     def effects(self, near):
         """Yield what a unit error of each reading does."""
-        told = self.to_told(near)
+        told = self.all_told(near)
         root = np.sqrt(self.weight / self.variance)
         travel = np.concatenate([told[:, :, E], told[-1:, :, self.n + E]]) * root[:, None]
         yield 'quantisation', travel[:, :, None]

@@ -8,6 +8,7 @@ them the mean of both wheels is no travel, and whatever rests on it is wrong.
 import numpy as np
 
 from odocal_ros.calib.wheels.pair import pair, robust_fit, runs, TUKEY
+from odocal_ros.nav.integral import integral_at
 from odocal_ros.reasons import Code, Reason
 
 CELL = 0.5            # s
@@ -167,8 +168,7 @@ def _reversed(two, steps, expected, ratio, variance, imu):
 def _against_imu(two, steps, imu):
     """Return the wheel whose speed changes against the Imu's x axis, None where that is unsure."""
     t_imu, _, f_b = imu
-    total = np.append(0.0, np.cumsum((f_b[1:, 0] + f_b[:-1, 0]) / 2 * np.diff(t_imu)))
-    push = np.diff(np.interp((two.t[:-1] + two.t[1:]) / 2, t_imu, total))
+    push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
     push = push - np.median(push)
     score = [_correlation(np.diff(step), push) for step in steps]
     if score[0] * score[1] < 0 and min(np.abs(score)) > SURE:

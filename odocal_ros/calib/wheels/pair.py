@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.nav.integral import integral_at, medians
+
 TUKEY = 4.685        # robust sigmas beyond which a row has no weight
 PASSES = 20
 GAP = 5.0            # median intervals: what lies within is not known
@@ -46,9 +48,8 @@ def pair(left, right, imu, between, step, doubt_t=()) -> Pair | None:
     t = begin + step * np.arange(max(0, int((end - begin) / step) + 1))
     if len(t) < 21:
         return None
-    up_b = np.median(f_b, axis=0)          # the mean of gravity: roll and pitch of the mounting
+    up_b = medians(f_b)          # the mean of gravity: roll and pitch of the mounting
     rate = w_b @ (up_b / max(float(np.linalg.norm(up_b)), 1e-9))
-    turn = np.append(0.0, np.cumsum((rate[:-1] + rate[1:]) / 2 * np.diff(t_imu)))
     known = np.ones(len(t) - 1, bool)
     for times in (left.t, right.t, t_imu):
         gap = np.diff(times)
@@ -56,7 +57,7 @@ def pair(left, right, imu, between, step, doubt_t=()) -> Pair | None:
             known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
     for at in doubt_t:
         known &= (t[1:] < at - step) | (t[:-1] > at + step)
-    return Pair(t, left.at(t), right.at(t), np.interp(t, t_imu, turn), known,
+    return Pair(t, left.at(t), right.at(t), integral_at(t, t_imu, rate), known,
                 max(left.quantum, right.quantum))
 
 
