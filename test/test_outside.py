@@ -39,7 +39,8 @@ def calibration():
 def texts(frame='imu_link', bag='drive', config=None):
     made, config = framed(calibration(), config or Config(), frame)
     inputs = [{'bag': bag, 'sha256': None, 'topics': {}}]
-    return made, ros_files.texts(made, config, as_json(made, config, inputs, '2026'))
+    content = as_json(made, config, inputs, '2026-01-02T03:04:05+00:00')
+    return made, ros_files.texts(made, config, content)
 
 
 @pytest.mark.parametrize('frame', ATTACKS)

@@ -10,6 +10,7 @@ TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro
 APART = 5.0, 10.0    # m, and fix sigmas: between fixes that give a course
 ALIKE = 0.9          # correlation from which they are the same turns
 RIGHT = 0.6, 1.6     # of the ratio: no scale error, skid or lean is so large
+NOTHING = 0.01     # of the turns of the fixes: no unit makes that of a turn
 DEGREES = 40.0, 80.0     # the same, of deg/s
 
 
@@ -56,6 +57,10 @@ def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
         return (Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right (ratio '
                        f'{ratio:.2f} instead of 1)'),)
     degrees = DEGREES[0] < ratio < DEGREES[1]
+    if abs(ratio) < NOTHING:
+        return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.2g} times as far as the course '
+                       'of the fixes, next to nothing', 'Mend the sender, or set '
+                       'imu.mounting_rpy: the axis that turns may be another.'),)
     wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
     return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.3g} times as far as the course of '
                    'the fixes' + ', as deg/s would' * degrees,

@@ -27,7 +27,9 @@ from odocal_ros.calib.smoother.state import (
 )
 
 MOST = 40            # iterations
-NEAR, FAR = 1.0, 4.0     # sigmas of a step from which residuals are noise, and are no more
+# sigmas of a step from which residuals are noise, and are no more; the first step with derivatives
+# by the fitted signal takes back what those with noise in them made of it, however much
+NEAR, FAR = 1.0, 4.0
 SETTLED = 0.03       # sigmas that the constants may still move
 CREEPS = 0.5         # the same: values that are worth having, with wider sigmas
 NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
@@ -102,6 +104,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
 
     """
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
+    was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
     tails, pace, slipping = 1 if about else FIRST_TAILS, {}, False
@@ -116,7 +119,8 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         before = sigma[:3]
         settled = bool(fitted and not slipping and move < SETTLED
                        and (frozen or change < QUIET and count > tails + 2))
-        fitted = bool(move < (FAR if fitted else NEAR))
+        first_fitted, was_fitted = fitted and not was_fitted, fitted
+        fitted = bool(first_fitted or move < (FAR if fitted else NEAR))
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
@@ -134,7 +138,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             levels = update(weighted, near, levels, problem, pace, slipping)
             spread = found
             if tail:
-                priors = beliefs(first, priors, state, solved, near)
+                priors = beliefs(first, priors, state, solved, near, fitted)
             near = None
     creeping = not settled and bool(still < CREEPS and change < CREEPS)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
@@ -175,18 +179,19 @@ def slips(weighted, neighbours, spread):
     return np.sqrt(spread * np.clip(spread * z2 / OUTLIER**2, 1.0, 1e6))
 
 
-def beliefs(first: Priors, now: Priors, state, solved, neighbours) -> Priors:
+def beliefs(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Priors:
     """
     Return priors widened where the data are far from their centre.
 
     Those of what is small give way only where the data know more than they do: nothing would
-    gainsay a wide one.
+    gainsay a wide one. Nor do they while derivatives hold noise (fitted: they do not), which calls
+    for a smaller signal: a slow drive would shrink to nothing.
     """
     n = solved.step.shape[1]
     P0 = np.diagonal(neighbours[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    untold = SMALL & (variance > KNOWN * now.constants**2)
+    untold = SMALL & ((variance > KNOWN * now.constants**2) | (not fitted))
     constants[untold] = now.constants[untold]
     constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
     return replace(
