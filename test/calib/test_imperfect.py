@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from smoother_legs import made
+from smoother_legs import leg_of, made
 
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.imperfect import believed, weigh_kinds
@@ -13,7 +13,10 @@ from odocal_ros.calib.smoother.state import FAST
 from odocal_ros.config import Config, with_settings
 from odocal_ros.grades import grade_as_seen, GRADES
 from odocal_ros.reasons import Code
+from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.real import Real
+from odocal_ros.sim.scenarios import simulate
+from odocal_ros.sim.truth import settings
 
 GRADE, BELIEF = 3e-3, 0.8
 TOWN = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'sway': 0.05}
@@ -171,3 +174,32 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     clean = {r.code for r in smooth(made(**TOWN, fix_noise='rtk', seed=4)[2], config).reasons}
     assert not clean & {Code.FIXES_SMOOTHED, Code.LEVER_ARM_OFF, Code.SCALE_VARIES,
                         Code.IMU_AXES_SKEW}
+
+
+def scale_off(drive, config, leg):
+    """Return the result and the error of its scale, sigmas."""
+    method = smooth(leg, config)
+    scale = method.estimates['scale_factor']
+    return method, (scale.value - drive.truth.scale) / scale.sigma
+
+
+@pytest.mark.parametrize('driven', [True, False])
+def test_tyres_that_slip_one_way_only_leave_the_mean_right(driven):
+    """A wheel that does not drive slips under the brake only: half a slope each way is 90 ppm."""
+    drive, config, leg = made(**TOWN | {
+        'fix_noise': 'rtk', 'fix_sigma': 0.01, 'real': Real(tyre_slip=0.035, driven=driven)})
+    method, off = scale_off(drive, config, leg)
+    assert abs(off) < 3.3
+    assert method.estimates['scale_factor'].sigma / drive.truth.scale < 60e-6
+    assert Code.WHEEL_SLIP not in {r.code for r in method.reasons}
+
+
+def test_a_slow_drive_settles_on_its_metres():
+    """A yard with all that real sensors have: with noise in derivatives its metres shrink."""
+    options, _ = drawn(70_000_024, 'yard', 'consumer', None)
+    drive = simulate(options)
+    config = with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
+                                      for group, keys in settings(drive).items()
+                                      for key, v in keys.items()})
+    method, off = scale_off(drive, config, leg_of(drive.leg(), config))
+    assert abs(off) < 3.3
