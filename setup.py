@@ -57,6 +57,7 @@ setup(
             'mpmath>=1.3',
             'mypy>=1.8',
             'pytest>=7.4',
+            'pytest-xdist>=3.5',
             'rich>=13',
             'ruff>=0.6',
         ],

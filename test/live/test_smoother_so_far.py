@@ -328,7 +328,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     assert ' m/pulse +- 2000 ppm so far; 500 m more bring it to the asked 1000 ppm; yaw ' in told
     assert told.endswith('; stop and start 12 times, or turn as often, for the yaw')
     told = hint(Situation(session, Config(), outlook=far, outlook_age_s=40.0, **known))
-    assert told.endswith('; as it was 40 s ago')
+    assert '; as it was 40 s ago; ' in told
     good = hint(Situation(session, Config(), outlook=of_sigmas(looks[-1]), **known))
     assert good.startswith('enough: scale 0.02')
     assert good.endswith('stand still 10 s at the end point, then call ~/stop_leg')
