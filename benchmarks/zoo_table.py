@@ -25,14 +25,15 @@ EXPLAINS = {
     'vibration': IMU | WHEELS, 'grade': IMU,
     'imu_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *IMU},
     'coarse_speed': {'SPEED_COARSE', *WHEELS}, 'coarse_pulses': {'COUNTER_COARSE', *GENERAL},
-    'odometer_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', *WHEELS},
+    'odometer_stamps': {'DELAY_SEEN', 'ODOMETER_LATE', 'STAMPS_NOT_RISING', *WHEELS},
     'speed_law': WHEELS | TYRES, 'warming': WHEELS | TYRES, 'slip': WHEELS | TYRES,
     'sideslip': GENERAL,
     'squat': WHEELS,
     'lever_arms': {'LEVER_ARM_OFF', *FIXES},
     'receiver_lag': {'DELAY_SEEN', 'FIXES_SMOOTHED', *GENERAL},
     'fix_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *GENERAL},
-    'slow_errors': FIXES, 'multipath': {'TRACK_MISMATCH', 'FIXES_UNUSABLE', *FIXES},
+    'slow_errors': FIXES,
+    'multipath': {'TRACK_MISMATCH', 'FIXES_UNUSABLE', 'BAD_ROWS_DROPPED', *FIXES},
     'covariance': {'FIXES_UNUSABLE', *FIXES}, 'outages': {'TOPIC_GAP', 'STAMPS_NOT_RISING'}}
 
 
