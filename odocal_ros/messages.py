@@ -223,8 +223,10 @@ def _yaw_variance(q_ni, covariance):
 
 
 def _fix(stamps, received, position, covariance, known, status) -> FixSamples:
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        horizontal = position[:, :2] * RAD_PER_DEG
     return FixSamples(
-        stamps, received, position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG,
+        stamps, received, horizontal[:, 0], horizontal[:, 1],
         position[:, 2], covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
 
 

@@ -13,7 +13,7 @@ from odocal_ros.bagio import cdr
 from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import make_reader
+from odocal_ros.messages import _fix, make_reader
 
 STD = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64')
 
@@ -416,3 +416,12 @@ def test_what_rclpy_serialises_has_the_same_layout(message):
     assert bits(wire) == bits(by_rosbags.rows([make.cdr(message)], [5], None))
     assert bits(wire) == bits(by_message.rows(
         [big], [5], lambda raw: serialization.deserialize_message(raw, ros)))
+
+
+def test_a_nan_that_signals_is_one_in_silence():
+    position = np.zeros((2, 3))
+    position.view(np.uint64)[1, 0] = 0x7ff0000000000001
+    ns = np.zeros(2, np.int64)
+    with np.errstate(all='raise'):
+        fixes = _fix(ns, ns, position, np.zeros((2, 9)), *np.zeros((2, 2, 1)))
+    assert np.isnan(fixes.latitude).tolist() == [False, True]
