@@ -97,11 +97,11 @@ def test_settings_and_reasons_named_in_the_text_exist():
 
 def test_the_node_offers_what_the_readme_lists():
     pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
-    from odocal_ros.live import inputs, node
+    from odocal_ros.live import node, topic_input
     from odocal_ros.live.outlets import PLOTTED
     topics = {'status', 'hint', 'scale_factor', 'yaw_mounting_angle'}     # and `_sigma`
     assert topics | {f'{name}_sigma' for name in topics} >= set(PLOTTED)
     services = set(re.findall(r'`~/(\w+)`', README)) - topics
     assert services == set(node.SERVICES)
-    for topic in inputs.TOPICS.values():
+    for topic in topic_input.TOPICS.values():
         assert f'`{topic}`' in README, topic

@@ -22,12 +22,12 @@ from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live import answers, params
-from odocal_ros.live.inputs import TOPICS
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.recording import Recording
+from odocal_ros.live.topic_input import TOPICS
 from odocal_ros.outside import one_line, said_by
 
 TICK_S = 0.05

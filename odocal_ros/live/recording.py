@@ -11,8 +11,9 @@ from rclpy.node import Node
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live.ability import Heard
-from odocal_ros.live.inputs import Input, Inputs
+from odocal_ros.live.inputs import Inputs
 from odocal_ros.live.progress import Progress
+from odocal_ros.live.topic_input import Input
 from odocal_ros.samples import Samples, take
 
 BACKWARD_S = 0.1   # a clock that steps back by more has jumped

@@ -7,7 +7,7 @@ from player import messages_of, part, Player
 import pytest
 
 from odocal_ros.live import jobs, operation
-from odocal_ros.live.inputs import Input
+from odocal_ros.live.topic_input import Input
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 

@@ -7,7 +7,7 @@ from launch_stand_in import of_python, of_xml
 import pytest
 import yaml
 
-from odocal_ros.live.inputs import TOPICS
+from odocal_ros.live.topic_input import TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON, XML = (ROOT / 'launch' / f'calibrator.launch.{kind}' for kind in ('py', 'xml'))

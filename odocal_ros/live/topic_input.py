@@ -1,0 +1,239 @@
+"""One topic of the node: raw messages as they wait, decoded in blocks by the readers of bags."""
+
+from collections import deque
+from collections.abc import Callable
+import difflib
+from functools import partial
+
+import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+from odocal_ros.config import Config
+from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.live.definitions import message_class
+from odocal_ros.live.health import Health
+from odocal_ros.messages import make_reader, Reader
+from odocal_ros.odometer_types import TYPES
+from odocal_ros.outside import said_by
+
+TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
+          'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
+# five seconds of the highest rate believed: a queue that runs over is what loses messages
+DEPTH = {'imu': 5000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
+         'fix': 500, 'fix_velocity': 500}
+LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+          'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
+MOST_MEANT, ALIKE = 2, 0.4
+QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
+
+
+class Gate(MutuallyExclusiveCallbackGroup):
+    """
+    A callback group that the executor leaves alone while it is shut.
+
+    Waking the executor for every message is nine tenths of what a node costs at 1 kHz: messages
+    wait in the middleware's queue instead, and ``Input.take`` fetches them twenty times a second.
+    """
+
+    def __init__(self, is_open: bool) -> None:
+        super().__init__()
+        self.is_open = is_open
+
+    def can_execute(self, entity) -> bool:
+        """Return whether the executor may wait for the entity."""
+        return self.is_open and super().can_execute(entity)
+
+
+class Input:
+    """
+    One topic, from the wire to blocks of samples.
+
+    ``allowed`` are the message types it takes; empty: any that ``make_reader`` can read.
+    """
+
+    def __init__(self, node: Node, slot: str, allowed: tuple[str, ...]) -> None:
+        self.slot, self.allowed = slot, allowed
+        self.name = TOPICS[slot]
+        self.topic = node.resolve_topic_name(self.name)
+        self.msgtype = ''
+        self.reader: Reader | None = None
+        self.health = Health()
+        self.trouble = ''
+        self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
+        self.frame = ''        # of the Imu's header, once a message has come
+        self.publishers: list = []
+        self.meant: list[str] = []     # topics that others publish, where nobody does this one
+        self._failed = 0
+        self._node = node
+        self._pending: deque = deque()
+        self._deserialize: Callable | None = None
+        self._subscription: Subscription | None = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        # in sim time a message is stamped with the node clock as it arrives: no queueing then
+        self.gate = Gate(node.get_clock().ros_time_is_active)  # type: ignore[attr-defined]
+
+    def check(self, config: Config) -> None:
+        """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
+        if len(self.allowed) == 1:
+            message_class(self.allowed[0])
+            make_reader(self.slot, self.allowed[0], config)
+
+    def look(self) -> None:
+        """Look at who publishes the topic, and where nobody does, at what may be meant."""
+        self.publishers = self._node.get_publishers_info_by_topic(self.topic)
+        self.meant = [] if self.publishers else self._alike()
+
+    def _alike(self) -> list[str]:
+        """Return topics that others publish with a type that would serve, the nearest first."""
+        wanted, own = set(self.allowed or TYPES), f'{self._node.get_fully_qualified_name()}/'
+        names = [name for name, types in self._node.get_topic_names_and_types()
+                 if wanted & set(types) and not name.startswith(own)
+                 and self._node.count_publishers(name)]
+        # of the many types that may be an odometer's only what is called alike
+        return difflib.get_close_matches(self.topic, names, MOST_MEANT,
+                                         0.0 if self.allowed else ALIKE)
+
+    def doubled(self) -> str:
+        """Name those who publish the topic where they are several, else return nothing."""
+        if len(self.publishers) < 2 or self.reader is None:
+            return ''
+        who = ', '.join(sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+                               for p in self.publishers))
+        return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages mix; '
+                'stop all but one')
+
+    def find(self, config: Config) -> None:
+        """Subscribe once the type is known."""
+        if self.reader is not None:
+            return
+        try:
+            if len(self.allowed) == 1:
+                self.subscribe(self.allowed[0], config)
+            elif self.publishers:
+                self.subscribe(self.publishers[0].topic_type, config)
+        except (OdocalError, ParameterException, InvalidQosOverridesError) as error:
+            trouble = said_by(error)
+            if trouble != self.trouble:
+                self._node.get_logger().error(trouble)
+            self.trouble = trouble
+
+    def subscribe(self, msgtype: str, config: Config) -> None:
+        """Create the reader and the subscription, or raise what is wrong."""
+        if self.allowed and msgtype not in self.allowed:
+            raise BadData(f'{self.topic} carries {msgtype}, not {" or ".join(self.allowed)}: '
+                          f'remap {self.name} to another topic')
+        kind = message_class(msgtype)
+        reader = make_reader(self.slot, msgtype, config)
+        # increments want the QoS on offer; a heading is optional, an idle subscription is not free
+        if not self.publishers and (self.slot == 'heading' or self._counts_increments(reader)):
+            return
+        offered = {p.qos_profile.reliability for p in self.publishers}
+        reliable = self._counts_increments(reader) and offered == {ReliabilityPolicy.RELIABLE}
+        qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=DEPTH[self.slot],
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
+        self._deserialize = partial(deserialize_message, message_type=kind)
+        self._subscription = self._node.create_subscription(
+            kind, self.name, self._receive,  # type: ignore[arg-type]
+            qos, raw=True, callback_group=self.gate,
+            # each event handler costs time in every turn of the executor; find() sees as much
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self.reader, self.msgtype, self.trouble = reader, msgtype, ''
+        self._node.get_logger().info(
+            f'{self.slot}: {msgtype} on {self.topic}, '
+            f'{"reliable" if reliable else "best effort"}')
+
+    @staticmethod
+    def _counts_increments(reader) -> bool:
+        # a lost increment is travel lost for good, so such a sender is asked to repeat itself
+        return reader.form is not None and reader.form.quantity == 'increment'
+
+    def _receive(self, raw: bytes, info: dict) -> None:
+        """Remember one message that the executor brought."""
+        if self.gate.is_open:
+            info['source_timestamp'] = self._node.get_clock().now().nanoseconds
+        self._pending.append((raw, info))
+
+    def _fetch(self, subscription: Subscription) -> None:
+        """Take what waits in the middleware's queue, as the executor would."""
+        handle, kind = subscription.handle, subscription.msg_type
+        with handle:
+            for _ in range(DEPTH[self.slot]):
+                message_and_info = handle.take_message(kind, True)
+                if message_and_info is None:
+                    return
+                self._pending.append(message_and_info)
+
+    def take(self) -> tuple[list[bytes], list[int]]:
+        """Return the messages that came since the last call, and when they were sent, ns."""
+        if self._subscription is not None and not self.gate.is_open:
+            self._fetch(self._subscription)
+        pending, self._pending = self._pending, deque()
+        if pending:
+            self.health.arrived([i['publication_sequence_number'] for _, i in pending],
+                                self._steady_ns())
+        return ([raw for raw, _ in pending],
+                [i['source_timestamp'] or i['received_timestamp'] for _, i in pending])
+
+    def decode(self, raws: list[bytes], received_ns: list[int], max_gap_s: float | None) -> list:
+        """Return (slot, block) pairs of messages; those that cannot be read are counted."""
+        reader, deserialize = self.reader, self._deserialize
+        if reader is None or deserialize is None:
+            return []
+        try:
+            if not self.frame and self.slot == 'imu':
+                self.frame = deserialize(raws[0]).header.frame_id
+            pairs = reader.rows(raws, received_ns, deserialize)
+        except Exception as error:  # whatever a foreign message does, the node lives on
+            self._failed += len(raws)
+            self.trouble = f'{self.topic}: {said_by(error)}'
+            pairs = []
+        self.health.unusable = self._failed + reader.unreadable
+        if not pairs and reader.trouble:
+            self.trouble = f'{self.topic}: {reader.trouble}'
+        for slot, block in pairs:
+            if slot == self.slot:
+                self.sound = self.health.decoded(block, max_gap_s)
+        return pairs
+
+    def flowing(self) -> bool:
+        """Return whether usable messages are coming."""
+        return self.health.flowing(self._steady_ns())
+
+    def why(self) -> str:
+        """Return why nothing usable comes, for people; empty if it does."""
+        silent = self.health.silent_s(self._steady_ns())
+        if self.flowing():
+            return ''
+        if self.trouble:
+            return self.trouble
+        if self.health.heard_ns and not self.health.newest_ns:
+            return f'{self.topic}: all header stamps are zero; mend the driver'
+        if not self.publishers:
+            return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'
+                    + (f', silent for {silent:.0f} s' if self.health.heard_ns else
+                       '; start the driver or remap ' + self.name)
+                    + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
+        foreign = {p.topic_type for p in self.publishers} - {self.msgtype}
+        if self.msgtype and foreign and not self.health.heard_ns:
+            return (f'{self.topic} is published as {", ".join(sorted(foreign))}, want '
+                    f'{self.msgtype}')
+        offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
+                                   for p in self.publishers}))
+        many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
+        if not self.health.heard_ns:
+            return f'{self.topic}: {many} found ({offers}) but no message yet'
+        return f'no {LABELS[self.slot]} on {self.topic} for {silent:.0f} s: {many} found'
+
+    def _steady_ns(self) -> int:
+        return self._steady.now().nanoseconds
