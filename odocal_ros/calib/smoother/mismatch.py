@@ -13,6 +13,11 @@ ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
 SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
 OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said to be wrong
 WIDEN = 2.0            # factor on the sigmas where the model does not hold
+BY_SHAKING = 'the Imu errs more than its grade, in ways that are not white noise'
+SHAKEN = ('What shakes an Imu is no white noise; the sigmas were widened. Mount it firmly and '
+          'away from the engine.')
+OF_FORCE = ('Mount the Imu firmly, or set imu.grade, or imu.accel_noise and the like, to what it '
+            'is.')
 
 
 def mismatch(problem, fit, config):
@@ -30,10 +35,11 @@ def mismatch(problem, fit, config):
         if np.max(np.abs(now[0]) / sigma) > 2 * WORSE]
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
-                              f'({", ".join(worse)}); estimated from the drive instead'))
+                              f'({", ".join(worse)}); estimated from the drive instead',
+                              '' if any('gyro' in x for x in worse) else OF_FORCE))
     widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
     if shaken > WORSE:      # what shakes a vehicle is not white, and its colour is not known
-        odd.append('the Imu errs more than its grade, in ways that are not white noise')
+        odd.append(BY_SHAKING)
     share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
@@ -46,7 +52,8 @@ def mismatch(problem, fit, config):
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
         widen = WIDEN
-        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd)))
+        reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
+                              SHAKEN if odd == [BY_SHAKING] else ''))
     return widen, reasons
 
 
