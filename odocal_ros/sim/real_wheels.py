@@ -19,15 +19,19 @@ def growth(state, real):
     return grown
 
 
-def tyre_slip(state, real):
-    """Return the metres spun beyond the ground because the tyres pull or brake: (n,)."""
+def slip_share(state, real):
+    """Return the metres spun beyond each metre of ground as the tyres pull or brake: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
     force = forward * state.acceleration / G + REST + AIR * state.speed**2     # over load
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
-    slip = real.tyre_slip * (pull + np.minimum(force, 0.0))
+    return real.tyre_slip * (pull + np.minimum(force, 0.0))
+
+
+def tyre_slip(state, real):
+    """Return the metres spun beyond the ground by then: (n,)."""
     way = np.diff(state.travel, prepend=state.travel[:1])
-    return np.cumsum(slip * way)
+    return np.cumsum(slip_share(state, real) * way)
 
 
 def leg_factor(state, real) -> float:

@@ -154,14 +154,14 @@ def _late(ns, options, name):
 
 def _reading(state, options, side, arm, scale):
     real, spun = options.real, slip(state, options, side)
-    if real.tyre_slip:
-        spun = spun + real_wheels.tyre_slip(state, real)
     grown = 1 + real_wheels.growth(state, real)
     if options.odometer == 'speed':
         noise = options.speed_noise * stream(options.seed, 'speed').standard_normal(len(state.t))
-        rate = (contact_speed(state, arm) + np.gradient(spun, state.t)) / grown
+        # slip of the moment: of a speed sent twice a second differences would smear it
+        pulled = real_wheels.slip_share(state, real) * state.speed
+        rate = (contact_speed(state, arm) + pulled + np.gradient(spun, state.t)) / grown
         return real_wheels.coarse((rate + noise) / scale, real)
-    rolled = contact_travel(state, arm) + spun
+    rolled = contact_travel(state, arm) + spun + real_wheels.tyre_slip(state, real)
     if np.ndim(grown):
         between = (grown + np.roll(grown, 1)) / 2
         rolled = np.cumsum(np.diff(rolled, prepend=rolled[:1]) / between)
