@@ -25,6 +25,7 @@ KNOT_STEP = 1.5      # the knots' grid over that of all rows, at least, of an in
 LEAST_CELL = 2       # cells from zero: in the first, a dead band may be at work
 GAP = 2.5            # median steps: longer ones tell no crossing
 GOLDEN = 0.618034    # steps through a range evenly
+SHARP = 0.5          # of a cell: a speed that changes by more in a step tells no crossing
 SHARPEST = 0.02      # of a cell, sigma of a crossing: what speeds do beside
 
 Floats = NDArray[np.float64]
@@ -62,12 +63,8 @@ class CoarseSpeed:
     @cached_property
     def most(self) -> float:
         """Return how far a speed may be from the line between rows, bends in between too."""
-        return self.step + self._bend
-
-    @cached_property
-    def _bend(self):
         change = np.abs(np.diff(self.value))
-        return float(np.percentile(change, 95)) / 4 if len(change) else 0.0
+        return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
     @cached_property
     def told(self) -> Told:
@@ -76,8 +73,8 @@ class CoarseSpeed:
 
         The offset is half a cell where the sender truncates, none where it rounds. A change by one
         cell: the speed of its middle is the mean of both values, uniform by what the speed changes
-        in the step. A value between changes by more, or of rows so far apart that speeds bend in
-        between: it is uniform in its cell, and its rows, however many, count as one.
+        in the step. A value between changes by more, or in steps so long that the speed changes by
+        much of a cell: it is uniform in its cell, and its rows, however many, count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -87,12 +84,13 @@ class CoarseSpeed:
         outer = np.maximum(np.abs(cell[at]), np.abs(cell[at + 1]))
         inner = np.minimum(np.abs(cell[at]), np.abs(cell[at + 1]))
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
+        # in a long step a cruise ends anywhere, and before it the speed was that of the cruise
+        gained = _gain(middle, edge, q) * h
+        jump = np.where(gained > SHARP * q, 2, jump)
         single = (jump == 1) & (outer >= LEAST_CELL) & (inner > 0)
         if not self.interpolated:
             single &= h <= GAP * usual
-        if self._bend > q / 2:        # rows so far apart tell their own times only
-            single, jump = np.zeros(len(at), bool), np.full(len(at), 2)
-        sigma = np.minimum(_gain(middle, edge, q) * h, q)[single]
+        sigma = gained[single]
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
         # one of its rows by turns: where the speed turns about, the middle one is the fastest

@@ -8,6 +8,7 @@ from smoother_legs import leg_of, made, truth, with_velocity
 
 from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
+from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SPREAD, USUAL
 from odocal_ros.calib.smoother.state import (
@@ -26,6 +27,7 @@ from odocal_ros.calib.smoother.state import (
     SLOW,
     SPEED_OFFSET,
     WITH_SLOW,
+    YAW,
 )
 from odocal_ros.config import with_settings
 from odocal_ros.nav.coarse_speed import CoarseSpeed
@@ -118,8 +120,18 @@ def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
     assert begin[:, :, P].any() == (name in ('motion', 'fixes'))
 
 
+def test_the_way_of_a_speed_in_coarse_steps_tells_nothing_of_its_size(stepping):
+    problem, state = stepping
+    by_constants = part_at(problem, state, 'motion').jacobians(N)[2]
+    assert not by_constants[:, D, [LN_K, ODO_DELAY, SPEED_OFFSET]].any()
+    assert by_constants[:, D, YAW].any()
+
+
 def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
     problem, state = stepping
+    # steps so fine that the way is heard, of the same way
+    problem = replace(problem, leg=replace(problem.leg, rough_scale=0.1))
+    assert not problem.leg.by_steps
     held = problem.sums(state)
 
     def raw(size):

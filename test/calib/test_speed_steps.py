@@ -60,6 +60,17 @@ def test_the_scale_of_a_speed_in_whole_kmh_is_held_by_its_sigma(how, rate, betwe
     assert Code.WHEEL_SLIP not in seen
 
 
+@pytest.mark.parametrize('seed', [2, 3, 31])
+def test_a_slow_yard_told_once_a_second_is_held_by_its_sigma(seed):
+    # squat and turns give the way directions of its own, which tell nothing of the scale
+    drive, result = calibrated(scenario='yard', rate=1.0, duration=400.0, seed=seed,
+                               imu_grade='industrial', fix_noise='rtk', fix_sigma=0.02,
+                               real=Real(speed_step=KMH, squat=0.002, sideslip=0.004))
+    off, sigma = error(drive, result.methods['smoother'])
+    assert abs(off) < 3.3 * sigma
+    assert sigma < 0.04
+
+
 @pytest.mark.parametrize(('how', 'share'), [('floor', 0.5), ('round', 0.0)])
 def test_truncation_or_rounding_is_found(how, share):
     _, result = calibrated(how)

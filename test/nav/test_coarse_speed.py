@@ -93,3 +93,20 @@ def test_a_smooth_start_to_one_cruise_has_no_grid():
     speed = 11.7647 * (x**3 * (10 - 15 * x + 6 * x**2))      # no jerk at either end
     assert coarse_speed(t, speed) is None
     assert coarse_speed(t, np.floor(speed * 3.6) / 3.6).step == pytest.approx(1 / 3.6, rel=1e-6)
+
+
+@pytest.mark.parametrize('rate', [1.0, 2.0, 10.0])
+def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
+    # every stop has its own cruise, the speed's place in its cell is any: in-between, up, down
+    rng = np.random.default_rng(5)
+    cruise = rng.uniform(1.0, 3.0, 400)
+    corners, v = np.cumsum(rng.uniform(5.0, 10.0, 1600)), np.zeros(1600)
+    v[1::4] = v[2::4] = cruise
+    corners[1::4], corners[3::4] = corners[0::4] + cruise / 0.7, corners[2::4] + cruise / 0.9
+    t = np.arange(corners[0], corners[-1], 1 / rate)
+    speed = np.interp(t, corners, v)
+    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).told
+    error = told.value + KMH / 2 - np.interp(told.t, corners, v)
+    assert len(told.t) > 800
+    assert abs((error / told.sigma).mean()) < 3.3 / np.sqrt(len(told.t))
+    assert np.sqrt(((error / told.sigma)**2).mean()) < 1.1

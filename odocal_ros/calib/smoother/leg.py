@@ -11,6 +11,7 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
 
 Floats = NDArray[np.float64]
+STEPS = 0.05           # m/s: a speed in finer steps errs as if by chance
 BEFORE_MARK = 30.0     # s: a standstill that ended longer before the start mark is another drive
 
 
@@ -47,6 +48,12 @@ class SmootherLeg:
     doubt_sigma: Floats = _none()        # scale units
     velocity: Velocity = Velocity()
     heading: Heading = Heading()
+
+    @property
+    def by_steps(self) -> bool:
+        """Tell whether the odometer is heard by the steps of its speed, not by its way."""
+        coarse = self.travel.coarse
+        return coarse is not None and coarse.step * self.rough_scale > STEPS
 
 
 def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:

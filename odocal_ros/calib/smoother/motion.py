@@ -101,6 +101,7 @@ class Motion:
 
     def __init__(self, leg, state, intervals, change=(0.0, 0.0), fitted=False):
         self.state, self.sums, self.fitted = state, intervals, fitted
+        self.by_steps = leg.by_steps
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
@@ -219,6 +220,9 @@ class Motion:
             c[:, D, SPEED_OFFSET] = -self.unsaid
         # stamps late by d: the reading at a time is the travel d before it
         c[:, D, ODO_DELAY] = -self.faster
+        if self.by_steps:       # of such a way the direction counts, which these do not change
+            c[:, D, [LN_K, ODO_DELAY, SPEED_OFFSET]] = 0.0
+            c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
         if self.fitted:

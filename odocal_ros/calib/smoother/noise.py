@@ -33,7 +33,6 @@ SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
 GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
 GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
 ABSENT = 1e4        # m^2: no odometer
-STEPS = 0.05        # m/s: a speed in finer steps errs as if by chance
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ def _given(motion, leg, axes, rest):
     Along the way itself it says nothing: what it tells is in speed_steps.py. In a turn an error
     that goes from one end of its cell to the other amid the interval moves the end sideways.
     """
-    if not by_steps(leg):
+    if not leg.by_steps:
         return np.zeros((len(rest), ROWS, 0))
     size = np.linalg.norm(motion.way, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.way / np.maximum(size, 1e-3), axes[:, 0])
@@ -170,12 +169,6 @@ def _given(motion, leg, axes, rest):
     given[:, D, 0] = along * np.sqrt(ABSENT)
     given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]
     return given * ~rest[:, None, None]
-
-
-def by_steps(leg) -> bool:
-    """Tell whether a leg's odometer is heard by the steps of its speed, not by its way."""
-    coarse = leg.travel.coarse
-    return coarse is not None and coarse.step * leg.rough_scale > STEPS
 
 
 def rest_noise(speed, rest):

@@ -8,7 +8,6 @@ a cell, for as long as the value stands.
 import numpy as np
 
 from odocal_ros.calib.smoother.motion import accelerations, gravity_n, means_by_way, varies_with
-from odocal_ros.calib.smoother.noise import by_steps
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -40,7 +39,7 @@ class SpeedSteps(PointRows):
 
     def __init__(self, problem, here):
         leg, state, points = problem.leg, here.state, here.points[self.name]
-        self.state, self.points, self.fitted = state, points, here.fitted
+        self.state, self.points = state, points
         self.told, self.k = _within(problem), points.interval
         self.sigma = self.told.sigma * leg.rough_scale
         # at an even acceleration the speed is at the same place of its cell again and again
@@ -70,7 +69,7 @@ class SpeedSteps(PointRows):
     @classmethod
     def there(cls, problem):
         """Tell whether the odometer sends such a speed."""
-        return by_steps(problem.leg) and len(_within(problem).t) > 0
+        return problem.leg.by_steps and len(_within(problem).t) > 0
 
     @classmethod
     def times(cls, problem, constants):
@@ -96,10 +95,9 @@ class SpeedSteps(PointRows):
         turned = np.cross(ahead, v) - np.cross(ahead, self.dv) / 2
         J[:, BG] = turn(np.swapaxes(self.C, 1, 2), turned) * tau + np.cross(arm, state.forward)
         K = state.scale * self.varied
-        # a value is its cell's: by the speed as fitted, which its error is not in
-        said = self.speed if self.fitted else self.said
-        c[:, LN_K], c[:, SPEED_OFFSET] = said, K * self.told.side
-        c[:, TYRES] = (said / self.varied)[:, None] * self.from_mean
+        # by what is said: the speed lies anywhere in its cell, so the error is the speed's alone
+        c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.told.side
+        c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
         for column, gradient in zip((YAW, PITCH), C_bv_gradient(
                 state.constants[YAW], state.constants[PITCH]), strict=True):
