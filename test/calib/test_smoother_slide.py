@@ -9,7 +9,7 @@ from smoother_legs import made, truth
 from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slide import least_slide, ROAD, SIDEWAYS, TESTED, turned
+from odocal_ros.calib.smoother.slide import HEAVE, least_slide, ROAD, SIDEWAYS, TESTED, turned
 from odocal_ros.reasons import Code
 
 
@@ -44,8 +44,9 @@ def test_a_leg_with_turns_tests_it_itself():
     _, config, leg = made(duration=200.0, imu_grade='industrial')
     method = smooth(leg, config)
     assert not said(method)
-    # wheels that never slide: far below a road's
-    assert max(method.details['noise'][name] for name in SIDEWAYS) < ROAD / 10
+    # wheels that never slide: far below a road's; up and down springs and road do what they do
+    assert max(method.details['noise'][name] for name in ('side', 'side_turn')) < ROAD / 10
+    assert method.details['noise']['up'] == pytest.approx(HEAVE)
 
 
 def test_turns_are_those_driven_whatever_the_bias_of_the_gyro():

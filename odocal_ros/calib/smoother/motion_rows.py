@@ -7,7 +7,7 @@ from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
 from odocal_ros.calib.smoother.part import Part, Total
-from odocal_ros.calib.smoother.slide import least_slide, SIDEWAYS
+from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.state import M
 
 FIRST_ROAD = 0.01    # m/sqrt(s), what slip and slide are believed to be at first
@@ -46,7 +46,8 @@ class MotionRows(Part):
         slide = least_slide(problem.turned)**2
         return (imu | dict.fromkeys(ALONG, FIRST_ROAD**2)
                 | dict.fromkeys(SIDEWAYS, max(FIRST_ROAD**2, slide)),
-                imu | dict.fromkeys(ALONG, LEAST_ROAD**2) | dict.fromkeys(SIDEWAYS, slide))
+                imu | dict.fromkeys(ALONG, LEAST_ROAD**2) | dict.fromkeys(SIDEWAYS, slide)
+                | {'up': max(slide, HEAVE**2)})
 
     def weigh(self, levels):
         """Whiten the rows by the Cholesky root of their covariance."""

@@ -13,6 +13,8 @@ from odocal_ros.calib.smoother.start import rest_bias
 from odocal_ros.reasons import Code, Reason
 
 TESTED = 2e-4                   # m/sqrt(s), least that is believed where there are turns
+# m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds
+HEAVE = 2e-3
 ROAD = 0.05 / np.sqrt(10.0)     # m/sqrt(s), an ordinary road: 0.05 m/s, white at 10 Hz
 # rad turned in all: less than one crossroads tests nothing, two do; in between in proportion
 NO_TURN, ENOUGH = np.pi / 2, np.pi
