@@ -7,6 +7,8 @@ from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'wheels', 'two_point')
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
+# what the smoother refuses end points do not know either: they have but the accelerometer's level
+REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # what a reason speaks of: nothing to say where another method gives it
 ABOUT = {
     Code.SCALE_NOT_DETERMINED: 'scale_factor', Code.SCALE_SIGMA_TOO_LARGE: 'scale_factor',
@@ -57,8 +59,9 @@ def choose(methods: dict[str, MethodResult], asked):
     estimates: dict[str, Estimate] = {}
     for method in usable:
         for name, estimate in method.estimates.items():
-            if name not in estimates or (estimates[name].value is None
-                                         and estimate.value is not None):
+            first = estimates.get(name)
+            if first is None or (first.value is None and estimate.value is not None
+                                 and (first.method, name) != REFUSED_FOR_ALL):
                 estimates[name] = replace(estimate, method=method.name)
     giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])

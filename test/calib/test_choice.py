@@ -39,6 +39,16 @@ def test_the_first_in_order_gives_what_it_has():
     assert giving == ('smoother', 'two_point')
 
 
+def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
+    known = {'pitch_mounting_angle': Estimate(0.02, 1e-3, 'rad')}
+    unknown = {'pitch_mounting_angle': Estimate(None, None, 'rad')}
+    smoother, ends = method('smoother'), method('two_point')
+    methods = several(replace(smoother, estimates=smoother.estimates | unknown),
+                      replace(ends, estimates=ends.estimates | known))
+    assert choose(methods, 'auto')[0]['pitch_mounting_angle'].value is None
+    assert choose(methods, 'two_point')[0]['pitch_mounting_angle'].value == 0.02
+
+
 def test_a_rejected_method_gives_nothing_while_another_is_sound():
     methods = several(method('wheels', 2.1, reasons=[REFUSED]), method('two_point'))
     assert choose(methods, 'auto')[0]['scale_factor'].value == 2.0
