@@ -19,6 +19,7 @@ from odocal_ros.nav.alignment import (
     level_at_rest,
     level_in_motion,
     MOTION_LEVEL,
+    off_the_earth,
 )
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon
@@ -31,6 +32,7 @@ from odocal_ros.screen import Inputs
 COURSE_TIME = 300.0       # s within which the way for a course must be driven
 HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
 NOISY = 10.0              # times the noise of the grade at rest: another gyro, or another unit
+NO_EARTH = 4.0            # sigmas: a gyro with such a bias is no compass
 NEAR = 0.5                # s: a heading sample this near to a moving start is taken
 
 
@@ -215,6 +217,10 @@ def _gyrocompass(inputs, level, latitude, grade, config):
     if sigma > COMPASS_LIMIT:
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
+    off = off_the_earth(level, latitude, grade)
+    if off > NO_EARTH:
+        return None, (f'at rest the gyro does not show the turn of the Earth, by {off:.0f} sigma: '
+                      f'its bias is not that of the {config.imu.grade} grade')
     return (yaw, sigma), ''
 
 

@@ -22,6 +22,11 @@ class Grade:
     misalignment: float = 0.0        # rad, of each axis from where it should point
     gyro_by_force: float = 0.0       # rad/s per m/s^2, what a force makes a gyro show
 
+    @property
+    def level_bias(self) -> float:
+        """Return the bias of a level accelerometer, m/s^2: its own and what its axis has of g."""
+        return math.hypot(self.accel_bias, math.sqrt(2) * G * self.misalignment)
+
 
 def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_bias,
                      accel_bias_walk, gyro_scale_error, accel_scale_error,

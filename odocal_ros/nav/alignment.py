@@ -106,7 +106,7 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
     span : (2,)
         Begin and end of the standstill, s.
     grade : Grade
-        Accelerometer bias and noise.
+        Accelerometer bias, axes and noise.
     gyro_noise : float
         rad/s/sqrt(Hz).
 
@@ -124,7 +124,7 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
     length = max(span[1] - span[0] - 2 * cut, 1e-3)
     up_b = f_b[inside].mean(axis=0)
     g = np.linalg.norm(up_b)
-    sigma = np.hypot(grade.accel_bias, grade.accel_noise / np.sqrt(length)) / g
+    sigma = np.hypot(grade.level_bias, grade.accel_noise / np.sqrt(length)) / g
     end = t[inside][-1]
     rate_sigma = np.hypot(gyro_noise / np.sqrt(length), grade.gyro_bias_walk * np.sqrt(length / 3))
     return Level(float(end), level_frame(up_b), float(sigma), w_b[inside].mean(axis=0),
@@ -162,7 +162,7 @@ def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
     g = gravity(latitude, 0.0)
     fastest = np.abs(speed).max()
     earth = OMEGA * (T / 2 + 2 * fastest / g)       # the level turning away, and Coriolis
-    parts = (grade.accel_bias / g, grade.gyro_bias * T / 2, earth, fastest * 0.05 / (g * T))
+    parts = (grade.level_bias / g, grade.gyro_bias * T / 2, earth, fastest * 0.05 / (g * T))
     return Level(float(t[0]), level_frame(up_0), float(np.linalg.norm(parts)), np.zeros(3),
                  0.0, None)
 
@@ -178,6 +178,20 @@ def gyrocompass(level: Level, latitude, grade) -> tuple[float, float]:
     yaw = wrap(np.pi / 2 - np.arctan2(rate_L[1], rate_L[0]))
     gyro = np.hypot(grade.gyro_bias, level.rate_sigma) / (OMEGA * np.cos(latitude))
     return float(yaw), float(np.hypot(gyro, level.level_sigma * np.tan(latitude)))
+
+
+def off_the_earth(level: Level, latitude, grade) -> float:
+    """
+    Return by how many sigmas the rate at rest is not the Earth's, level and up: the worse one.
+
+    Both are known but for the heading, so a bias that the grade does not have shows.
+    """
+    rate_L = level.C_Lb @ level.mean_rate_b
+    level_rate, up_rate = OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)
+    off = np.array([np.hypot(rate_L[0], rate_L[1]) - level_rate, rate_L[2] - up_rate])
+    tilt = level.level_sigma * np.array([up_rate, level_rate])
+    sigma = np.sqrt(grade.gyro_bias**2 + level.rate_sigma**2 + tilt**2)
+    return float(np.abs(off / sigma).max())
 
 
 def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro_noise):

@@ -105,7 +105,8 @@ def test_level_sigma_holds(grade):
     grade, rng = GRADES[grade], np.random.default_rng(1)
     C_nb, z = matrix_from_rpy(RPY), []
     for _ in range(DRAWS):
-        level = levelled(rest(C_nb, accel_bias=rng.normal(0, grade.accel_bias, 3), grade=grade,
+        # what an axis that is askew has of g is a bias
+        level = levelled(rest(C_nb, accel_bias=rng.normal(0, grade.level_bias, 3), grade=grade,
                               rng=rng, seconds=10.0), grade)
         up_seen = C_nb @ level.C_Lb[2]              # where L's up lies in the true n
         z.append(up_seen[:2] / level.level_sigma)

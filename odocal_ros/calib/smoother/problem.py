@@ -201,9 +201,9 @@ def _priors(config, grade, leg) -> Priors:
     sigma[HEADING] = leg.heading.sigma
     sigma[GYRO_SCALE] = max(grade.gyro_scale_error, NO_ERROR)
     sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade, leg.t_stop - leg.t_begin), NO_ERROR)
-    # what gravity makes of axes and scale is a bias
-    level = np.sqrt(2) * G * grade.misalignment
-    accel_bias = np.hypot(max(grade.accel_bias, 1e-6), [level, level, grade.accel_scale_error * G])
+    # what gravity makes of the scale is a bias too
+    up = np.hypot(grade.accel_bias, grade.accel_scale_error * G)
+    accel_bias = np.maximum([grade.level_bias, grade.level_bias, up], 1e-6)
     centre = np.zeros(M)
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)
