@@ -5,6 +5,7 @@ from pathlib import Path
 import random
 import socket
 
+import hypothesis
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -24,12 +25,30 @@ def _own_domain():
     raise RuntimeError('all ROS domains are taken by other test runs')
 
 
+# no test is timed: a busy machine fails none
+hypothesis.settings.register_profile('untimed', deadline=None)
+hypothesis.settings.load_profile('untimed')
 # at import, since rclpy and every process started by a test read them once
 DOMAIN, _lock = _own_domain()
 os.environ['ROS_DOMAIN_ID'] = str(DOMAIN)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_LOCALHOST_ONLY', None)      # deprecated, and it would win
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')      # as the commands have it: the same digits
+
+
+# files that together take half of all the time
+SLOW = ('test_damaged_rows', 'test_fuzz', 'test_imperfect', 'test_journal', 'test_kills',
+        'test_late_counter', 'test_one_bad_row', 'test_predict_smoother', 'test_result_folders',
+        'test_shutdown', 'test_wire')
+
+
+def pytest_collection_modifyitems(items):
+    """Mark what takes long (slow), runs a node (live), needs the recordings (data)."""
+    for item in items:
+        marks = {'slow': item.path.stem in SLOW, 'live': item.path.parent.name == 'live',
+                 'data': 'data_dir' in item.fixturenames}
+        for mark in (name for name, there in marks.items() if there):
+            item.add_marker(mark)
 
 
 def pytest_report_header() -> list[str]:
