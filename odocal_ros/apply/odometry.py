@@ -8,12 +8,10 @@ attitude and bias is that of a replay. With it, the accelerometer holds the tilt
 gyro bias; the position never jumps.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKE
+from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import begin, Start
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
@@ -33,25 +31,6 @@ SPEED_OVER = 0.2     # s that a speed is taken over
 SILENT = 10.0        # s without odometer, after which attitude goes on alone
 HOLE = 0.1           # s without Imu that hide motion
 TOO_FAST = 100.0     # m/s: no land vehicle, but a scale of another unit
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """
-    Where the vehicle is, and how it moved since the pose before.
-
-    stamp_ns : of the Imu.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
-    base_link in odom.   velocity, rate : (3,) m/s, rad/s in base_link, of base_link.
-    pose_cov, twist_cov : (6, 6); of the pose position and rotation about the axes of odom.
-    """
-
-    stamp_ns: int
-    position: NDArray[np.float64]
-    q: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    pose_cov: NDArray[np.float64]
-    twist_cov: NDArray[np.float64]
 
 
 class Odometry:
@@ -220,36 +199,13 @@ class Odometry:
         velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
         if abs(speed) > TOO_FAST:
             self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
+        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
                     quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
-                    self._pose_cov(C_nb, arm_n), self._twist_cov(speed, rate, T))
+                    pose_covariance(v, self.errors, C_nb, arm_n, quantum),
+                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
-
-    def _pose_cov(self, C_nb, arm_n):
-        """Return the covariance, with what a count hides along the way."""
-        cov = self.errors.pose(C_nb, arm_n)
-        forward_n = C_nb @ self.vehicle.forward_b
-        cov[:3, :3] += np.outer(forward_n, forward_n) * self.wheels.quantum**2 / 6
-        return cov
-
-    def _twist_cov(self, speed, rate, T):
-        """Return the covariance of a mean twist over T s."""
-        v, e = self.vehicle, self.errors
-        C_vb, g = v.C_vb, self.grade
-        cov = np.zeros((6, 6))
-        turn = C_vb @ e.cov[BG, BG] @ C_vb.T + np.eye(3) * g.gyro_noise**2 / T
-        turn += np.outer(rate, rate) * g.gyro_scale_error**2
-        doubt = self.wheels.doubt(self._t - T, self._t)
-        cov[0, 0] = (speed * v.scale_sigma)**2 + (self.wheels.quantum**2 / 6 + doubt) / T**2
-        # what the road does to it in the time; and what no odometer sees: a body that sways
-        cov[:3, :3] += np.diag(e.road(speed * T) / T**2 + [1e-6, 0.05**2, 0.05**2])
-        # a body that turns too much about an arm moves too much
-        arm = np.cross(np.eye(3), -v.lever_arm).T
-        cov[:3, :3] += arm @ turn @ arm.T
-        cov[:3, 3:] = arm @ turn
-        cov[3:, :3], cov[3:, 3:] = cov[:3, 3:].T, turn
-        return cov
 
     def _leave_behind(self, last):
         """Forget what lies behind."""
