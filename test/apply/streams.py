@@ -76,8 +76,8 @@ def alignment_of(drive, row, tilt=(0.003, -0.002, 0.01), bias=(2e-5, -1e-5, 3e-5
         heading_source='fixed', heading_shared=True)
 
 
-def given(alignment, drive):
-    """Return the settings that begin odometry with an alignment, gyros alone."""
+def given(alignment, latitude):
+    """Return the settings that begin odometry with an alignment, at a latitude in rad."""
     return {'start__attitude': tuple(alignment.q_nb.tolist()), 'levelling': False,
             'start__gyro_bias': tuple(alignment.gyro_bias.tolist()),
-            'start__latitude': float(np.rad2deg(drive.options.latitude))}
+            'start__latitude': float(np.rad2deg(latitude))}

@@ -30,7 +30,7 @@ def test_the_path_is_that_of_replay_as_calibrated(drive):
     result = calibrate(drive.leg(), settings(drive), alignment)
     estimates = result.methods['two_point'].estimates
     assert estimates['yaw_mounting_angle'].value is not None
-    poses = poses_of(odometry_of(drive, estimates, **given(alignment, drive)),
+    poses = poses_of(odometry_of(drive, estimates, **given(alignment, result.origin[0])),
                      samples_of(drive, drive.imu.stamp_ns[row]), drive.form)
     assert len(poses) > 900
     rows = np.searchsorted(drive.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
@@ -56,7 +56,7 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     left, right = (run.reckon(travel).P * scale for travel, scale in zip(
         (run.inputs.travel_left, run.inputs.travel_right), made.truth.wheel_scales, strict=True))
     wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
-    poses = poses_of(odometry_of(made, **given(alignment, made)),
+    poses = poses_of(odometry_of(made, **given(alignment, run.origin.latitude)),
                      samples_of(made, made.imu.stamp_ns[row]), made.form)
     rows = np.searchsorted(made.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
     off = np.array([p.position for p in poses]) - (wanted[rows] - wanted[0])

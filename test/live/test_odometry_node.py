@@ -49,10 +49,10 @@ def replayed(drive, tmp_path_factory):
     return SimpleNamespace(row=row, alignment=alignment, result=result, path=path)
 
 
-def given(drive, replayed):
+def given(replayed):
     """Return the arguments that begin the node where replay begins."""
     values = {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
-              'start.latitude': float(np.rad2deg(drive.options.latitude)), 'levelling': False}
+              'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False}
     return [x for name, value in values.items()
             for x in ('-p', f'{name}:={str(value).lower()}')]
 
@@ -63,7 +63,7 @@ def heard(drive, replayed, domain):
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from nav_msgs.msg import Odometry
     from rclpy.qos import QoSProfile
-    node = NodeProcess('--params-file', str(replayed.path), *given(drive, replayed),
+    node = NodeProcess('--params-file', str(replayed.path), *given(replayed),
                        module='odometry')
     client = Client('odometry')
     seen = SimpleNamespace(odometry=[], twists=[], node=node)
