@@ -53,6 +53,9 @@ def given(replayed):
     """Return the arguments that begin the node where replay begins."""
     values = {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
               'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False}
+    # from the very first message on: one lost would be another start
+    values |= {f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+               for topic in ('imu/data', 'odometer')}
     return [x for name, value in values.items()
             for x in ('-p', f'{name}:={str(value).lower()}')]
 
