@@ -65,6 +65,7 @@ setup(
     entry_points={'console_scripts': [
         'calibrator = odocal_ros.live.node:main',
         'odocal = odocal_ros.offline.cli:main',
+        'odometry = odocal_ros.live.odometry:main',
     ]},
     zip_safe=True,
 )

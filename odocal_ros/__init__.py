@@ -19,6 +19,7 @@ Modules  config, errors, reasons, samples, leg, messages   what everybody speaks
          nav      earth, projection, rotations, alignment, strapdown, odometer, dead reckoning
          calib    methods, their error budget, verdict, combination of legs
          pipeline one pure function from leg to result
+         apply    a calibration at work, sample by sample
          paper    the tables of source A, computed
          sim      drives with known truth        bagio    the only place of rosbags
          live     the node, the only place of rclpy       offline  the odocal command

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.config import Config
-from odocal_ros.grades import Grade, grade_of
+from odocal_ros.force import TILT
+from odocal_ros.grades import G, Grade, grade_of
 from odocal_ros.nav.alignment import (
     COMPASS_LIMIT,
     complete,
@@ -61,6 +62,8 @@ def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Confi
 
     """
     grade = grade_of(config.imu)
+    if not inputs.felt:
+        grade = replace(grade, accel_bias=TILT * G)
     level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
     level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)

@@ -7,7 +7,9 @@ made from these dataclasses. A setting's name is ``group.field``, as its ROS par
 
 from dataclasses import dataclass, fields, is_dataclass, replace
 import difflib
+from functools import cache
 import math
+from typing import Any, TypeVar
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.setting import Setting, setting
@@ -17,6 +19,7 @@ HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'c
 FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
            'report')
 NAN = math.nan
+AnyConfig = TypeVar('AnyConfig', bound=Any)     # Config, or that of another node
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +265,13 @@ def _settings(owner, prefix=''):
                           m['choices'], m['about'], m['ro'], m['frame'])
 
 
-SETTINGS = {s.name: s for s in _settings(Config())}
+@cache
+def settings_of(kind: type) -> dict[str, Setting]:
+    """Return the settings of a dataclass of settings by dotted name."""
+    return {s.name: s for s in _settings(kind())}
+
+
+SETTINGS = settings_of(Config)
 
 
 def value_of(config: Config, name: str):
@@ -277,7 +286,7 @@ def flat(config: Config) -> dict:
     return {name: value_of(config, name) for name in SETTINGS}
 
 
-def with_settings(config: Config, changes: dict) -> Config:
+def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
     """
     Return config with settings changed by dotted name, each checked.
 
@@ -288,13 +297,14 @@ def with_settings(config: Config, changes: dict) -> Config:
 
     """
     groups: dict[str, dict] = {}
+    settings = settings_of(type(config))
     for name, value in changes.items():
-        if name not in SETTINGS:
-            near = difflib.get_close_matches(name, SETTINGS, 3, 0.5)
+        if name not in settings:
+            near = difflib.get_close_matches(name, settings, 3, 0.5)
             hint = f'; did you mean {" or ".join(near)}?' if near else ''
             raise BadConfig(f'no setting {name!r}{hint}')
         group, _, leaf = name.rpartition('.')
-        groups.setdefault(group, {})[leaf] = SETTINGS[name].checked(value)
+        groups.setdefault(group, {})[leaf] = settings[name].checked(value)
     top = groups.pop('', {})
     nested = {g: replace(getattr(config, g), **values) for g, values in groups.items()}
     return replace(config, **top, **nested)

@@ -8,6 +8,7 @@ from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
 from odocal_ros.coarse_odometer import held_steps
 from odocal_ros.errors import OdocalError
+from odocal_ros.force import upright
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.slow_slip import held
 from odocal_ros.smoother_run import smoother
@@ -33,7 +34,7 @@ def run_method(name, run):
         # what runs away is told by the number that is none, not by warnings and what follows
         with np.errstate(over='raise', divide='raise', invalid='raise'):
             method, path = METHODS[name](run)
-            return held_steps(held(method, run), run), path
+            return upright(held_steps(held(method, run), run), run), path
     except (OdocalError, MemoryError):
         raise
     except FloatingPointError as error:

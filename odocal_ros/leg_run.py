@@ -123,7 +123,9 @@ class LegRun:
     def _asked(self):
         """Return the methods to run: those asked for, of auto those that the leg can carry."""
         wanted = deciding(self.config.method, shown=True)
-        one_counter = self.inputs.travel_right is None and self.config.method == 'auto'
+        # without an accelerometer it serves one counter too
+        one_counter = (self.inputs.travel_right is None and self.inputs.felt
+                       and self.config.method == 'auto')
         return [name for name in METHODS if name in wanted
                 and not (name == 'wheels' and one_counter)]
 
@@ -183,7 +185,8 @@ class LegRun:
     def _faces_forward(self):
         """Tell whether the body frame is near enough to forward-left-up, and say where not."""
         inputs = self.inputs
-        self.facing = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, self.rough)
+        if inputs.felt:
+            self.facing = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, self.rough)
         found = axes_reasons(self.facing, self.config.imu.nominal_yaw)
         self.reasons += with_axes(found, inputs)
         return Code.IMU_AXES not in {r.code for r in found}
@@ -221,7 +224,8 @@ class LegRun:
     def _faults(self):
         """Say what is wrong with two wheels beside each other; return where one slipped."""
         inputs, odometer = self.inputs, self.config.odometer
-        if inputs.travel_right is None or BROKEN & {r.code for r in self.reasons}:
+        unseen = inputs.travel_right is None or not inputs.felt
+        if unseen or BROKEN & {r.code for r in self.reasons}:
             return NO_SLIPS
         found, slips = wheel_faults(
             inputs.travel_left, inputs.travel_right, (inputs.t_imu, inputs.w_b, inputs.f_b),

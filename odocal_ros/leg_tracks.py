@@ -35,7 +35,8 @@ def as_configured(run, f, estimates):
     f : as found; of its angles those are kept that ``estimates`` do not hold.
     """
     found = mounting_from_forward(f)
-    angles = [0.0 if estimates[name].value is not None else angle for name, angle in zip(
+    told = {name for name, e in estimates.items() if e.value is not None}
+    angles = [0.0 if name in told else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
     return (run.nominal or run.rough) * forward_b(*angles)
 

@@ -208,7 +208,9 @@ def full_type(msgtype: str) -> str:
     return f'{package}/msg/{name}' if package and '/' not in package else msgtype
 
 
-def _imu(stamps, received, q_ni, covariance, w_i, f_i) -> ImuSamples:
+def _imu(stamps, received, q_ni, covariance, w_i, f_i, of_force) -> ImuSamples:
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        f_i = np.where(of_force == -1, np.nan, f_i)       # REP-145: none is sent
     return ImuSamples(stamps, received, w_i, f_i, q_ni, _yaw_variance(q_ni, covariance))
 
 
@@ -238,7 +240,8 @@ def _velocity(stamps, received, velocity_n, *covariance) -> VelocitySamples:
 
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0, 8))
 _SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Callable]] = {
-    ('imu', IMU): ((*_ORIENTATION, xyz('angular_velocity'), xyz('linear_acceleration')), _imu),
+    ('imu', IMU): ((*_ORIENTATION, xyz('angular_velocity'), xyz('linear_acceleration'),
+                    array('linear_acceleration_covariance', 0)), _imu),
     ('heading', IMU): (_ORIENTATION, _heading),
     ('fix', FIX): ((fixed(np.float64, 'latitude', 'longitude', 'altitude'),
                     array('position_covariance', *range(9)),

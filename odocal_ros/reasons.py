@@ -26,6 +26,8 @@ class Code(Enum):
 
     # the data that came
     NO_IMU = REJECT, 'Check the Imu topic and its QoS, or name it with --imu-topic.'
+    NO_ACCELEROMETER = CAUTION, ('For yaw and pitch take an Imu that sends its acceleration too; '
+                                 'drive level ground, hills lengthen the way unseen.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
     NO_FIX = REJECT, 'Drive under open sky and wait for a position before the start mark.'
     FIXES_UNUSABLE = REJECT, ('Wait for a valid position; loosen gnss.min_status or '

@@ -28,8 +28,13 @@ WEIGHTS = {Verdict.REJECTED: 'rejects', Verdict.CAUTION: 'caution', Verdict.ACCE
 # section: code: when it appears and what it means
 MEANINGS: dict[str, dict[Code, str]] = {
     'The data that came': {
-        Code.NO_IMU: 'No usable Imu message lies between the marks, or all its turn rates or '
-        'accelerations are zero. Without them there is no track.',
+        Code.NO_IMU: 'No usable Imu message lies between the marks, or all its turn rates are '
+        'zero. Without them there is no track.',
+        Code.NO_ACCELEROMETER: 'Every acceleration of the Imu is zero, NaN, or said to be none '
+        '(`linear_acceleration_covariance[0]` of -1), as of a yaw rate on a bus. The scale comes '
+        'from gyro, counter and fixes by the method wheels, of one counter too, with 0.05 % in '
+        'its sigma for hills that nothing sees; what moves the vehicle is not felt, so yaw and '
+        'pitch mounting angle, slips and reversing are not told.',
         Code.NO_ODOMETER: 'No usable odometer message lies between the marks: a wrong topic, a '
         'type that is read differently, or a driver that is not running.',
         Code.NO_FIX: 'No position lies between the marks, or none near one of the two marks.',

@@ -16,6 +16,7 @@ from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.clocks import judge_clocks
 from odocal_ros.config import Config
 from odocal_ros.fix_screen import origin_amid, usable_fixes
+from odocal_ros.force import with_force
 from odocal_ros.glitches import (
     about_clumps,
     beyond,
@@ -68,6 +69,7 @@ class Inputs:
     velocity_variance: NDArray[np.float64]  # (v, 3) (m/s)^2, 0 or less: unknown
     fixes_rejected: int
     scale_unit: str
+    felt: bool = True                  # False: f_b is made up, no accelerometer is there
 
     def mirrored(self, spans) -> 'Inputs':
         """Return them with what was counted in spans, (m, 2) s, counted the other way."""
@@ -87,7 +89,8 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     The usable arrays (empty where nothing is left) and the findings.
 
     """
-    found: list[Reason] = []
+    leg, unfelt = with_force(leg, config)
+    found: list[Reason] = [*unfelt]
     for slot in ('imu', 'odometer', 'fix'):
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
@@ -131,7 +134,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
-    if travelled.right is not None:
+    if travelled.right is not None and not unfelt:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
     let_go(*vars(leg.imu).values())
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
@@ -146,7 +149,9 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
         t_velocity=t_velocity, velocity_n=velocity.velocity_n,
         velocity_variance=velocity.variance_n,
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
-        scale_unit=leg.form.scale_unit)
+        scale_unit=leg.form.scale_unit, felt=not unfelt)
+    if unfelt:
+        return inputs, tuple(found)
     back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))
     found += said_of(back, inputs.travel, _metres(inputs) if len(back) else None, BY_IMU,
                      config.odometer.signed)

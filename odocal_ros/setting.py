@@ -49,7 +49,7 @@ class Setting:
             if isinstance(value, str) or not hasattr(value, '__len__'):
                 raise BadConfig(f'{self.name}: {value!r} is not a list')
             items = tuple(self._one(v, str if self.choices else float) for v in value)
-            lengths = (0, 4) if self.name.startswith('reference.') else (3,)
+            lengths = (3,) if self.default else (0, 4)
             if not self.choices and len(items) not in lengths:
                 raise BadConfig(f'{self.name}: {len(items)} values, want {lengths[-1]}')
             return items

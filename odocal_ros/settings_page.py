@@ -1,5 +1,5 @@
 """
-Pages made from config.py and reasons.py: calibrator.yaml, docs/reasons.md, the README's tables.
+Pages made from config.py and reasons.py: config/*.yaml, docs/reasons.md, the README's tables.
 
 ``python -m odocal_ros.settings_page`` tells whether they agree with the code, ``--write`` makes
 them agree. A test says so too.
@@ -11,18 +11,26 @@ from pathlib import Path
 import sys
 import textwrap
 
-from odocal_ros.config import SETTINGS
+from odocal_ros.apply_config import ApplyConfig
+from odocal_ros.config import Config, SETTINGS, settings_of
 from odocal_ros.reasons import Code
 from odocal_ros.reasons_page import reasons_md, WEIGHTS
 from odocal_ros.setting import Setting
 
 ROOT = Path(__file__).resolve().parent.parent
 YAML_HEAD = """\
-# Every setting of odocal_ros with its default, made by: python -m odocal_ros.settings_page --write
-# The node takes it by --params-file, odocal replay by --config. Keep the lines you change.
-/**/calibrator:
+# Every setting of {} with its default, made by: python -m odocal_ros.settings_page --write
+# {}
+/**/{}:
   ros__parameters:
 """
+NODES = {
+    'calibrator': (Config, YAML_HEAD.format('odocal_ros', 'The node takes it by --params-file, '
+                                            'odocal replay by --config. Keep the lines you '
+                                            'change.', 'calibrator')),
+    'odometry': (ApplyConfig, YAML_HEAD.format('the node odometry', 'It takes it by '
+                                               '--params-file, beside the calibration.yaml. Keep '
+                                               'the lines you change.', 'odometry'))}
 TYPES = {'bool': 'bool', 'int': 'int', 'float': 'double', 'str': 'string', 'floats': 'double[]',
          'strs': 'string[]'}
 
@@ -47,10 +55,11 @@ def limits(setting: Setting) -> str:
     return ', '.join(parts)
 
 
-def config_yaml() -> str:
-    """Return the text of config/calibrator.yaml."""
+def config_yaml(node: str) -> str:
+    """Return the text of config/<node>.yaml."""
+    kind, head = NODES[node]
     lines, group = [], ''
-    for name, setting in SETTINGS.items():
+    for name, setting in settings_of(kind).items():
         here, _, leaf = name.rpartition('.')
         if here != group:
             lines += ['', f'    {here}:']
@@ -62,7 +71,7 @@ def config_yaml() -> str:
             lines += textwrap.wrap(note, 97, initial_indent=f'{indent}# ',
                                    subsequent_indent=f'{indent}# ', break_on_hyphens=False)
         lines.append(f'{indent}{leaf}: {scalar_text(setting.default)}')
-    return YAML_HEAD + '\n'.join(lines) + '\n'
+    return head + '\n'.join(lines) + '\n'
 
 
 def settings_table() -> str:
@@ -101,7 +110,7 @@ def filled(page: str) -> str:
 def pages(root: Path = ROOT) -> dict[Path, str]:
     """Return each page's path and the text it should have."""
     readme = root / 'README.md'
-    return {root / 'config' / 'calibrator.yaml': config_yaml(),
+    return {**{root / 'config' / f'{node}.yaml': config_yaml(node) for node in NODES},
             root / 'docs' / 'reasons.md': reasons_md(),
             readme: filled(readme.read_text(encoding='utf-8'))}
 

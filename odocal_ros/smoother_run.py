@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.smoother import smooth, smoother_leg
+from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.delay_note import note_delays
 from odocal_ros.leg_tracks import as_configured, Paths
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
+from odocal_ros.reasons import Code, Reason
 
+NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
 ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
 
 
@@ -25,6 +28,8 @@ def smoother(run):
     all values found, delays and lever arms too; t is as the fixes stamp it. None where refused.
 
     """
+    if not run.inputs.felt:
+        return refused((NOT_FELT,), run.inputs.scale_unit), None
     leg = smoother_leg(run.inputs, run.config, run.origin, run.fixes_n, run.spans, run.rough,
                        run.t_fit)
     method = smooth(leg, run.config)

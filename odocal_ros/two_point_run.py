@@ -72,6 +72,8 @@ class TwoPointRun:
 
     def _slips(self, chord, f):
         """Return slips of the mean between the marks, s and m; name those not named already."""
+        if not self.inputs.felt:
+            return np.empty(0), np.empty(0)
         t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
                              toward(self.run.facing, f), self.run.origin.latitude,
                              rounding(self.inputs.travel))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.judge import judge
+from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.wheels.leg import positions, WheelLeg
 from odocal_ros.calib.wheels.planar import planar_leg
 from odocal_ros.calib.wheels.ranges import ranges_of
@@ -20,6 +21,7 @@ from odocal_ros.reasons import Code, Reason
 
 ONE_COUNTER = Reason(Code.NO_METHOD, 'method wheels needs the counts of two wheels: odometer.left '
                      'and odometer.right name them')
+OF_TWO = {Code.WHEELS_NOT_SEPARABLE, Code.TRACK_WIDTH_NOT_DETERMINED}
 UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
@@ -34,19 +36,20 @@ def wheels(run):
     MethodResult, and the antenna's Paths; None where refused.
 
     """
-    if run.inputs.travel_left is None or run.inputs.travel_right is None:
+    two = run.inputs.travel_right is not None
+    if not two and run.inputs.felt:
         return refused(run.inputs, ONE_COUNTER), None
     leg = _leg(run)
     if leg is None:
         return refused(run.inputs, Reason(Code.NO_FIX, 'no usable fix at the start mark')), None
-    method = fit_wheels(leg, run.config)
+    method = fit_wheels(leg, run.config) if two else _of_one(fit_wheels(leg, run.config, False))
     if method.estimates['scale_factor'].value is None:
         return method, None
     # the methods that follow hold them too
     run.wheel_slips = with_unseen(run.wheel_slips, method.details['slips'])
     note_delays(run, {'gnss': (method.details['fix_latency_seen'],
                                method.details['fix_latency_sigma'])})
-    found = _search(run, leg, method.details['pitch']['value'])
+    found = _search(run, leg, method.details['pitch']['value']) if two else None
     more = {} if found is None else {'search': found.as_dict()}
     # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself
     reasons = tuple(r for r in (found.reasons if found else ())
@@ -60,7 +63,9 @@ def wheels(run):
 
 def _leg(run) -> WheelLeg | None:
     inputs = run.inputs
-    left, right = inputs.travel_left, inputs.travel_right
+    left = right = inputs.travel
+    if inputs.travel_right is not None:
+        left, right = inputs.travel_left, inputs.travel_right
     ends = (max(0.0, float(run.track.t[0]), float(left.t[0]), float(right.t[0])),
             min(run.t_fit, float(run.track.t[-1]), float(left.t[-1]), float(right.t[-1])))
     start = run.mark(ends[0], run.path(np.array([run.rough, 0.0, 0.0])), 'start')
@@ -77,6 +82,13 @@ def _leg(run) -> WheelLeg | None:
         interval=float(np.median(np.diff(left.t))), doubt=(inputs.doubt_t, inputs.doubt_sigma),
         slips=drawn_out(slips.begin, slips.end, slips.size),
         uneven=bool(slips.change) or _uneven(run))
+
+
+def _of_one(method):
+    """Return what the method says of one counter, that stood for both: nothing of two wheels."""
+    width = Estimate(None, None, 'm')       # left and right are not stated without their turn
+    return replace(method, estimates=method.estimates | {'track_width': width}, reasons=tuple(
+        r for r in method.reasons if r.code not in OF_TWO))
 
 
 def _uneven(run) -> bool:

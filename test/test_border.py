@@ -23,6 +23,7 @@ NEVER = {'live': {'offline', 'sim'}, 'offline': {'live'}, 'sim': {'live', 'calib
          'paper': {'live', 'offline', 'bagio', 'output', 'messages'},
          'align': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'},
          'leg_run': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper'},
+         'apply': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'},
          'screen': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'}}
 
 
@@ -56,7 +57,8 @@ def _own_parts(path):
 @pytest.mark.parametrize('module', [
     'odocal_ros.pipeline', 'odocal_ros.calib.two_point', 'odocal_ros.nav.strapdown',
     'odocal_ros.leg', 'odocal_ros.messages', 'odocal_ros.config_file', 'odocal_ros.output.files',
-    'odocal_ros.output.summary', 'odocal_ros.bagio.read', 'odocal_ros.offline.replay'])
+    'odocal_ros.output.summary', 'odocal_ros.bagio.read', 'odocal_ros.offline.replay',
+    'odocal_ros.apply.odometry'])
 def test_imports_at_the_top_stay_light(module):
     probe = f'import {module}, sys; print([m for m in {HEAVY} if m in sys.modules])'
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
@@ -98,7 +100,8 @@ def test_parts_that_must_not_see_each_other_do_not(part):
 
 
 def test_the_pure_parts_ask_no_clock_and_open_nothing():
-    pure = [p for p in _modules() if _part(p) in ('nav', 'calib', 'pipeline', 'align', 'screen')]
+    pure = [p for p in _modules() if _part(p) in (
+        'nav', 'calib', 'pipeline', 'align', 'screen', 'apply')]
     assert len(pure) > 10
     for path in pure:
         tree = ast.parse(path.read_text(encoding='utf-8'))

@@ -7,6 +7,8 @@ from pages import commands, PAGES, ROOT
 import pytest
 
 from odocal_ros import settings_page
+from odocal_ros.apply_config import ApplyConfig
+from odocal_ros.config import SETTINGS, settings_of
 from odocal_ros.offline import cli
 from odocal_ros.reasons import Code
 from odocal_ros.reasons_page import MEANINGS
@@ -29,7 +31,7 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(settings_page, 'pages', lambda: fresh(tmp_path))
     monkeypatch.setattr('sys.argv', ['settings_page'])
     assert settings_page.main() == 1
-    assert capsys.readouterr().out.count('stale: ') == 3
+    assert capsys.readouterr().out.count('stale: ') == 4
     monkeypatch.setattr('sys.argv', ['settings_page', '--write'])
     assert settings_page.main() == 0
     assert (tmp_path / 'README.md').read_text() == README
@@ -80,14 +82,14 @@ def test_modules_of_the_method_page_exist():
 
 
 def test_settings_and_reasons_named_in_the_text_exist():
-    from odocal_ros.config import SETTINGS
-    groups = {name.partition('.')[0] for name in SETTINGS if '.' in name}
+    known = {*SETTINGS, *settings_of(ApplyConfig)}
+    groups = {name.partition('.')[0] for name in known if '.' in name}
     for page in PAGES:
         text = re.sub(r'<!-- (\w+): begin -->.*?<!-- \1: end -->', '',
                       page.read_text(encoding='utf-8'), flags=re.DOTALL)
         for name in re.findall(r'`([a-z_]+\.[a-z_]+)`', text):
             if name.partition('.')[0] in groups and not name.endswith(('.py', '.yaml')):
-                assert name in SETTINGS, f'{page.name}: {name}'
+                assert name in known, f'{page.name}: {name}'
         for name in re.findall(r'`([A-Z]+_[A-Z_]+)`', text):
             if not name.startswith('ODOCAL'):
                 assert name in Code.__members__, f'{page.name}: {name}'

@@ -106,6 +106,8 @@ def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
     if len(A) < LEAST or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
         return None, np.pi
     gain = np.vdot(A, F) / power
+    if not gain:            # of no accelerometer
+        return None, np.pi
     rest = F - gain * A
     # half the residual lies across the axis; neighbours share noise, so count every third bin
     sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))

@@ -31,7 +31,7 @@ class Heard:
 
     variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
     none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
-    latitude : rad.   height : the fixes carry one.
+    latitude : rad.   height : the fixes carry one.   felt : the Imu sends its acceleration.
     """
 
     variances: dict[str, float]
@@ -39,6 +39,7 @@ class Heard:
     latitude: float = 0.7
     height: bool = True
     two_wheels: bool = False
+    felt: bool = True
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,13 @@ class Ability:
 
 def ability(config: Config, heard: Heard) -> Ability:
     """Return what a leg that starts here can tell and what not."""
-    methods = [name for name in METHODS if name in deciding(config.method)]
+    methods = [name for name in METHODS if name in deciding(config.method)
+               and (heard.felt or name != ALL_SAMPLES)]
     told = [(True, 'the scale'), _yaw(config, heard, methods),
             (True, 'the pitch') if heard.height else
             (False, 'the pitch, since the fixes carry no height')]
+    if not heard.felt:
+        told[-1] = False, 'the pitch, since the Imu sends no acceleration'
     if heard.two_wheels:
         told += _of_two_wheels(config, methods)
     weak = '' if heard.rested_s >= config.leg.standstill else (

@@ -1,34 +1,29 @@
 """The live node: declares settings, records, computes on a mark, publishes."""
 
 from functools import partial
-import os
-import signal
 import sys
-import tempfile
 import threading
 
 from rcl_interfaces.msg import SetParametersResult
-import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.task import Future
-from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.live import answers, params
+from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.process import complain, run
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
-from odocal_ros.outside import one_line, said_by
+from odocal_ros.outside import said_by
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
@@ -100,7 +95,7 @@ class Calibrator(Node):
             if hasattr(self, part) and getattr(self, part).close() is False:
                 self.at_work = True
         if hasattr(self, 'operation') and (left := self.operation.left_behind()):
-            _complain(left)      # a context that is shut down takes its log with it
+            complain('calibrator', left)      # a context that is shut down takes its log with it
         super().destroy_node()
 
     def get_logger(self) -> PlainLog:
@@ -169,70 +164,8 @@ class Calibrator(Node):
 
 
 def main(args=None) -> int:
-    """
-    Run the node until it is told to end.
-
-    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help was asked
-    for; 1 when it cannot start, with one line that says why.
-    """
-    # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
-    signal.signal(signal.SIGINT, lambda *_: None)
-    try:
-        asked = remove_ros_args(args)[1:]
-        if {'-h', '--help'} & set(asked):
-            print(HELP)
-            return 0
-        if asked:
-            return _complain(f'{asked[0]} means nothing here: settings are ROS parameters, '
-                             'written after --ros-args (see calibrator --help)')
-        _init(args)
-    except Exception as error:
-        text = said_by(error).split(', at /')[0]
-        return _complain(f'{text}; write parameters as --ros-args -p name:=value, remaps as -r '
-                         'from:=to')
-    executor, node, code = SingleThreadedExecutor(), None, 0
-    try:
-        node = Calibrator()
-        executor.add_node(node)
-        executor.spin()
-    except ExternalShutdownException:
-        pass
-    except OdocalError as error:
-        code = _complain(str(error))
-    except Exception as error:
-        # a callback caught in the middle of a shutdown may find its publisher gone
-        code = _complain(answers.one_line(error)) if rclpy.ok() else 0
-    finally:
-        executor.shutdown()
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    if node is not None and node.at_work:
-        # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    return code
-
-
-def _init(args) -> None:
-    """Start rclpy; of an error only the exception is left, not rcl's own line on stderr."""
-    sys.stderr.flush()
-    stderr = os.dup(2)
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
-        try:
-            rclpy.init(args=args)
-            held.seek(0)
-            os.write(stderr, held.read())
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-
-
-def _complain(text: str) -> int:
-    print(one_line(f'calibrator: {text}'), file=sys.stderr)
-    return 1
+    """Run the node until it is told to end; see ``process.run``."""
+    return run('calibrator', HELP, Calibrator, args)
 
 
 if __name__ == '__main__':

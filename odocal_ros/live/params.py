@@ -4,13 +4,18 @@ from collections.abc import Iterable
 import difflib
 import math
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.config import Config, SETTINGS, with_settings
+from odocal_ros.config import Config, SETTINGS, settings_of, with_settings
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.restored import Restored
 from odocal_ros.output.stored import check_estimate
@@ -22,6 +27,9 @@ SCALE = 'm/pulse, m/rad or 1'
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad', 'scale_factor_left': SCALE,
              'scale_factor_right': SCALE, 'heading_error': 'rad', 'track_width': 'm'}
+# what dead reckoning takes beside
+APPLIED = ESTIMATES | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'} | {
+    f'odometer_lever_arm_{axis}': 'm' for axis in 'xyz'}
 PREFIX = 'result.'
 QOS: dict[str, tuple[str, ...]] = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
@@ -30,13 +38,13 @@ NO_STAMP = 'an unknown date'
 TAKE = 'take the file that ~/save wrote'
 
 
-def _result_defaults() -> dict:
-    numbers = {PREFIX + name + end: math.nan for name in ESTIMATES for end in ('', '_sigma')}
+def _result_defaults(estimates) -> dict:
+    numbers = {PREFIX + name + end: math.nan for name in estimates for end in ('', '_sigma')}
     return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': '',
                       PREFIX + 'vehicle': ''}
 
 
-RESULTS = _result_defaults()
+RESULTS = _result_defaults(ESTIMATES)
 
 
 def descriptor(setting: Setting) -> ParameterDescriptor:
@@ -49,7 +57,8 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
     result = ParameterDescriptor(description=about, read_only=setting.read_only)
-    result.dynamic_typing = setting.kind in ('floats', 'strs') and not setting.read_only
+    result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
+        setting.read_only and setting.default)
     limits = []
     if setting.choices:
         limits.append('one of ' + ', '.join(setting.choices))
@@ -66,9 +75,9 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     return result
 
 
-def declare(node: Node) -> Config:
+def declare(node: Node, kind: type = Config):
     """
-    Declare every setting as a parameter and return the configuration they make.
+    Declare every setting as a parameter and return the configuration they make, of a kind.
 
     Raises
     ------
@@ -76,8 +85,8 @@ def declare(node: Node) -> Config:
         An override has the wrong type or is out of range.
 
     """
-    values = {}
-    for name, setting in SETTINGS.items():
+    values, settings = {}, settings_of(kind)
+    for name, setting in settings.items():
         try:
             value = node.declare_parameter(name, _as_ros(setting), descriptor(setting)).value
             if value is None:
@@ -86,17 +95,17 @@ def declare(node: Node) -> Config:
         except ParameterException as error:
             raise BadConfig(_refusal(name, setting, error)) from None
         values[name] = setting.default if value is None else _plain(value)
-    _warn_of_unknown(node)
-    return with_settings(Config(), values)
+    _warn_of_unknown(node, settings)
+    return with_settings(kind(), values)
 
 
-def _warn_of_unknown(node: Node) -> None:
+def _warn_of_unknown(node: Node, settings) -> None:
     """Name overrides in our groups that are no settings; ROS passes over what nobody declares."""
-    groups = {name.partition('.')[0] for name in SETTINGS if '.' in name}
+    groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public way to them
         group, dot, _ = name.partition('.')
-        near = difflib.get_close_matches(name, SETTINGS, 1, 0.8)
-        if name not in SETTINGS and (near or dot and group in groups):
+        near = difflib.get_close_matches(name, settings, 1, 0.8)
+        if name not in settings and (near or dot and group in groups):
             mean = f': did you mean {near[0]}?' if near else ''
             node.get_logger().warning(f'no parameter {name}{mean or "."} It is not taken.')
 
@@ -125,10 +134,17 @@ def changed(config: Config, parameters: list[Parameter]) -> Config:
         p.name: _plain(p.value) for p in parameters if p.name in SETTINGS})
 
 
-def declare_results(node: Node) -> None:
-    """Declare ``result.*``; a saved result may come back as overrides at start-up."""
-    for name, default in RESULTS.items():
-        unit = ESTIMATES.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
+def fixed(parameters: list[Parameter]) -> SetParametersResult:
+    """Refuse to set what holds as long as the node runs."""
+    ours = [p.name for p in parameters if p.name.startswith(PREFIX) or p.name in SETTINGS]
+    return SetParametersResult(successful=not ours, reason=(
+        f'{ours[0]} is taken at the start: start the node anew with it') if ours else '')
+
+
+def declare_results(node: Node, estimates=ESTIMATES) -> Restored | None:
+    """Declare ``result.*``; return the saved result that came as overrides at start-up, if any."""
+    for name, default in _result_defaults(estimates).items():
+        unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
         about = ParameterDescriptor(dynamic_typing=True, description=(
             'Set by the node after each leg' + (f' [{unit}]' if unit else '')))
         value = node.declare_parameter(name, default, about).value
@@ -138,12 +154,14 @@ def declare_results(node: Node) -> None:
             raise BadConfig(f'{name}: {value!r} is not of type {kind.__name__}; {TAKE}')
         if whole:
             node.set_parameters([Parameter(name, value=float(value))])
-    kept = restored_from({name: node.get_parameter(name).value for name in RESULTS})
+    kept = restored_from({name: node.get_parameter(name).value
+                          for name in _result_defaults(estimates)}, estimates)
     here = node.get_parameter('vehicle').value
     if kept is not None and kept.vehicle and here and kept.vehicle != here:
         raise BadConfig(f"the result given is of vehicle '{one_line(kept.vehicle)}', and this "
-                        f"node calibrates '{one_line(here)}': give the calibration.yaml of "
+                        f"node is of '{one_line(here)}': give the calibration.yaml of "
                         'that one, or none')
+    return kept
 
 
 def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict:
@@ -159,7 +177,7 @@ def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict:
     return values
 
 
-def restored_from(results: dict) -> Restored | None:
+def restored_from(results: dict, estimates=ESTIMATES) -> Restored | None:
     """
     Return the result that ``result.*`` hold, None where they hold none.
 
@@ -170,19 +188,19 @@ def restored_from(results: dict) -> Restored | None:
 
     """
     try:
-        return _restored(results)
+        return _restored(results, estimates)
     except ValueError as error:
         raise BadConfig(f'{error}; {TAKE}') from None
 
 
-def _restored(results):
+def _restored(results, names):
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
         raise ValueError(f'result.legs: {legs} is no number of legs')
     if one_line(stamp) != stamp:
         raise ValueError(f"result.stamp: '{one_line(stamp)}' is no date")
     estimates = {}
-    for name, unit in ESTIMATES.items():
+    for name, unit in names.items():
         value, sigma = (None if math.isnan(x) else x for x in (
             results[PREFIX + name], results[PREFIX + name + '_sigma']))
         check_estimate(name, value, sigma)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.config import Config
+from odocal_ros.force import felt
 from odocal_ros.live.ability import Heard, stated_variance
 from odocal_ros.nav.earth import radii
 from odocal_ros.samples import OdometerForm
@@ -210,7 +211,8 @@ class Progress:
             ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
         variances = {name: np.inf if block is None else stated_variance(
             block.q_ni, block.yaw_variance) for name, block in sent.items()}
-        return replace(place, variances=variances,
+        imu = self._last.get('imu')
+        return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
                        rested_s=travel.rested_s(preroll_s) if travel else 0.0)
 
     def begin_leg(self) -> None:

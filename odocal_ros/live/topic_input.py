@@ -94,9 +94,9 @@ class Input:
 
     def _alike(self) -> list[str]:
         """Return topics that others publish with a type that would serve, the nearest first."""
-        wanted, own = set(self.allowed or TYPES), f'{self._node.get_fully_qualified_name()}/'
+        wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
         names = [name for name, types in self._node.get_topic_names_and_types()
-                 if wanted & set(types) and not name.startswith(own)
+                 if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]
         # of the many types that may be an odometer's only what is called alike
         return difflib.get_close_matches(self.topic, names, MOST_MEANT,

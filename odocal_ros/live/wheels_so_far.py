@@ -7,6 +7,7 @@ import numpy as np
 from odocal_ros.calib.choice import deciding
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.config import Config, with_settings
+from odocal_ros.force import felt
 from odocal_ros.leg import Leg
 from odocal_ros.live.outlook import Outlook, Prospect, WheelsOutlook
 from odocal_ros.pipeline import calibrate
@@ -19,9 +20,11 @@ def with_wheels(outlook: Outlook, leg: Leg, config: Config) -> Outlook:
     """
     Return an outlook with what two wheels tell so far; scale and yaw too, where that is better.
 
-    leg : the way so far. One counter, or a method that takes the mean of both, changes nothing.
+    leg : the way so far. One counter beside an accelerometer, or a method that takes the mean of
+    both, changes nothing.
     """
-    if not len(leg.odometer_right.stamp_ns) or 'wheels' not in deciding(config.method):
+    one = not len(leg.odometer_right.stamp_ns) and felt(leg.imu.f_i)
+    if one or 'wheels' not in deciding(config.method):
         return outlook
     result = calibrate(leg, with_settings(config, {'method': 'wheels'}))
     method = result.methods.get('wheels')

@@ -61,7 +61,7 @@ def _of_imu(topic):
         return
     unit = imu['force_unit']
     if not imu['gravity']:
-        yield 'no specific force: orientation only'
+        yield 'no specific force: no accelerometer, or one that is not sent'
         yield from _orientation(imu)
         return
     way = {'+z': 'z-up', '-z': 'looks z-down'}.get(

@@ -11,8 +11,8 @@ import threading
 import time
 
 ROOT = Path(__file__).resolve().parents[2]
-NODE = [sys.executable, '-c', 'import sys; from odocal_ros.live.node import main; '
-        'sys.exit(main(sys.argv))']
+START = 'import sys; from odocal_ros.live.{} import main; sys.exit(main(sys.argv))'
+NODE = [sys.executable, '-c', START.format('node')]
 PATIENCE = 20.0   # s, for one event; only a failing test waits so long
 
 
@@ -20,13 +20,15 @@ class NodeProcess:
     """
     The node as a process of its own; what it prints is kept.
 
-    before : Python that runs before the node does.
+    before : Python that runs before the node does.   module : of live/ that holds the node.
     """
 
-    def __init__(self, *args: str, env: dict | None = None, before: str = '') -> None:
+    def __init__(self, *args: str, env: dict | None = None, before: str = '',
+                 module: str = 'node') -> None:
         paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH')]))
         self.process = subprocess.Popen(
-            [*NODE[:2], before + NODE[2], *(('--ros-args', *args) if args else ())], text=True,
+            [sys.executable, '-c', before + START.format(module),
+             *(('--ros-args', *args) if args else ())], text=True,
             bufsize=1, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             env=os.environ | {'PYTHONPATH': paths} | (env or {}))
         self.lines: list[str] = []

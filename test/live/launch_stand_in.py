@@ -115,7 +115,7 @@ def _started(node, arguments) -> Started:
 def of_xml(path: Path, given: dict[str, str]) -> tuple[dict, list[Started]]:
     """Return declared arguments (default, description) and the nodes of an XML launch file."""
     root = ElementTree.parse(path).getroot()
-    declared = {a.get('name'): (_filled(a.get('default'), {}), a.get('description'))
+    declared = {a.get('name'): (_filled(a.get('default', ''), {}), a.get('description'))
                 for a in root.findall('arg')}
     arguments = {name: default for name, (default, _) in declared.items()} | given
     nodes: list[Started] = []

@@ -400,7 +400,7 @@ def test_the_result_of_another_vehicle_is_not_restored(start, connect):
     refused = NodeProcess(*of_three, '-p', 'vehicle:=car 4')
     assert refused.wait() == 1
     line, = refused.lines
-    assert "the result given is of vehicle 'car 3', and this node calibrates 'car 4'" in line
+    assert "the result given is of vehicle 'car 3', and this node is of 'car 4'" in line
     start(*of_three, '-p', 'vehicle:=car 3')
     client = connect()
     assert 'of vehicle car 3' in client.call('stop_leg').message

@@ -20,6 +20,7 @@ NOISY = 1.25         # times the stated sigma: worth saying
 WILD, LOST = 5.0, 0.01     # times the stated sigma, and of the way: no track at all
 BACKWARDS = np.deg2rad(160.0)
 FAR = np.deg2rad(20.0)
+NOTHING = 1e-9       # of the other parameters' weight
 
 
 def correlation(covariance, names=PARAMETERS):
@@ -54,6 +55,7 @@ def without_turns(solution: Solution):
     size = np.sqrt(np.diag(wheels))
     values = np.linalg.eigvalsh(wheels / np.outer(size, size))
     size = np.sqrt(np.diag(normal))
+    size = np.maximum(size, NOTHING * size.max())       # of one counter for both: no ratio at all
     rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
     variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not told at all
     return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])

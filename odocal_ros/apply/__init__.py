@@ -1,0 +1,1 @@
+"""A calibration at work: counter and Imu in, pose and twist with their covariance out."""

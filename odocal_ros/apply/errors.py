@@ -1,0 +1,114 @@
+"""
+How dead reckoning errs: covariance of position, attitude, sensors and calibration.
+
+True attitude is exp(phi) the reckoned one, in n (the odom frame); true rate (reading - bias) less
+g times itself; true way (1 + k) along an axis turned by m in b. Position, scale, mounting and gyro
+scale are considered, never corrected: the pose does not jump, the calibration stands.
+"""
+
+import numpy as np
+
+from odocal_ros.nav.rotations import skew
+
+P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+K, M, G, N = 12, slice(13, 15), 15, 16     # m: about the y and z axis of b
+BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # what it tells, of a body that is nearly level: no heading
+BY_REST = np.r_[3:9]
+ROAD = np.array([0.005, 0.01, 0.01])   # m/sqrt(m) along, left, up: slip and slide of any road
+HIDDEN = 0.1          # rad/s that may hide in a gap of the Imu
+SHAKE = 0.4          # m/s^2 of driving that a second of odometer does not tell, and more seconds
+# rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the vehicle: 11
+# deg/h that stay alike for half a minute or so
+EARTH_LEFT = 6e-4
+GRAVITY = 9.81        # m/s^2; its last digits tilt nothing
+
+
+class Errors:
+    """
+    The errors' covariance, (16, 16), and what stops and gravity say of them.
+
+    grade : Grade of the Imu.   vehicle : Vehicle.
+    """
+
+    def __init__(self, grade, vehicle, tilt, bias_sigma, earth_left=True) -> None:
+        self.grade, self._earth_left = grade, EARTH_LEFT * earth_left
+        self.cov = np.zeros((N, N))
+        sigma = np.concatenate([
+            np.zeros(3), [tilt, tilt, 0.0], np.broadcast_to(bias_sigma, 3),
+            np.full(3, grade.accel_bias), [vehicle.scale_sigma, vehicle.pitch_sigma,
+                                           vehicle.yaw_sigma, grade.gyro_scale_error]])
+        self.cov[range(N), range(N)] = sigma**2
+        # x of odom is where the vehicle heads: what the yaw errs by is in the attitude, reversed
+        self.cov[5, 5] = vehicle.yaw_sigma**2
+        self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
+
+    def grow(self, T, C_nb, way_n, turn_n, axes_n, doubt=0.0, hidden=0.0) -> None:
+        """
+        Carry the errors over an interval.
+
+        T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : (3,) m, rad.
+        axes_n : (3, 3) columns forward, left, up.   doubt : m^2 of the way that are not certain.
+        hidden : s of the interval of which the Imu tells nothing.
+        """
+        F = np.eye(N)
+        cross = skew(way_n)
+        F[P, PHI], F[P, K], F[P, M] = -cross, way_n, -cross @ C_nb[:, 1:]
+        F[PHI, BG], F[PHI, G] = -C_nb * T, -turn_n
+        F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
+        cov = F @ self.cov @ F.T
+        road = self.road(np.linalg.norm(way_n)) + [doubt, 0.0, 0.0]
+        cov[P, P] += axes_n * road @ axes_n.T
+        diagonal = np.zeros(N)
+        diagonal[PHI] = self.grade.gyro_noise**2 * T + (HIDDEN * hidden)**2
+        diagonal[3:5] += self._earth_left**2 * T
+        diagonal[BG] = self.grade.gyro_bias_walk**2 * T
+        diagonal[BA] = self.grade.accel_bias_walk**2 * T
+        cov[range(N), range(N)] += diagonal
+        self.cov = cov
+
+    @staticmethod
+    def road(way):
+        """Return what slip and slide vary a way by, along, left and up, m^2."""
+        return ROAD**2 * abs(way)
+
+    def lost(self, way) -> None:
+        """Take in a way, m, of which nobody knows where it led."""
+        self.cov[range(3), range(3)] += way**2
+
+    def by_gravity(self, C_nb, off_n, T, sigma):
+        """
+        Return the correction, (16,), by the level part of force less acceleration, m/s^2.
+
+        C_nb : (3, 3) over the T s that it is the mean of.   sigma : m/s^2, beside the sensor's.
+        """
+        H = np.zeros((2, N))
+        H[0, 4], H[1, 3] = -GRAVITY, GRAVITY
+        H[:, BA] = C_nb[:2]
+        return self._correction(H, off_n[:2], np.eye(2) * (
+            self.grade.accel_noise**2 / T + sigma**2), BY_GRAVITY)
+
+    def by_rest(self, rate_b, variance):
+        """Return the correction by a mean turn rate at rest, rad/s, bias taken out."""
+        H = np.zeros((3, N))
+        H[:, BG] = np.eye(3)
+        return self._correction(H, rate_b, np.diag(variance), BY_REST)
+
+    def _correction(self, H, z, R, told):
+        cov = self.cov
+        S = H @ cov @ H.T + R
+        gain = np.zeros((N, len(z)))
+        gain[told] = np.linalg.solve(S, H @ cov)[:, told].T
+        keep = np.eye(N) - gain @ H
+        self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
+        return gain @ z
+
+    def pose(self, C_nb, arm_n):
+        """
+        Return the covariance of position, m, and rotation of the vehicle, rad, in n: (6, 6).
+
+        arm_n : (3,) m, from the odometer's point to what the position is of.
+        """
+        J = np.zeros((6, N))
+        J[:3, P], J[3:, PHI], J[3:, M] = np.eye(3), np.eye(3), C_nb[:, 1:]
+        J[:3] -= skew(arm_n) @ J[3:]
+        return J @ self.cov @ J.T

@@ -1,0 +1,214 @@
+"""
+Dead reckoning as the samples come: the calibration's own strapdown and sum, corrected at stops.
+
+From one Imu sample to the next attitude is turned by the calibration's rotation increments
+(``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
+as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
+attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
+gyro bias; the position never jumps.
+"""
+
+import numpy as np
+
+from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKE
+from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
+from odocal_ros.apply.start import begin, Start
+from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.vehicle import Vehicle
+from odocal_ros.apply.wheels import Wheels
+from odocal_ros.grades import grade_of
+from odocal_ros.nav.rotations import (
+    matrix_from_quat,
+    quat_from_matrix,
+    quat_from_rotvec,
+    quat_multiply,
+)
+from odocal_ros.nav.standstill import TURN
+from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+
+LOOK = 1.0           # s between corrections
+SPEED_OVER = 0.2     # s that a speed is taken over
+SILENT = 10.0        # s without odometer, after which attitude goes on alone
+HOLE = 0.1           # s without Imu that hide motion
+TOO_FAST = 100.0     # m/s: no land vehicle, but a scale of another unit
+
+
+class Odometry:
+    """
+    Turns samples into poses.
+
+    ``feed`` blocks as they come, ``poses`` gives what they allow: up to the last time that the
+    odometer and the Imu but for its newest sample have reached.
+    """
+
+    def __init__(self, vehicle: Vehicle, config) -> None:
+        self.vehicle, self.config = vehicle, config
+        self.grade = grade_of(config.imu)
+        self._told: list[str] = []
+        self._anew()
+
+    def take_told(self) -> list[str]:
+        """Return what was found since the last call, in sentences."""
+        told = list(dict.fromkeys(self._told))
+        self._told.clear()
+        return told
+
+    def apart(self) -> float:
+        """Return by how many s the odometer's newest stamp is ahead of the Imu's, 0 unknown."""
+        ready = self.wheels.ready() and len(self.imu.t)
+        return self.wheels.newest() - float(self.imu.t[-1]) if ready else 0.0
+
+    def begin_anew(self) -> None:
+        """Begin where a first message would, after a jump of time."""
+        self._told.append('time went back: odometry begins anew, at its origin')
+        self._anew()
+
+    def _anew(self):
+        self.wheels = Wheels(self.vehicle, self.config, self._told)
+        self.imu = ImuStream(self.config)
+        self._start: Start | None = None
+
+    def feed(self, slot: str, block, form=None) -> None:
+        """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
+        if slot != 'imu':
+            self.wheels.feed(slot, block, form)
+        elif not self.imu.feed(block):
+            self.begin_anew()
+            self.imu.feed(block)
+        self.wheels.zero_ns = self.imu.zero_ns
+
+    def poses(self) -> list[Pose]:
+        """Return the poses that what was fed since the last call allows."""
+        out: list[Pose] = []
+        if self._start is None:
+            self._start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
+            if self._start is None:
+                return out
+            self._take_start(self._start)
+        while (last := self._next()) is not None:
+            speaks = self.imu.t[last] <= self.wheels.newest()
+            self._advance(last)
+            if speaks:
+                out.append(self._pose())
+            self._look()
+            self._leave_behind(last)
+        return out
+
+    def _take_start(self, start):
+        self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
+        self.accel_bias = np.zeros(3)
+        self.position = np.zeros(3)      # of the odometer's point, from where it began
+        self.imu.drop(start.row)
+        self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
+        self._s = self._s_pose = float(self.wheels.at(self._t))
+        self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
+        self._w_look: list = []
+        self._rested = False
+        self._v_look = self._velocity_n(self._t)
+        self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
+
+    def _next(self):
+        """Return the row to advance to: a pose is due and all it needs has come; else None."""
+        t, at = self.imu.t, self.imu.at
+        period = 1 / self.config.publish.rate
+        last = int(np.searchsorted(t, self._t_pose + period - 1e-6))
+        last = max(last, at + 1)
+        if last > len(t) - 2:            # a cubic needs the sample beyond
+            return None
+        if t[last] > self.wheels.newest() and t[-1] - t[last] < SILENT:
+            return None
+        return last
+
+    def _advance(self, last):
+        """Go to a row of the Imu."""
+        imu, at = self.imu, self.imu.at
+        low = max(at - 1, 0)
+        t = imu.t[low:last + 2]
+        phi = rotation_increments(t, imu.w_b[low:last + 2] - self.bias)
+        phi = phi[:, at - low:last - low]
+        t = imu.t[at:last + 1]
+        q = prefix_product(np.concatenate([self.q[None], quat_from_rotvec(phi.T)]))
+        if self._start.earth_n.any():
+            turned = np.multiply.outer(self._t - t, self._start.earth_n)
+            q = quat_multiply(quat_from_rotvec(turned), q)
+        C = matrix_from_quat(q)
+        s = self.wheels.at(t)
+        lost, self._s = abs(float(s[0]) - self._s), float(s[-1])
+        mid = (C[:-1] + C[1:]) / 2
+        way_n = np.sum(mid @ self.vehicle.forward_b * np.diff(s)[:, None], axis=0)
+        self.position = self.position + way_n
+        T, turn_b = t[-1] - t[0], phi.sum(axis=1)
+        gaps = np.diff(t)
+        C_mid = C[len(C) // 2]
+        self.errors.grow(T, C_mid, way_n, C_mid @ turn_b, C_mid @ self.vehicle.C_vb.T,
+                         self.wheels.doubt(t[0], t[-1]), gaps[gaps > HOLE].sum())
+        if lost > self.wheels.quantum:
+            self.errors.lost(lost)
+        f = imu.f_b[at:last + 1] - self.accel_bias
+        self._felt &= bool(np.isfinite(f).all()) and not (gaps > HOLE).any()
+        f_n = np.einsum('kij,kj->ki', C, f)
+        self._felt_n = self._felt_n + gaps @ (f_n[:-1] + f_n[1:]) / 2
+        self._turn_b = self._turn_b + turn_b
+        self._w_look.append(imu.w_b[at + 1:last + 1])
+        self.q, self._t = q[-1] / np.linalg.norm(q[-1]), float(t[-1])
+        imu.at = last
+
+    def _velocity_n(self, t):
+        """Return the velocity of the Imu in n, by the odometer's last rows."""
+        v, C_nb = self.vehicle, matrix_from_quat(self.q)
+        now, before = self.wheels.at(np.array([t, t - SPEED_OVER]))
+        arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
+        rate = self.imu.w_b[self.imu.at] - self.bias
+        return C_nb @ (v.forward_b * (now - before) / SPEED_OVER + np.cross(rate, arm_b))
+
+    def _look(self):
+        """Correct tilt and gyro bias, a second after the last time."""
+        T = self._t - self._t_look
+        if T < LOOK - 1e-6:
+            return
+        velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
+        w = np.concatenate(self._w_look)
+        resting = heard and self.wheels.still(self._t_look, self._t) and bool(
+            (w.std(axis=0) < TURN).all() and (np.abs(w.mean(axis=0) - self.bias) < TURN).all())
+        if self.config.levelling and heard and self._felt:
+            off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
+            noise = 2 * self.wheels.quantum / SPEED_OVER / T if not resting else 0.0
+            self._correct(self.errors.by_gravity(
+                matrix_from_quat(self.q), off_n, T, 0.0 if resting else np.hypot(SHAKE, noise)))
+        if self.config.levelling and resting and self._rested:
+            variance = np.maximum(self.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
+            earth_b = matrix_from_quat(self.q).T @ self._start.earth_n
+            self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
+        self._rested = resting
+        self._t_look, self._v_look = self._t, self._velocity_n(self._t)
+        self._felt_n, self._felt, self._w_look = np.zeros(3), True, []
+
+    def _correct(self, by):
+        self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
+        self.bias = self.bias + by[BG]
+        self.accel_bias = self.accel_bias + by[BA]
+
+    def _pose(self):
+        """Return the pose at the row reached."""
+        v, T = self.vehicle, self._t - self._t_pose
+        C_nb, C_vb = matrix_from_quat(self.q), v.C_vb
+        arm_n = -C_nb @ C_vb.T @ v.lever_arm
+        earth_b = C_nb.T @ self._start.earth_n
+        rate = C_vb @ (self._turn_b / T - earth_b)
+        speed = (self._s - self._s_pose) / T
+        velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
+        if abs(speed) > TOO_FAST:
+            self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
+        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
+        pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
+                    quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
+                    pose_covariance(v, self.errors, C_nb, arm_n, quantum),
+                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
+        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
+        return pose
+
+    def _leave_behind(self, last):
+        """Forget what lies behind."""
+        if last > 2000:
+            self.imu.drop(last - 2)
+            self.wheels.forget(self._t - 2 * LOOK)

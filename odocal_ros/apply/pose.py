@@ -1,0 +1,62 @@
+"""What is sent of odometry: poses and twists, each with its covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.apply.errors import BG
+
+SWAY = 0.05          # m/s to the side and up, of a body that no wheel feels
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """
+    Where the vehicle is, and how it moved since the pose before.
+
+    stamp_ns : of the Imu.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
+    base_link in odom.   velocity, rate : (3,) m/s, rad/s in base_link, of base_link.
+    pose_cov, twist_cov : (6, 6); of the pose position and rotation about the axes of odom.
+    """
+
+    stamp_ns: int
+    position: NDArray[np.float64]
+    q: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    pose_cov: NDArray[np.float64]
+    twist_cov: NDArray[np.float64]
+
+
+def pose_covariance(vehicle, errors, C_nb, arm_n, quantum):
+    """
+    Return the covariance of position and rotation, with what a count hides along the way: (6, 6).
+
+    C_nb, arm_n : as ``Errors.pose`` takes them.   quantum : m, a count.
+    """
+    cov = errors.pose(C_nb, arm_n)
+    forward_n = C_nb @ vehicle.forward_b
+    cov[:3, :3] += np.outer(forward_n, forward_n) * quantum**2 / 6
+    return cov
+
+
+def twist_covariance(vehicle, errors, speed, rate, T, variance):
+    """
+    Return the covariance of a mean twist over T s, of base_link: (6, 6).
+
+    speed : m/s, of the odometer's point.   rate : (3,) rad/s.   variance : m^2, of the way in T
+    beside that of scale and road.
+    """
+    C_vb, grade = vehicle.C_vb, errors.grade
+    turn = C_vb @ errors.cov[BG, BG] @ C_vb.T + np.eye(3) * grade.gyro_noise**2 / T
+    turn += np.outer(rate, rate) * grade.gyro_scale_error**2
+    # a body that turns too much about an arm moves too much
+    arm = np.cross(np.eye(3), -vehicle.lever_arm).T
+    along = np.array([(speed * vehicle.scale_sigma)**2 + variance / T**2, SWAY**2, SWAY**2])
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = np.diag(along + errors.road(speed * T) / T**2 + [1e-6, 0.0, 0.0])
+    cov[:3, :3] += arm @ turn @ arm.T
+    cov[:3, 3:] = arm @ turn
+    cov[3:, :3], cov[3:, 3:] = cov[:3, 3:].T, turn
+    return cov

@@ -1,0 +1,76 @@
+"""Where odometry begins: attitude, gyro bias and what is certain of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.apply.errors import Errors
+from odocal_ros.nav.alignment import C_nL, level_frame
+from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.rotations import quat_from_matrix
+from odocal_ros.nav.standstill import MOST_BIAS, TURN
+
+LOOKED_AT = 2.0        # s of samples that a start is taken from
+TILT_GIVEN = 0.01      # rad of an attitude from outside
+TILT = 0.1             # rad of a road, and of a vehicle that moves while it is levelled
+UNDER_WAY = 2.0        # m/s^2 that a mean of so long may hold of braking
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """
+    Attitude and gyro bias at a row of the Imu.
+
+    earth_n : (3,) rad/s that is taken out of the turn rates, zero where it is in the bias.
+    """
+
+    row: int
+    q_nb: NDArray[np.float64]
+    gyro_bias: NDArray[np.float64]
+    earth_n: NDArray[np.float64]
+    errors: Errors
+
+
+def begin(imu, wheels, vehicle, config, grade) -> Start | None:
+    """Return the start, None while too little has come."""
+    if not wheels.ready() or not len(imu.t):
+        return None
+    row = int(np.searchsorted(imu.t, wheels.oldest()))
+    if config.start.attitude:
+        return _given(row, vehicle, config, grade) if len(imu.t) > row else None
+    end = int(np.searchsorted(imu.t, max(wheels.oldest(), imu.t[0]) + LOOKED_AT))
+    if end >= len(imu.t) or wheels.newest() < imu.t[end]:
+        return None
+    t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
+    resting = wheels.still(t[0], t[-1]) and bool(
+        (w.std(axis=0) < TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
+    return _levelled(end, t[-1] - t[0], w, f, resting, vehicle, grade)
+
+
+def _given(row, vehicle, config, grade):
+    """Return the start that the settings tell."""
+    start = config.start
+    q = np.asarray(start.attitude)
+    earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))
+    errors = Errors(grade, vehicle, TILT_GIVEN, grade.gyro_bias, not earth.any())
+    return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
+
+
+def _levelled(row, length, w, f, resting, vehicle, grade):
+    """Return the start by gravity, x along the vehicle; the bias by a rest, else as calibrated."""
+    felt = bool(np.isfinite(f).all())
+    C_Lb = level_frame(f.mean(axis=0)) if felt else vehicle.C_vb
+    forward = C_Lb @ vehicle.forward_b
+    C_nb = C_nL(-np.arctan2(forward[1], forward[0])) @ C_Lb
+    if resting:
+        bias = w.mean(axis=0)
+        noise = np.maximum(grade.gyro_noise / np.sqrt(length), w.std(axis=0) / np.sqrt(len(w)))
+        sigma = np.hypot(noise, grade.gyro_bias_walk * np.sqrt(length))
+    else:
+        known = vehicle.gyro_bias is not None
+        bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
+    errors = Errors(grade, vehicle, TILT, sigma)
+    if felt:        # so that the tilt hangs on the accelerometer's bias
+        errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else UNDER_WAY)
+    return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

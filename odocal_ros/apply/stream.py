@@ -1,0 +1,59 @@
+"""The Imu's samples that odometry has not left behind."""
+
+import numpy as np
+
+from odocal_ros.nav.rotations import matrix_from_rpy
+
+WILD = 100.0         # rad/s: no turn rate
+BACK_NS = 10**9      # stamps that step back by more,
+FEW = 3              # so many in turn, are a time that began anew
+
+
+class ImuStream:
+    """
+    Rows of the Imu, usable and rising.
+
+    t : (n,) s since the first.   w_b, f_b : (n, 3) rad/s, m/s^2, NaN: no force is sent.
+    stamp_ns : (n,).              at : the row that is reached.     zero_ns : stamp of t = 0.
+    """
+
+    def __init__(self, config) -> None:
+        self._C = matrix_from_rpy(config.imu.mounting_rpy)
+        self._scales = config.imu.gyro_scale, config.imu.accel_scale
+        self._offset_ns = round(config.imu.time_offset * 1e9)
+        self.zero_ns = 0
+        self.at = 0
+        self._stale = 0
+        self.stamp_ns = np.empty(0, np.int64)
+        self.t, self.w_b, self.f_b = np.empty(0), np.empty((0, 3)), np.empty((0, 3))
+
+    def feed(self, block) -> bool:
+        """Take rows; return False, nothing taken, where their time has begun anew."""
+        stamp = block.stamp_ns + self._offset_ns
+        good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD).all(axis=1)
+        newest = self.stamp_ns[-1] if len(self.stamp_ns) else 0
+        for k in np.flatnonzero(good):
+            if stamp[k] <= newest:
+                good[k] = False
+                self._stale = self._stale + 1 if stamp[k] < newest - BACK_NS else self._stale
+            else:
+                newest, self._stale = stamp[k], 0
+        if self._stale >= FEW:
+            return False
+        if not good.any():
+            return True
+        self.zero_ns = self.zero_ns or int(stamp[good][0])
+        f_i = block.f_i[good]
+        f_i = np.where((f_i == 0).all(axis=1, keepdims=True), np.nan, f_i)
+        self.stamp_ns = np.append(self.stamp_ns, stamp[good])
+        self.t = (self.stamp_ns - self.zero_ns) * 1e-9
+        gyro, accel = self._scales
+        self.w_b = np.concatenate([self.w_b, gyro * block.w_i[good] @ self._C.T])
+        self.f_b = np.concatenate([self.f_b, accel * f_i @ self._C.T])
+        return True
+
+    def drop(self, row) -> None:
+        """Forget the rows before one; what is reached must not be among them."""
+        for name in ('stamp_ns', 't', 'w_b', 'f_b'):
+            setattr(self, name, getattr(self, name)[row:])
+        self.at = max(self.at - row, 0)

@@ -1,0 +1,88 @@
+"""What a calibration says of a vehicle, as dead reckoning takes it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.result import Estimate
+from odocal_ros.errors import BadConfig
+from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.rotations import matrix_from_rpy
+
+UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05    # rad, 1 sigma of what no calibration determined
+SIDES = ('scale_factor_left', 'scale_factor_right')
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """
+    A calibrated vehicle.
+
+    scale : m per unit of the odometer, of two wheels of their mean.   scale_sigma : relative.
+    wheel_scales : m per unit, left and right, None where only their mean is calibrated.
+    yaw, pitch : rad, mounting angles, with sigmas.
+    lever_arm : (3,) m, the odometer's point in base_link.
+    gyro_bias : (3,) rad/s in b as last calibrated, None unknown.
+    guessed : what no calibration determined, for people.
+    """
+
+    scale: float
+    scale_sigma: float
+    wheel_scales: tuple[float, float] | None
+    yaw: float
+    pitch: float
+    yaw_sigma: float
+    pitch_sigma: float
+    lever_arm: NDArray[np.float64]
+    gyro_bias: NDArray[np.float64] | None
+    guessed: tuple[str, ...] = ()
+
+    @cached_property
+    def forward_b(self) -> NDArray[np.float64]:
+        """Return the vehicle's forward axis in b."""
+        return forward_b(self.yaw, self.pitch)
+
+    @cached_property
+    def C_vb(self) -> NDArray[np.float64]:
+        """Return the rotation that takes b to the vehicle's axes."""
+        return matrix_from_rpy([0.0, self.pitch, self.yaw])
+
+
+def vehicle_of(estimates: dict[str, Estimate], config) -> Vehicle:
+    """
+    Return the vehicle of a calibration's estimates.
+
+    Raises
+    ------
+    BadConfig
+        They hold no scale factor.
+
+    """
+    def told(name, otherwise, sigma=0.0):
+        e = estimates.get(name)
+        if e is None or e.value is None:
+            return otherwise, sigma
+        return e.value, sigma if e.sigma is None else e.sigma
+
+    scale, sigma = told('scale_factor', math.nan)
+    wheels = tuple(told(name, math.nan)[0] for name in SIDES)
+    if math.isnan(scale):
+        raise BadConfig('the calibration holds no result.scale_factor: give the calibration.yaml '
+                        'that odocal replay or the calibrator wrote, --params-file FILE')
+    nominal = config.imu.nominal_yaw
+    yaw = told('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
+    pitch = told('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
+    guessed = tuple(f'{name} is not in the calibration: taken as {value:.4g} +- {sigma:.2g} rad'
+                    for name, (value, sigma) in (('yaw_mounting_angle', yaw),
+                                                 ('pitch_mounting_angle', pitch))
+                    if name not in estimates or estimates[name].value is None)
+    bias = np.array([told(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
+    return Vehicle(
+        scale, sigma / scale, None if np.isnan(wheels).any() else wheels, yaw[0], pitch[0],
+        yaw[1], pitch[1],
+        np.array([told(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
+            'xyz', config.odometer.lever_arm, strict=True)]),
+        None if np.isnan(bias).any() else bias, guessed)

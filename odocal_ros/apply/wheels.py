@@ -1,0 +1,91 @@
+"""The travel of a vehicle by one counter or by those of its two wheels."""
+
+import numpy as np
+
+from odocal_ros.apply.wheel import Wheel
+from odocal_ros.nav.standstill import MOVE
+
+STILL = 1.5      # counts that a wheel at rest may still show
+SIDES = ('odometer', 'odometer_right')
+
+
+class Wheels:
+    """
+    Travel, m, of the vehicle's odometer: one wheel's, or the mean of two.
+
+    Of two wheels each has its own factor where the calibration gives both.
+    """
+
+    def __init__(self, vehicle, config, told) -> None:
+        self._vehicle, self._told = vehicle, told
+        self._reversed = config.odometer.reversed
+        self._offset_ns = round(config.odometer.time_offset * 1e9)
+        self._two = config.odometer.right == 'topic'
+        self._waiting: list = []       # blocks from before the first Imu message
+        self._wheels: dict[str, Wheel] = {}
+        self.zero_ns = 0
+
+    def feed(self, slot, block, form) -> None:
+        """Take rows of a slot."""
+        self._waiting.append((slot, block, form))
+        if not self.zero_ns:
+            self._waiting = self._waiting[-100:]
+            return
+        for slot, block, form in self._waiting:
+            self._feed(slot, block, form)
+        self._waiting = []
+
+    def _feed(self, slot, block, form):
+        if slot not in self._wheels:
+            self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
+            self._scale(form)
+        wheel = self._wheels[slot]
+        good = block.stamp_ns > 0
+        stamp = block.stamp_ns[good] + self._offset_ns
+        wheel.feed((stamp - self.zero_ns) * 1e-9, block.value[good])
+        self._told += wheel.told
+        wheel.told.clear()
+
+    def _scale(self, form):
+        """Give each of two wheels its own factor."""
+        scales = self._vehicle.wheel_scales
+        if len(self._wheels) == 2 and scales is not None and form.sides:
+            for slot, scale in zip(SIDES, scales, strict=True):
+                self._wheels[slot].rescale(scale)
+
+    def ready(self) -> bool:
+        """Return whether every wheel has sent rows."""
+        return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
+            not self._two or len(self._wheels) == 2)
+
+    def newest(self) -> float:
+        """Return the last time that every wheel's rows have reached, s."""
+        return min(w.t[-1] for w in self._wheels.values())
+
+    def oldest(self) -> float:
+        """Return the first time that every wheel has, s."""
+        return max(w.t[0] for w in self._wheels.values())
+
+    def at(self, t):
+        """Return the travel at times, m."""
+        return sum(w.at(t) for w in self._wheels.values()) / len(self._wheels)
+
+    def doubt(self, t_from, t_to) -> float:
+        """Return the variance of the travel between two times, m^2, beside that of the scale."""
+        return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
+
+    @property
+    def quantum(self) -> float:
+        """Return the size of a count of the travel, m."""
+        return float(np.linalg.norm([w.quantum for w in self._wheels.values()])
+                     / len(self._wheels))
+
+    def still(self, t_from, t_to) -> bool:
+        """Return whether no wheel turned between two times."""
+        return all(abs(w.at(t_to) - w.at(t_from)) <= MOVE / 2 + STILL * w.quantum
+                   for w in self._wheels.values())
+
+    def forget(self, t) -> None:
+        """Drop rows before a time."""
+        for wheel in self._wheels.values():
+            wheel.forget(t)

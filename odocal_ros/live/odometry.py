@@ -1,0 +1,178 @@
+"""The node that applies a calibration: counter and Imu in, odometry and twist out."""
+
+from functools import partial
+import sys
+
+from geometry_msgs.msg import Point, Quaternion, TwistWithCovarianceStamped, Vector3
+from nav_msgs.msg import Odometry as OdometryMessage
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
+
+from odocal_ros.apply.odometry import Odometry, Pose
+from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.apply_config import ApplyConfig
+from odocal_ros.errors import BadConfig
+from odocal_ros.live import params
+from odocal_ros.live.inputs import IMU
+from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.process import run
+from odocal_ros.live.topic_input import Input
+from odocal_ros.outside import said_by
+from odocal_ros.samples import take
+
+TICK_S, LOOK_S = 0.01, 1.0
+WAIT_S, SELDOM_S = 5.0, 60.0     # of silence before it is said, and said again
+APART_S = 2.0                    # of stamps: two clocks
+MOST_SAID = 20                   # sentences on what comes in, of one run of the node
+HELP = """\
+usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
+
+Applies a calibration that 'odocal replay' or the calibrator wrote: dead reckoning of a vehicle by
+its odometer and Imu, with a covariance (a ROS 2 node).
+
+listens to   imu/data, odometer; where set so odometer_right
+             (another name: -r odometer:=/your/topic)
+publishes    odometry (nav_msgs/Odometry), odometry/twist
+             (geometry_msgs/TwistWithCovarianceStamped)
+settings     parameters, all in config/odometry.yaml with what they mean"""
+
+
+class OdometryNode(Node):
+    """Joins the inputs of the calibrator to ``Odometry`` and its poses to two topics."""
+
+    def __init__(self, node_name: str = 'odometry', **kwargs) -> None:
+        try:
+            super().__init__(node_name, **kwargs)
+            try:
+                self._build()
+            except Exception:
+                self.destroy_node()
+                raise
+        except (ParameterException, InvalidQosOverridesError) as error:
+            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
+
+    def _build(self) -> None:
+        self.config = params.declare(self, ApplyConfig)
+        kept = params.declare_results(self, params.APPLIED)
+        if kept is None or not kept.valid:
+            why = 'no calibration is given' if kept is None else (
+                f'the calibration of {kept.stamp} was rejected')
+            raise BadConfig(f'{why}: start with --ros-args --params-file FILE, a calibration.yaml '
+                            'that odocal replay or the calibrator wrote')
+        vehicle = vehicle_of(kept.estimates, self.config)
+        for text in vehicle.guessed:
+            self.get_logger().warning(text)
+        self._odometry = Odometry(vehicle, self.config)
+        self._inputs = {slot: Input(self, slot, allowed)
+                        for slot, allowed in _wanted(self.config).items()}
+        params.check_qos(self, (one.topic for one in self._inputs.values()))
+        for one in self._inputs.values():
+            one.check(self.config)
+        publish = partial(self.create_publisher, event_callbacks=PublisherEventCallbacks(
+            use_default_callbacks=False))
+        self._pose = publish(OdometryMessage, 'odometry', 10)
+        self._twist = publish(TwistWithCovarianceStamped, 'odometry/twist', 10)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._look_ns = self._silent_ns = 0
+        self._said, self._begun, self._pause_s = 0, False, WAIT_S
+        self.add_on_set_parameters_callback(params.fixed)
+        self.create_timer(TICK_S, self._tick, clock=self._steady)
+        self.get_logger().info(f'applies the {kept.words("")}')
+
+    def get_logger(self) -> PlainLog:
+        """Return the node's log."""
+        return PlainLog(super().get_logger())
+
+    def _tick(self) -> None:
+        now_ns = self._steady.now().nanoseconds
+        if now_ns - self._look_ns > LOOK_S * 1e9:
+            self._look_ns = now_ns
+            self._look_around(now_ns)
+        for source in self._inputs.values():
+            self._pump(source)
+        poses = self._odometry.poses()
+        for pose in poses:
+            self._publish(pose)
+        if poses and not self._begun:
+            self._begun = True
+            self.get_logger().info('odometry begins')
+        for text in self._odometry.take_told():
+            self._said += 1
+            if self._said <= MOST_SAID:
+                last = ' (more of this kind is not said)' if self._said == MOST_SAID else ''
+                self.get_logger().warning(text + last)
+
+    def _pump(self, source: Input) -> None:
+        """Hand on what has come on a topic."""
+        raws, sent_ns = source.take()
+        if not raws:
+            return
+        for slot, block in source.decode(raws, sent_ns, None):
+            self._odometry.feed(slot, take(block, source.sound),
+                                source.reader and source.reader.form)
+        if source.slot == 'imu' and source.health.jumped_back:
+            self._odometry.begin_anew()
+            for one in self._inputs.values():
+                one.health.forget()
+
+    def _look_around(self, now_ns: int) -> None:
+        """Look for publishers, and say what is missing, seldom."""
+        sim = self.get_clock().ros_time_is_active  # type: ignore[attr-defined]
+        for one in self._inputs.values():
+            one.look()
+            one.gate.is_open = sim
+            if not one.flowing():
+                one.find(self.config)
+        missing = [why for why in (one.why() for one in self._inputs.values()) if why]
+        apart = self._odometry.apart()
+        if not missing and abs(apart) > APART_S:
+            missing = [f'the stamps of the odometer are {apart:+.3g} s from those of the Imu: two '
+                       'clocks; mend the drivers, or set use_sim_time where a bag is played']
+        if not missing:
+            self._silent_ns, self._pause_s = 0, WAIT_S
+        elif not self._silent_ns:
+            self._silent_ns = now_ns + round(self._pause_s * 1e9)
+        elif now_ns > self._silent_ns:
+            self.get_logger().warning('nothing is published: ' + '; '.join(missing))
+            self._pause_s = SELDOM_S
+            self._silent_ns = now_ns + round(self._pause_s * 1e9)
+
+    def _publish(self, pose: Pose) -> None:
+        frames = self.config.frames
+        twist = TwistWithCovarianceStamped()
+        twist.header.stamp.sec, twist.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
+        twist.header.frame_id = frames.base
+        twist.twist.twist.linear = Vector3(**_xyz(pose.velocity))
+        twist.twist.twist.angular = Vector3(**_xyz(pose.rate))
+        twist.twist.covariance = pose.twist_cov.ravel()
+        odometry = OdometryMessage(child_frame_id=frames.base, twist=twist.twist)
+        odometry.header.stamp, odometry.header.frame_id = twist.header.stamp, frames.odom
+        odometry.pose.pose.position = Point(**_xyz(pose.position))
+        odometry.pose.pose.orientation = Quaternion(**_xyz(pose.q))
+        odometry.pose.covariance = pose.pose_cov.ravel()
+        self._twist.publish(twist)
+        self._pose.publish(odometry)
+
+
+def _xyz(values) -> dict[str, float]:
+    return dict(zip('xyzw', values.tolist(), strict=False))
+
+
+def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:
+    """Return slot -> message types allowed, empty: any."""
+    odometer = () if config.odometer.type == 'auto' else (config.odometer.type,)
+    wanted: dict[str, tuple[str, ...]] = {'imu': (IMU,), 'odometer': odometer}
+    return wanted | ({'odometer_right': odometer} if config.odometer.right == 'topic' else {})
+
+
+def main(args=None) -> int:
+    """Run the node until it is told to end; see ``process.run``."""
+    return run('odometry', HELP, OdometryNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,85 @@
+"""A node as a process: its start, its end, and the one line that says why there is none."""
+
+from collections.abc import Callable
+import os
+import signal
+import sys
+import tempfile
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+from odocal_ros.errors import OdocalError
+from odocal_ros.outside import one_line, said_by
+
+
+def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
+    """
+    Run a node until it is told to end.
+
+    name : of the command.   about : what --help prints.   make : returns the node.
+
+    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help was asked
+    for; 1 when it cannot start, with one line that says why.
+    """
+    # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        asked = remove_ros_args(args)[1:]
+        if {'-h', '--help'} & set(asked):
+            print(about)
+            return 0
+        if asked:
+            return complain(name, f'{asked[0]} means nothing here: settings are ROS parameters, '
+                            f'written after --ros-args (see {name} --help)')
+        _init(args)
+    except Exception as error:
+        text = said_by(error).split(', at /')[0]
+        return complain(name, f'{text}; write parameters as --ros-args -p name:=value, remaps as '
+                        '-r from:=to')
+    executor, node, code = SingleThreadedExecutor(), None, 0
+    try:
+        node = make()
+        executor.add_node(node)
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except OdocalError as error:
+        code = complain(name, str(error))
+    except Exception as error:
+        # a callback caught in the middle of a shutdown may find its publisher gone
+        code = complain(name, said_by(error)) if rclpy.ok() else 0
+    finally:
+        executor.shutdown()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    if getattr(node, 'at_work', False):
+        # an interpreter that ends under a thread in C++ aborts; what is on the disk is whole
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _init(args) -> None:
+    """Start rclpy; of an error only the exception is left, not rcl's own line on stderr."""
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            rclpy.init(args=args)
+            held.seek(0)
+            os.write(stderr, held.read())
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+def complain(name: str, text: str) -> int:
+    """Say on stderr why a command cannot go on; return its exit code."""
+    print(one_line(f'{name}: {text}'), file=sys.stderr)
+    return 1

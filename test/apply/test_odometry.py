@@ -1,0 +1,196 @@
+"""Dead reckoning as the samples come, against replay's own of the same drive, and closed forms."""
+
+from drives import settings
+import numpy as np
+import pytest
+from streams import alignment_of, given, odometry_of, poses_of, samples_of
+
+from odocal_ros.leg_run import LegRun
+from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.pipeline import calibrate
+from odocal_ros.samples import ImuSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.screen import screen
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'duration': 120.0}   # replay keeps each epoch
+KINDS = {'counts': {}, 'speed': {'odometer': 'speed'}, 'angle': {'odometer': 'angle'}}
+
+
+@pytest.fixture(scope='module', params=KINDS)
+def drive(request):
+    """Simulate two minutes of a hilly town, by each kind of odometer."""
+    return simulate(SimOptions(scenario='town', slope=0.03, fix_noise='rtk',
+                               imu_grade='tactical', **RATES, **KINDS[request.param]))
+
+
+def test_the_path_is_that_of_replay_as_calibrated(drive):
+    row = int(np.searchsorted(drive.imu.stamp_ns, drive.truth.start_ns)) - 5
+    alignment = alignment_of(drive, row)
+    result = calibrate(drive.leg(), settings(drive), alignment)
+    estimates = result.methods['two_point'].estimates
+    assert estimates['yaw_mounting_angle'].value is not None
+    poses = poses_of(odometry_of(drive, estimates, **given(alignment, result.origin[0])),
+                     samples_of(drive, drive.imu.stamp_ns[row]), drive.form)
+    assert len(poses) > 900
+    rows = np.searchsorted(drive.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
+    off = np.array([p.position for p in poses]) - (
+        result.track_n[rows] - result.track_n[0])
+    # of 600 m, summed in another order
+    assert np.abs(off).max() < 1e-9
+
+
+@pytest.fixture(scope='module')
+def two_wheels():
+    """Simulate two wheels whose factors differ by 2 %."""
+    return simulate(SimOptions(scenario='town', two_wheels=True, wheel_difference=0.02,
+                               fix_noise='rtk', imu_grade='tactical', **RATES))
+
+
+def test_of_two_wheels_each_has_its_own_factor(two_wheels):
+    made = two_wheels
+    row = int(np.searchsorted(made.imu.stamp_ns, made.truth.start_ns)) - 5
+    alignment, config = alignment_of(made, row), settings(made)
+    run = LegRun(made.leg(), screen(made.leg(), config)[0], config, [], alignment)
+    assert run.examine()
+    left, right = (run.reckon(travel).P * scale for travel, scale in zip(
+        (run.inputs.travel_left, run.inputs.travel_right), made.truth.wheel_scales, strict=True))
+    wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)
+    poses = poses_of(odometry_of(made, **given(alignment, run.origin.latitude)),
+                     samples_of(made, made.imu.stamp_ns[row]), made.form)
+    rows = np.searchsorted(made.imu.stamp_ns, [p.stamp_ns for p in poses]) - row
+    off = np.array([p.position for p in poses]) - (wanted[rows] - wanted[0])
+    assert np.abs(off).max() < 1e-9
+
+
+def blocks_with(drive, change):
+    """Return a drive's samples with the odometer's changed: (stamps s from begin, values)."""
+    blocks = samples_of(drive)
+    sent = blocks['odometer']
+    t = (sent.stamp_ns - sent.stamp_ns[0]) * 1e-9
+    keep, value = change(t, sent.value.copy())
+    stamps = sent.stamp_ns[keep]
+    return blocks | {'odometer': OdometerSamples(stamps, stamps, value[keep])}
+
+
+def always(t):
+    return np.ones(len(t), bool)
+
+
+def rolling(t, value):
+    return always(t), (value + 60_000) % 2**16
+
+
+def reset(t, value):
+    return always(t), np.where(t > 80.0, value - value[np.searchsorted(t, 80.0)], value)
+
+
+def one_false(t, value):
+    value[np.searchsorted(t, [70.0, 90.0])] = [0, 10**9]
+    return always(t), value
+
+
+def hole(t, value):
+    return (t < 70.0) | (t > 73.0), value
+
+
+FAULTS = {'rollover': (rolling, 1e-9), 'reset': (reset, 1.0), 'false rows': (one_false, 1.5),
+          'no messages for 3 s': (hole, 2.0)}
+
+
+@pytest.fixture(scope='module')
+def counted():
+    """Simulate two minutes of town with a counter and a gyro that starts with a bias."""
+    return simulate(SimOptions(scenario='town', slope=0.03, imu_grade='consumer', **RATES))
+
+
+@pytest.fixture(scope='module')
+def whole(counted):
+    """Return the poses of that drive with nothing wrong."""
+    return poses_of(odometry_of(counted), samples_of(counted), counted.form)
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_what_a_counter_does_costs_little_of_the_path(counted, whole, fault):
+    change, most = FAULTS[fault]
+    form = OdometerForm('cumulative', 2**16 if change is rolling else 2**64, 'm/pulse')
+    odometry = odometry_of(counted)
+    poses = poses_of(odometry, blocks_with(counted, change), form)
+    wanted = {p.stamp_ns: p for p in whole}
+    off = np.array([p.position - wanted[p.stamp_ns].position for p in poses
+                    if p.stamp_ns in wanted])
+    assert len(off) > 1100
+    assert np.abs(off).max() <= most
+    said = odometry.take_told()
+    assert any('jumps by' in text for text in said) == (change in (reset, one_false))
+    assert max(np.linalg.norm(p.velocity) for p in poses) < 25.0
+
+
+def test_rows_that_are_no_numbers_or_come_twice_change_nothing(counted, whole):
+    blocks = samples_of(counted)
+    imu = blocks['imu']
+    rows = np.insert(np.arange(len(imu.stamp_ns)), 1000, [998, 998])    # of before, again
+    blocks['imu'] = take(imu, rows)
+    poses = poses_of(odometry_of(counted), blocks, counted.form)
+    assert [p.stamp_ns for p in poses] == [p.stamp_ns for p in whole]
+    np.testing.assert_array_equal(poses[-1].position, whole[-1].position)
+
+
+def test_it_begins_at_zero_along_the_vehicle_and_takes_the_bias_from_rest(counted, whole):
+    first = whole[0]
+    np.testing.assert_allclose(first.position, 0.0, atol=1e-6)
+    C = matrix_from_quat(first.q)
+    assert abs(np.arctan2(C[1, 0], C[0, 0])) < 1e-4
+    # of 0.04 deg/s: what is left is noise of two seconds
+    at_rest = [p.rate for p in whole[:20]]
+    assert np.abs(np.mean(at_rest, axis=0)).max() < 3e-4
+    assert np.abs(counted.truth.gyro_bias).max() > 3e-4
+
+
+def test_the_pose_is_within_its_covariance(counted, whole):
+    last = whole[-1]
+    state = counted.motion.at(np.array(
+        [(p.stamp_ns - counted.options.start_ns) * 1e-9 for p in (whole[0], last)]))
+    C = matrix_from_quat(last.q)
+    turned = np.arctan2(C[1, 0], C[0, 0]) - np.diff(state.yaw)[0]
+    assert abs((turned + np.pi) % (2 * np.pi) - np.pi) < 3 * np.sqrt(last.pose_cov[5, 5])
+    assert 3e-4 < np.sqrt(last.pose_cov[5, 5]) < 0.03
+    for covariance in (last.pose_cov, last.twist_cov):
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
+        assert np.linalg.eigvalsh(covariance).min() > -1e-12
+    grown = [np.trace(p.pose_cov[:2, :2]) for p in whole[::100]]
+    assert grown[-1] > grown[len(grown) // 2] > grown[0]
+
+
+def test_base_link_goes_round_a_wheel_that_is_not_under_it(counted):
+    arm = np.array([1.2, -0.7, 0.3])
+    whole, poses = (poses_of(odometry_of(counted, levelling=False, odometer__lever_arm=where),
+                             samples_of(counted), counted.form)
+                    for where in ((0.0, 0.0, 0.0), tuple(arm.tolist())))
+    C = [matrix_from_quat(p.q) for p in (poses[0], poses[-1])]
+    np.testing.assert_allclose(poses[-1].position - whole[-1].position,
+                               (C[0] - C[1]) @ arm, atol=2e-3)      # C[0]: of 2 s at rest
+    turning = max(poses, key=lambda p: abs(p.rate[2]))
+    same = next(p for p in whole if p.stamp_ns == turning.stamp_ns)
+    np.testing.assert_allclose(turning.velocity - same.velocity,
+                               np.cross(turning.rate, -arm), atol=1e-3)
+
+
+def test_time_that_goes_back_begins_anew(counted):
+    odometry = odometry_of(counted)
+    blocks = samples_of(counted)
+    first = poses_of(odometry, blocks, counted.form)
+    again = poses_of(odometry, blocks, counted.form)
+    assert any('time went back' in text for text in odometry.take_told())
+    np.testing.assert_allclose(again[-1].position, first[-1].position, atol=1e-9)
+
+
+def test_an_imu_without_accelerometer_serves(counted, whole):
+    blocks = samples_of(counted)
+    imu = blocks['imu']
+    blocks['imu'] = ImuSamples(imu.stamp_ns, imu.received_ns, imu.w_i, np.zeros_like(imu.f_i),
+                               imu.q_ni, imu.yaw_variance)
+    poses = poses_of(odometry_of(counted), blocks, counted.form)
+    off = np.linalg.norm((poses[-1].position - whole[-1].position)[:2])
+    assert off < 3 * np.sqrt(np.trace(poses[-1].pose_cov[:2, :2]))
+    assert poses[-1].pose_cov[2, 2] > 2 * whole[-1].pose_cov[2, 2]       # nothing levels it

@@ -1,0 +1,187 @@
+"""The node that applies a calibration, as a process over DDS, beside replay."""
+
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+from bench import Client, NodeProcess, ROOT, wait_for
+from drives import settings
+from launch_stand_in import of_xml
+import numpy as np
+from player import Player, sent_of
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.output.files import as_json
+from odocal_ros.output.ros_files import texts
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 20.0         # times real time
+BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: any, but one for both
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Simulate two minutes of a hilly town, the Imu at a rate of which replay uses all."""
+    return simulate(SimOptions(scenario='town', duration=135.0, slope=0.03, imu_rate=50.0,
+                               odometer_rate=20.0, odometer='speed', fix_noise='rtk',
+                               imu_grade='tactical'))
+
+
+@pytest.fixture(scope='module')
+def replayed(drive, tmp_path_factory):
+    """Calibrate on it from a given alignment, and write what odocal replay writes."""
+    row = int(np.searchsorted(drive.imu.stamp_ns, drive.truth.start_ns)) - 5
+    alignment = Alignment(
+        t=(int(drive.imu.stamp_ns[row]) - drive.truth.start_ns) * 1e-9,
+        C_nb=matrix_from_rpy((*TILT, np.pi / 2 - drive.truth.heading)),
+        gyro_bias=np.array(BIAS), level_sigma=0.003, heading_sigma=0.002,
+        gyro_bias_sigma=np.full(3, 1e-5), gyro_noise=1e-5, gyro_bias_walk=1e-8,
+        heading_source='fixed', heading_shared=True)
+    config = settings(drive)
+    result = calibrate(drive.leg(), config, alignment)
+    calibration = combine([result], config)
+    path = tmp_path_factory.mktemp('calibrated') / 'calibration.yaml'
+    content = as_json(calibration, config, [], '2026-01-02T03:04:05+00:00')
+    path.write_text(texts(calibration, config, content)['calibration.yaml'])
+    return SimpleNamespace(row=row, alignment=alignment, result=result, path=path)
+
+
+def given(replayed):
+    """Return the arguments that begin the node where replay begins."""
+    values = {'start.attitude': replayed.alignment.q_nb.tolist(), 'start.gyro_bias': list(BIAS),
+              'start.latitude': float(np.rad2deg(replayed.result.origin[0])), 'levelling': False}
+    # from the very first message on: one lost would be another start
+    values |= {f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+               for topic in ('imu/data', 'odometer')}
+    return [x for name, value in values.items()
+            for x in ('-p', f'{name}:={str(value).lower()}')]
+
+
+@pytest.fixture(scope='module')
+def heard(drive, replayed, domain):
+    """Play the drive to a node with that calibration; keep what it publishes."""
+    from geometry_msgs.msg import TwistWithCovarianceStamped
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import QoSProfile
+    node = NodeProcess('--params-file', str(replayed.path), *given(replayed),
+                       module='odometry')
+    client = Client('odometry')
+    seen = SimpleNamespace(odometry=[], twists=[], node=node)
+    try:
+        topics = {'imu': encode.imu('imu/data', drive.imu),
+                  'odometer': encode.twist('odometer', drive.odometer)}
+        begin_ns = int(drive.imu.stamp_ns[replayed.row])
+        early_ns = {'imu': 0, 'odometer': 10**9}
+        sent = sorted((one for slot, topic in topics.items() for one in sent_of(slot, topic)
+                       if one.stamp_ns >= begin_ns - early_ns[slot]),
+                      key=lambda one: one.stamp_ns)
+        player = Player(client.node, {slot: topic.msgtype for slot, topic in topics.items()})
+        for kind, name, kept in ((Odometry, 'odometry', seen.odometry),
+                                 (TwistWithCovarianceStamped, 'odometry/twist', seen.twists)):
+            client.node.create_subscription(kind, name, kept.append, QoSProfile(depth=5000))
+        wait_for(player.matched, 'subscriptions of the node')
+        wait_for(lambda: client.node.count_publishers('/odometry/twist'), 'its publishers')
+        player.play(sent, SPEED)
+        wait_for(lambda: seen.odometry and stamp_of(seen.odometry[-1]) > sent[-1].stamp_ns - 10**9,
+                 f'the last pose; the node says {node.text}')
+        seen.odometry, seen.twists = list(seen.odometry), list(seen.twists)
+        yield seen
+    finally:
+        seen.code = node.end()
+        client.close()
+    assert seen.code == 0
+
+
+def stamp_of(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def test_its_path_is_that_of_replay_as_calibrated(heard, drive, replayed):
+    assert heard.node.text.count('odometry begins') == 1, heard.node.text
+    assert 'jumps' not in heard.node.text
+    rows = np.searchsorted(drive.imu.stamp_ns, [stamp_of(m) for m in heard.odometry])
+    path = np.array([[getattr(m.pose.pose.position, axis) for axis in 'xyz']
+                     for m in heard.odometry])
+    wanted = replayed.result.track_n[rows - replayed.row] - replayed.result.track_n[0]
+    assert len(path) > 1000
+    assert np.linalg.norm(wanted[-1]) > 200.0
+    assert np.abs(path - wanted).max() < 1e-9
+
+
+def test_messages_are_what_robot_localization_takes(heard):
+    pose, twist = heard.odometry[500], heard.twists[500]
+    assert (pose.header.frame_id, pose.child_frame_id) == ('odom', 'base_link')
+    assert (twist.header.frame_id, twist.header.stamp) == ('base_link', pose.header.stamp)
+    assert pose.twist == twist.twist
+    for covariance in (pose.pose.covariance, twist.twist.covariance):
+        matrix = np.reshape(covariance, (6, 6))
+        assert (np.diag(matrix) > 0).all()
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.trace(matrix))
+
+
+def test_without_a_calibration_it_says_what_to_give(domain, tmp_path):
+    rejected = tmp_path / 'rejected.yaml'
+    rejected.write_text('/**: {ros__parameters: {result: {scale_factor: 0.02, valid: false}}}')
+    for more, why in (((), 'no calibration is given'),
+                      (('--params-file', str(rejected)), 'was rejected')):
+        node = NodeProcess('-p', 'vehicle:=car 3', *more, module='odometry')
+        assert node.wait() == 1
+        line, = node.lines
+        assert line.startswith('odometry: ')
+        assert why in line
+        assert 'calibration.yaml' in line
+
+
+def test_the_launch_file_starts_it_with_both_files():
+    declared, (node,) = of_xml(ROOT / 'launch' / 'odometry.launch.xml',
+                               {'calibration': '/tmp/calibration.yaml', 'imu_topic': '/a/imu'})
+    assert declared['calibration'][0] == ''       # must be given
+    assert node.executable == 'odometry'
+    assert f"'{node.executable} = odocal_ros.live.odometry:main'" in (
+        ROOT / 'setup.py').read_text()
+    assert node.parameters[:2] == [str(ROOT / 'config' / 'odometry.yaml'),
+                                   '/tmp/calibration.yaml']
+    assert node.remappings['imu/data'] == '/a/imu'
+
+
+def test_the_node_takes_its_own_settings_file_and_is_what_the_policy_allows(replayed, domain):
+    policy = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml').getroot()
+    profile, = policy.findall('enclaves/enclave[@path="/odometry"]/profiles/profile')
+    allowed = {kind: {one.text for group in profile.findall(f'*[@{kind}="ALLOW"]')
+                      for one in group} for kind in ('publish', 'subscribe')}
+    node = NodeProcess('--params-file', str(ROOT / 'config' / 'odometry.yaml'),
+                       '--params-file', str(replayed.path), '-p', 'odometer.left:=topic', '-p',
+                       'odometer.right:=topic', '-p', 'use_sim_time:=true', '-p',
+                       'odometer.type:=std_msgs/msg/Int64', module='odometry')
+    client = Client('odometry')
+    try:
+        for kind, names in (('publish', 'get_publisher_names_and_types_by_node'),
+                            ('subscribe', 'get_subscriber_names_and_types_by_node')):
+            wanted = {name if name.startswith('/') else f'/{name}' for name in allowed[kind]}
+
+            def seen(names=names):
+                try:
+                    return {n for n, _ in getattr(client.node, names)('odometry', '/')}
+                except Exception:       # not in the graph yet
+                    return set()
+            wait_for(lambda seen=seen, wanted=wanted: seen() == wanted, f'{kind}: {wanted}')
+    finally:
+        assert node.end() == 0
+        client.close()
+
+
+def test_the_ekf_of_robot_localization_listens_to_what_is_sent():
+    import yaml
+    ekf = yaml.safe_load((ROOT / 'config' / 'ekf_odocal.yaml').read_text())[
+        '/**/ekf_filter_node']['ros__parameters']
+    own = yaml.safe_load((ROOT / 'config' / 'odometry.yaml').read_text())[
+        '/**/odometry']['ros__parameters']['frames']
+    assert ekf['twist0'] == 'odometry/twist'
+    assert (ekf['odom_frame'], ekf['base_link_frame']) == (own['odom'], own['base'])
+    names = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+    fused = dict(zip([*names, *(f'v{n}' for n in names), 'ax', 'ay', 'az'],
+                     ekf['twist0_config'], strict=True))
+    assert {name for name, on in fused.items() if on} == {'vx', 'vy', 'vyaw'}

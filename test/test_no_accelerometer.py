@@ -1,0 +1,91 @@
+"""An Imu that sends turn rates only: the scale comes by gyro, counter and fixes, and no angle."""
+
+from dataclasses import replace
+
+from drives import drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.bagio import encode
+from odocal_ros.config import Config
+from odocal_ros.messages import IMU, make_reader
+from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.reasons import Code, Verdict
+
+TOWN = {'scenario': 'town', 'duration': 300.0, 'slope': 0.03}
+ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
+
+
+def without_force(made, value=0.0, planar=False):
+    """Return the leg of a drive whose Imu sends no force, and about one axis only if planar."""
+    leg = made.leg()
+    w_i = leg.imu.w_i * ([0.0, 0.0, 1.0] if planar else 1.0)
+    return replace(leg, imu=replace(leg.imu, w_i=w_i, f_i=np.full_like(leg.imu.f_i, value)))
+
+
+@pytest.mark.parametrize('how', ['zero', 'nan', 'yaw rate alone'])
+def test_one_counter_gives_the_scale_within_its_sigma(how):
+    made = drive(**TOWN)
+    leg = without_force(made, np.nan if how == 'nan' else 0.0, how == 'yaw rate alone')
+    config = settings(made, heading_sigma=None, method='auto')
+    result = calibrate(leg, config)
+    calibration = combine([result], config)
+    scale = calibration.estimates['scale_factor']
+    assert scale.method == 'wheels'
+    # 240 ppm of fixes of 1.5 m, 500 ppm of hills unseen
+    assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.003 * made.truth.scale
+    assert all(calibration.estimates[name].value is None for name in ANGLES)
+    said = everything_said(result)
+    assert Code.NO_IMU not in said
+    assert 'need an accelerometer' in said[Code.NO_ACCELEROMETER]
+    assert calibration.verdict is Verdict.CAUTION
+    # nothing that only an accelerometer sees is made up
+    assert not {Code.WHEEL_SLIP, Code.REVERSING_UNSIGNED, Code.IMU_AXES} & set(said)
+
+
+def test_two_wheels_give_both_scales_and_the_track_width():
+    made = drive(**TOWN, two_wheels=True)
+    config = settings(made, heading_sigma=None, method='auto')
+    found = combine([calibrate(without_force(made), config)], config).estimates
+    for side, true in zip(('left', 'right'), made.truth.wheel_scales, strict=True):
+        e = found[f'scale_factor_{side}']
+        assert abs(e.value - true) < 3 * e.sigma < 0.003 * true
+    width = found['track_width']
+    assert abs(width.value - made.options.track_width) < 4 * width.sigma + 1e-3
+
+
+def test_hills_are_in_the_sigma():
+    made = drive(**TOWN)
+    config = settings(made, heading_sigma=None, method='auto')
+    sources = {s.name: s for s in calibrate(without_force(made), config).methods['wheels'].sources}
+    assert sources['hills'].effects[0, 0] == 5e-4
+
+
+def test_a_heading_from_outside_gives_the_yaw_all_the_same():
+    made = drive(**TOWN)
+    config = settings(made, heading_sigma=2e-3, method='auto')
+    found = combine([calibrate(without_force(made), config)], config).estimates
+    yaw = found['yaw_mounting_angle']
+    assert abs(yaw.value - made.truth.yaw) < 3 * yaw.sigma < 0.02
+
+
+def test_an_imu_that_says_so_in_its_covariance_is_heard():
+    """REP-145: linear_acceleration_covariance[0] of -1, whatever the values are."""
+    imu = drive(**TOWN).imu
+    topic = encode.imu('/imu', imu)
+    packed = topic.pack(slice(0, 5)).copy()
+    raw = [row.tobytes() for row in packed]
+    at = _offset_of_covariance(raw[0], imu.f_i[0])
+    none = [r[:at] + np.float64(-1.0).tobytes() + r[at + 8:] for r in raw]
+    reader = make_reader('imu', IMU, Config())
+    for rows, has in ((raw, True), (none, False)):
+        (_, block), = reader.rows(rows, [1] * len(rows), None)
+        assert np.isfinite(block.f_i).all() == has
+        assert np.isfinite(block.w_i).all()
+
+
+def _offset_of_covariance(raw, f_i):
+    """Return where the covariance begins: after the last number of the acceleration."""
+    at = raw.find(np.asarray(f_i).tobytes())
+    assert at > 0
+    return at + 24
