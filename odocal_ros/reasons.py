@@ -152,6 +152,8 @@ class Code(Enum):
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
+    SCALE_CHANGED = CAUTION, ('Look at tyre pressure, load and tyres; the scale given is that '
+                              'since the change.')
     LEGS_UNLIKE = REJECT, ('Combine legs of one vehicle, one mounting and one set of topics and '
                            'settings; calibrate the others by themselves.')
     LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'

@@ -191,6 +191,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
     'Several legs': {
         Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow; in what, and of the '
         'smoother which leg most, is said. The sigma of the combination holds that.',
+        Code.SCALE_CHANGED: 'With leg.automatic: a leg has another scale than those before, by '
+        'more than 3 sigma of the difference, the walk by verdict.scale_drift_per_day among it. '
+        'From that leg on the scale is another one; what legs share besides goes on.',
         Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
         'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
         'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '

@@ -187,6 +187,8 @@ def _legs_of(path, args, asked, config, journal, unit):
             if isinstance(note, str):
                 _tell(args, note)
         results = _calibrated(recorder, spans, config, notes, name, args)
+        if config.leg.automatic and not (marks or asked):
+            results = _worth_keeping(results, args)
         with Phase(f'checksum of {name}', quiet):
             described = {'bag': name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
@@ -207,6 +209,20 @@ def _calibrated(recorder, spans, config, notes, name, args):
             results.append(replace(calibrate(leg, config, notes=notes[number - 1],
                                              holdout=args.holdout), bag=name))
     return results
+
+
+def _worth_keeping(results, args):
+    """Return legs found by themselves but for those that are no good, as the node has it."""
+    from odocal_ros.automatic import refusal
+    why = [refusal(leg) for leg in results]
+    if all(why):
+        return results
+    for leg, reason in zip(results, why, strict=True):
+        if reason:
+            start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
+            _tell(args, f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
+                  f'{reason.code.name}: {reason.text}')
+    return [leg for leg, reason in zip(results, why, strict=True) if not reason]
 
 
 def _styled(stream) -> bool:
