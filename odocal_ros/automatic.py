@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import LegResult
+from odocal_ros.combination import combine
 from odocal_ros.config import Config
 from odocal_ros.odometer_steps import Steps
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -161,3 +163,10 @@ def refusal(result: LegResult) -> Reason | None:
     every = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
     return next((r for r in every if r.code.gravity is Verdict.REJECTED),
                 Reason(Code.NO_METHOD, 'no method could be run'))
+
+
+def fold(legs, config: Config, carried: Carried | None = None) -> Carried | None:
+    """Return what is carried on with some legs taken in, by time."""
+    for leg in legs:
+        carried = combine([leg], config, carried).carried or carried
+    return carried

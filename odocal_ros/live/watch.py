@@ -45,12 +45,13 @@ class Watch:
         self._pause_until = 0.0
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
-        """Watch a leg that starts at a mark; ``recorder`` holds what came before."""
+        """Watch a leg that starts at a mark; ``recorder`` holds what came so far."""
         self.end()
         self._over, self._start_ns, self._config = threading.Event(), start_ns, config
         self._sketch, self._before = Sketch(recorder.form), recorder
         self._smoother = SmootherSoFar()
         self._gaps = ImuGaps(start_ns, config.leg.max_gap)
+        self._gaps.feed(recorder.rows('imu'))      # a mark may lie back, as leg.automatic sets it
         self._due_ns = start_ns + EVERY_NS
 
     def end(self) -> None:

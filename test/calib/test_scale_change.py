@@ -8,6 +8,7 @@ import pytest
 from smoother_legs import made
 from test_legs_on_border import apart, leg_result, Toy, TRUTH
 
+from odocal_ros.automatic import fold
 from odocal_ros.calib.carried import carried_from
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.scale_steps import CHANGED, scale_steps
@@ -134,6 +135,20 @@ def test_a_result_on_the_disk_goes_on(session):
     for other in (replace(carried, last_ns=10**18), replace(carried, unit='1')):
         alone = combine(legs[2:], config, other)
         assert alone.estimates[SCALE].value == results[2].estimates[SCALE].value
+
+
+def test_legs_folded_into_what_is_carried_count_as_before(session):
+    config, results = session
+    legs = legs_of(results)
+    whole, carried = combine(legs, config), fold(legs[:2], config)
+    found = combine(legs[2:], config, carried)
+    assert found.carried.legs == 3
+    for name in (SCALE, YAW):
+        a, b = found.estimates[name], whole.estimates[name]
+        assert a.value == pytest.approx(b.value, abs=1e-3 * b.sigma), name
+        assert a.sigma == pytest.approx(b.sigma, rel=1e-3), name
+    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
+    assert fold([rejected], config, carried) is carried
 
 
 def test_only_what_is_asked_for_is_written(session):
