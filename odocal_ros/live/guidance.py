@@ -18,7 +18,9 @@ def hint(now: Situation) -> str:
     """Return what is missing, or what to do next."""
     session, state = now.session, now.session.state
     if state is State.COMPUTING:
-        return 'the answer of ~/stop_leg comes in a moment'
+        share, stage = now.computed
+        return (f'computing: {100 * share:.0f} %' + (f' ({stage})' if stage else '')
+                + ('' if session.by_itself else '; then ~/stop_leg answers'))
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')

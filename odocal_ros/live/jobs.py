@@ -1,5 +1,6 @@
 """The heavy work, as the worker thread runs it: pure of the node and its state."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from std_msgs.msg import Header
@@ -34,10 +35,11 @@ class Computed:
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int, kept: list[LegResult],
-            config: Config, carried: Carried | None = None, by_itself: bool = False) -> Computed:
+            config: Config, carried: Carried | None = None, by_itself: bool = False,
+            progress: Callable[[float, str], None] | None = None) -> Computed:
     """Return a leg's result, its combination with the legs kept, and the paths to show."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    result = calibrate(leg, config)
+    result = calibrate(leg, config, progress=progress)
     paths = leg_paths(result, config)
     if by_itself and (why := refusal(result)):
         return Computed(result, paths, refused=why)

@@ -116,6 +116,7 @@ class LegWay:
         outlook = self._watch.outlook
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
+            computed=self._computing.at,
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
@@ -198,7 +199,7 @@ class LegWay:
         kept = [leg.result for leg in session.legs]
         self._computing.submit(partial(
             jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
-            session.carried, session.by_itself), self._take_leg)
+            session.carried, session.by_itself, self._computing.tell), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
         self.session.fail(trouble)

@@ -25,7 +25,7 @@ NAME = 'calibrator: calibration'  # replay finds marks by this name
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
-    'metres_to_go_yaw'), 1) | {
+    'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
         'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4}
 VALUES = {
@@ -68,6 +68,7 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'save_trouble': now.save_trouble, 'lost': now.lost,
         'automatic': _automatic(now), 'unused': _unused(session),
+        'computing_percent': 100 * now.computed[0] if session.state is State.COMPUTING else 0.0,
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)

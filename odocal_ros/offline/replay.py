@@ -203,11 +203,12 @@ def _calibrated(recorder, spans, config, notes, name, args):
     results = []
     with Phase('calibrating', args.quiet or args.json) as phase:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
-            if len(spans) > 1:
-                phase((number - 1) / len(spans), f'calibrating leg {number} of {len(spans)}')
+            which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            results.append(replace(calibrate(leg, config, notes=notes[number - 1],
-                                             holdout=args.holdout), bag=name))
+            results.append(replace(calibrate(
+                leg, config, notes=notes[number - 1], holdout=args.holdout,
+                progress=lambda share, stage, done=number - 1, which=which: phase(
+                    (done + share) / len(spans), which + stage)), bag=name))
     return results
 
 

@@ -69,6 +69,8 @@ def _first(found, node, client, player, drive):
         found.one = client.until(legs='1')
         found.next = client.until(state='recording', leg_id='2')
         found.two = client.until(legs='2')
+        found.computing = [s for s in client.statuses if s['state'] == 'computing'
+                           and s['leg_id'] == '1']
         found.written = wait_for(lambda: _saved(client.status['saved'], 2), 'the second save')
 
 
@@ -108,6 +110,14 @@ def test_legs_begin_and_end_by_themselves(seen, drive):
     assert 'stop_leg' not in seen.recording['hint'] + seen.two['hint'] + seen.one['hint']
     assert 'ready' in seen.node.text
     assert '~/start_leg' not in seen.node.text
+
+
+def test_how_far_a_leg_is_computed_is_said(seen):
+    shares = [float(status['computing_percent']) for status in seen.computing]
+    assert shares == sorted(shares)
+    assert 0 < shares[-1] < 100
+    assert seen.computing[-1]['hint'].startswith(f'computing: {shares[-1]:.0f} % (')
+    assert seen.next['computing_percent'] == '0.0'
 
 
 def test_a_change_of_the_scale_is_said_and_followed(seen, drive):
