@@ -36,6 +36,8 @@ class Code(Enum):
     STAMPS_NOT_RISING = NOTE, 'Mend the clock of the sender; the rows in order were used.'
     IMU_GAP = REJECT, ('Mend the Imu stream (QoS depth, CPU load, cable), or mark a leg beside '
                        'the gap; leg.max_gap is the limit.')
+    LEG_CUT = NOTE, ('Mend the Imu stream (QoS depth, CPU load, cable): a leg without a gap tells '
+                     'more; leg.max_gap is the limit.')
     TOPIC_GAP = NOTE, 'Mend the stream; the gap lowers the weight, not the leg.'
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')

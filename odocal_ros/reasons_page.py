@@ -45,6 +45,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'were left out that leave the rest in order.',
         Code.IMU_GAP: 'The Imu is silent, or repeats one value, for longer than `leg.max_gap`. '
         'How the vehicle turned meanwhile is lost, and with it the track.',
+        Code.LEG_CUT: 'The Imu was silent for longer than `leg.max_gap`: the leg is cut there, '
+        'and its parts are calibrated as legs and combined. A part that does not carry, as one of '
+        'a few seconds, is left out; where none does, the leg is rejected (`IMU_GAP`).',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
         'intervals, or the odometer begins late or ends early. Travel across the gap is bridged '
         'and its doubt is in the sigma.',

@@ -118,16 +118,16 @@ def _before_start(still_s: float) -> str:
 def _while_recording(now: Situation) -> tuple[list[str], list[str]]:
     """Return what to do, and what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
+    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
     slow = now.max_speed < now.session.config.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
         end = _end(now) if now.session.by_itself else (
             f'then stand still {REST_S:.0f} s and call ~/stop_leg')
-        return [', '.join(wants), end], []
+        return [', '.join(wants), end], facts
     if now.outlook is None:
-        return [*wants, _end(now)], []
-    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution
+        return [*wants, _end(now)], facts
     facts.append(now.outlook.words())
     if now.outlook_age_s > OLD_S:
         facts.append(f'as it was {now.outlook_age_s:.0f} s ago')

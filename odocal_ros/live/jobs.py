@@ -11,7 +11,8 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live.outputs import paths
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.parts import calibrate_parts
+from odocal_ros.pipeline import combine
 from odocal_ros.reasons import Reason
 
 MOST_KEPT = 30      # legs in memory and in the report; what those before tell is carried on
@@ -22,11 +23,12 @@ class Computed:
     """
     What a leg gave.
 
+    results : one, or one of each part where the Imu had a gap.
     refused : why a leg begun by itself does not count; there is no calibration then.
     carried, folded : what earlier legs tell now, and how many of those kept are in it.
     """
 
-    result: LegResult
+    results: tuple[LegResult, ...]
     paths: tuple
     calibration: Calibration | None = None
     refused: Reason | None = None
@@ -34,19 +36,21 @@ class Computed:
     folded: int = 0
 
 
-def compute(recorder: LegRecorder, start_ns: int, stop_ns: int, kept: list[LegResult],
-            config: Config, carried: Carried | None = None, by_itself: bool = False,
-            progress: Callable[[float, str], None] | None = None) -> Computed:
+def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
+            kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
+            by_itself: bool = False, progress: Callable[[float, str], None] | None = None,
+            ) -> Computed:
     """Return a leg's result, its combination with the legs kept, and the paths to show."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    result = calibrate(leg, config, progress=progress)
-    paths = leg_paths(result, config)
-    if by_itself and (why := refusal(result)):
-        return Computed(result, paths, refused=why)
+    results = tuple(calibrate_parts(leg, config, progress=progress))
+    paths = leg_paths(max(results, key=lambda one: one.distance), config)
+    if by_itself and (why := refusal(results[0])):
+        return Computed(results, paths, refused=why)
     folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
-    carried = fold(kept[:folded], config, carried)
-    calibration = combine([*kept[folded:], result], config, carried)
-    return Computed(result, paths, calibration, None, carried, folded)
+    carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
+    left = [one for leg in kept[folded:] for one in leg]
+    calibration = combine([*left, *results], config, carried)
+    return Computed(results, paths, calibration, None, carried, folded)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,

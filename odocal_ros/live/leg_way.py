@@ -196,7 +196,7 @@ class LegWay:
 
     def _compute(self, samples: LegRecorder) -> None:
         session = self.session
-        kept = [leg.result for leg in session.legs]
+        kept = [leg.results for leg in session.legs]
         self._computing.submit(partial(
             jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
             session.carried, session.by_itself, self._computing.tell), self._take_leg)
@@ -209,26 +209,27 @@ class LegWay:
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
     def _take_leg(self, done: jobs.Computed) -> None:
-        leg_id, self._snapshot, self._distance_m = self.session.leg_id, None, done.result.distance
+        leg_id, self._snapshot = self.session.leg_id, None
+        self._distance_m = sum(one.distance for one in done.results)
         if done.calibration is None:
             self.session.leave_out(done.refused)
-            text = (f'leg {leg_id}, {done.result.distance:.0f} m, is not used: '
+            text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
                     f'{done.refused.code.name}: {done.refused.text}')
             self._log.info(text)
             self._computing.answer(False, text)
             return
-        self.session.finish(done.result, done.calibration)
+        self.session.finish(done.results, done.calibration)
         self.session.carry_on(done.carried, done.folded)
-        success, text = self._take_result(done.calibration, done.paths, done.result)
+        success, text = self._take_result(done.calibration, done.paths, done.results)
         if success and self._config().output.autosave:
             self._save(done.calibration)
 
-    def _take_result(self, calibration, paths, leg=None) -> tuple[bool, str]:
+    def _take_result(self, calibration, paths, parts=()) -> tuple[bool, str]:
         """Publish a result and answer those who wait for it."""
         self._outlets.set_results(calibration)
         self._outlets.show_paths(paths)
         now = self.situation()
-        success, text = answers.outcome(calibration, leg, self.session.leg_id,
+        success, text = answers.outcome(calibration, parts, self.session.leg_id,
                                         words(quantities_ok(now)), after_result(now))
         self._log.info(text)
         self._computing.answer(success, text)

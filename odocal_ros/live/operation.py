@@ -66,7 +66,7 @@ class Operation(AutomaticWay):
 
     def undo_leg(self) -> tuple[bool, str] | Future:
         """Drop the last kept leg and combine the others anew."""
-        left = [leg.result for leg in self.session.begin_undo()]
+        left = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
         self._filing.withdraw(left)

@@ -32,12 +32,12 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeptLeg:
-    """A leg that counts."""
+    """A leg that counts; of parts where the Imu had a gap."""
 
     leg_id: int
     start_ns: int
     stop_ns: int
-    result: LegResult
+    results: tuple[LegResult, ...]
 
 
 class Session:
@@ -101,9 +101,9 @@ class Session:
         self.config = config
         self.state, self.trouble = State.COMPUTING, ''
 
-    def finish(self, result: LegResult, calibration: Calibration) -> None:
+    def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg."""
-        self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, result))
+        self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
         self.unused = None
         self._settle(calibration)
 

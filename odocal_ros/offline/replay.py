@@ -199,16 +199,17 @@ def _calibrated(recorder, spans, config, notes, name, args):
     from dataclasses import replace
 
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.pipeline import calibrate
+    from odocal_ros.parts import calibrate_parts
     results = []
     with Phase('calibrating', args.quiet or args.json) as phase:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
             which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            results.append(replace(calibrate(
+            parts = calibrate_parts(
                 leg, config, notes=notes[number - 1], holdout=args.holdout,
                 progress=lambda share, stage, done=number - 1, which=which: phase(
-                    (done + share) / len(spans), which + stage)), bag=name))
+                    (done + share) / len(spans), which + stage))
+            results += [replace(one, bag=name) for one in parts]
     return results
 
 
