@@ -17,7 +17,7 @@ BEFORE_NS = 60 * 10**9           # what lies nearer to the start mark belongs to
 
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
-    """Return a leg cut where its Imu is silent for longer: itself without such gaps, or too many."""
+    """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
     stamps = leg.imu.stamp_ns
     near = stamps[(stamps >= leg.start_ns - BEFORE_NS) & (stamps <= leg.stop_ns)]
     if len(near) < 2:
