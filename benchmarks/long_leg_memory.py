@@ -119,7 +119,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     print(f'node, recorded: {peak_mib():.0f} MiB (goal {NODE_GOAL})', flush=True)
     stop = recorder.newest_ns('imu')
     began = time.perf_counter()
-    result, *_ = compute(recorder.snapshot(), begin[0], stop, [], config)
+    result, = compute(recorder.snapshot(), begin[0], stop, [], config).results
     scale = result.methods['smoother'].estimates['scale_factor']
     print(f'node, computed ({result.imu_samples} Imu rows, {time.perf_counter() - began:.0f} s, '
           f'scale {scale.value} +- {scale.sigma}): {peak_mib():.0f} MiB (goal {NODE_GOAL})',

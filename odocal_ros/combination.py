@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge, nominal_scale
 from odocal_ros.calib.one_vehicle import unlike_legs
-from odocal_ros.calib.result import Calibration, MethodResult
+from odocal_ros.calib.result import Calibration, Estimate, MethodResult
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.config import Config
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
@@ -16,9 +17,11 @@ PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_
 # the same of legs that are combined on their border: all of them may tell what none does
 ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
              Code.YAW_FAR_FROM_NOMINAL}
+SMOOTHER = 'smoother'      # the method whose legs are combined on their border
+OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 
 
-def combine(legs, config: Config) -> Calibration:
+def combine(legs, config: Config, carried: Carried | None = None) -> Calibration:
     """
     Combine legs of one vehicle.
 
@@ -28,6 +31,8 @@ def combine(legs, config: Config) -> Calibration:
         At least one. Rejected legs are left out while any other is left, and named.
     config : Config
         Limits, frames.
+    carried : Carried, optional
+        What earlier legs tell of the vehicle.
 
     Returns
     -------
@@ -40,17 +45,19 @@ def combine(legs, config: Config) -> Calibration:
     good = [leg for leg in good if leg not in twice]
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
-    methods = {n: _combined(n, [(leg.methods[n], leg.start_ns, i) for i, leg in enumerate(legs, 1)
-                                if leg in used and n in leg.methods], config) for n in names}
+    carried = carried if carried and _belongs(carried, used) else None
+    methods = {n: _combined(n, [
+        (leg.methods[n], leg.start_ns, i) for i, leg in enumerate(legs, 1)
+        if leg in used and n in leg.methods], config, carried) for n in names}
     on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
     estimates, giving = choose(methods, config.method)
-    reasons = _leg_reasons(legs, good, twice, giving, estimates)
+    reasons = _leg_reasons(legs, good, twice, giving, estimates, carried is not None)
     if giving:
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
         nominal = nominal_scale(config, estimates['scale_factor'].unit)
         own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
-               if len(legs) == 1 or r.code is Code.LEGS_DISAGREE
+               if len(legs) == 1 or r.code in OF_ALL
                or n in on_border and r.code in ON_BORDER]
         reasons += [r for r in (*own, *judge(estimates, nominal, config))
                     if (r.code, r.text) not in known and r.code not in rejecting]
@@ -62,7 +69,27 @@ def combine(legs, config: Config) -> Calibration:
     if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
         reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
     quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
-    return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy)
+    return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
+                       _carried_on(methods, good, carried))
+
+
+def _belongs(carried, legs):
+    """Tell whether legs are of the odometer of earlier ones, and driven after them."""
+    smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
+    return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
+        and min(leg.start_ns for leg in legs) > carried.last_ns
+
+
+def _carried_on(methods, good, before):
+    """Return what legs leave for those to come, None where they tell nothing."""
+    whole = methods.get(SMOOTHER)
+    times = [leg.start_ns for leg in good if SMOOTHER in leg.methods
+             and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
+    if whole is None or whole.border is None or not times:
+        return None
+    return Carried(whole.border, whole.estimates['scale_factor'].unit,
+                   before.first_ns if before else min(times), max(times),
+                   len(times) + (before.legs if before else 0))
 
 
 def driven_twice(legs):
@@ -77,18 +104,23 @@ def driven_twice(legs):
     return twice
 
 
-def together(name, results, times_ns, config, numbers=None) -> MethodResult:
+def together(name, results, times_ns, config, numbers=None, carried=None) -> MethodResult:
     """
-    Return what a method says of several legs.
+    Return what a method says of several legs, and of those carried on where it can.
 
     results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
     """
+    if carried and all(r.border for r in results):
+        unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
+        results = [MethodResult(name, (), unknown, border=carried.border), *results]
+        numbers = [0, *(numbers or range(1, len(results)))]
+        times_ns = [carried.last_ns, *times_ns]
     if len(results) > 1 and all(r.border for r in results):
         return combine_legs(results, times_ns, config, numbers)
     return combine_method(name, results)
 
 
-def _combined(name, driven, config):
+def _combined(name, driven, config, carried=None):
     """
     Return a method's combination of the legs where it is not rejected, of all if of none.
 
@@ -96,7 +128,7 @@ def _combined(name, driven, config):
     """
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)
-    whole = together(name, list(results), times_ns, config, numbers)
+    whole = together(name, list(results), times_ns, config, numbers, good and carried)
     if good or len(results) == 1:
         return whole
     why = dict.fromkeys(r for one in results for r in one.reasons
@@ -104,15 +136,16 @@ def _combined(name, driven, config):
     return replace(whole, reasons=(*whole.reasons, *why))
 
 
-def _leg_reasons(legs, good, twice, giving, estimates):
+def _leg_reasons(legs, good, twice, giving, estimates, carried):
     """Return the legs' own reasons, numbered where there are several."""
+    alone = len(legs) == 1 and not carried
     reasons = []
     for number, leg in enumerate(legs, 1):
         prefix = f'leg {number}: ' if len(legs) > 1 else ''
         methods = [leg.methods[n] for n in giving if n in leg.methods]
         own = [*leg.reasons, *(r for m in methods
                                for r in worth_saying(_further(m, leg), m.name, estimates)
-                               if len(legs) == 1 or r.code not in PER_LEG
+                               if alone or r.code not in PER_LEG
                                and not (m.border and r.code in ON_BORDER))]
         if leg in twice:
             reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '

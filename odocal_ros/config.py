@@ -125,9 +125,15 @@ class LegConfig:
     max_duration: float = setting(7200.0, 's', 10.0, 14400.0, about='A live leg longer than this '
                                   'is stopped.')
     max_gap: float = setting(0.5, 's', 0.05, 10.0, about='Longest gap in the Imu that a leg '
-                             'survives.')
+                             'survives uncut.')
     standstill: float = setting(2.0, 's', 0.2, 600.0, about='Shortest stop that counts as one.')
     preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Seconds kept before the start mark.')
+    automatic: bool = setting(False, about='Legs begin and end by themselves, at standstills, '
+                              'else every leg.automatic_minutes; a change of the scale beyond 3 '
+                              'sigma is said.')
+    automatic_minutes: float = setting(10.0, 'min', 1.0, 120.0, about='Longest leg of '
+                                       'leg.automatic; half of it suffices where the vehicle '
+                                       'stands.')
 
 
 @dataclass(frozen=True, kw_only=True)

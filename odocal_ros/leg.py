@@ -4,7 +4,7 @@ A leg: what the sensors said between two marks, and the recorder that collects i
 The recorder is the only thing in the package that remembers; both doors feed it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ EMPTY = {
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
+LEAD_NS = 10**9         # of odometer and fixes, to interpolate at the first row of the Imu
 AFTER_NS = 600 * 10**9   # a first row later than that after a mark tells nothing of it
 MOST_DAYS = 7          # of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
@@ -125,6 +126,14 @@ class LegRecorder:
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,
                    form_right=self.form_right, **rows)
+
+
+def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
+    """Return what lies between two stamps of a leg; ``first_ns``: no Imu row before it is."""
+    rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - LEAD_NS, stop_ns) for slot in SLOTS}
+    imu = rows['imu']
+    rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
+    return replace(leg, start_ns=start_ns, stop_ns=stop_ns, **rows)
 
 
 def _key(samples) -> np.ndarray:

@@ -35,6 +35,10 @@ FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.05            # relative sigma up to which a scale gives the distance
+# of the time that methods take, and of the tracks after them
+EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
+TRACKS = 2
+USUAL_PASSES = 6.0      # of a fit, in which it comes to two thirds of its way: 10 are usual
 
 
 def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
@@ -64,13 +68,15 @@ class LegRun:
     What methods read: leg, inputs, config, origin, fixes_n (k, 3) m, fix_sigma m, nominal and
     rough (scale, 0 or None unknown), lever_b (3,) m, spans (standstills), alignment, track,
     distance m, t_fit s (fixes after it are held out), facing (of the Imu, None unseen);
-    ``reasons`` takes what they find of the data.
+    ``reasons`` takes what they find of the data, ``progress(share, stage)`` how far they are.
     """
 
     def __init__(self, leg, inputs, config, reasons, alignment, holdout=False):
         self.leg, self.inputs, self.config, self.reasons = leg, inputs, config, reasons
         self.t_fit = inputs.t_stop
         self.holdout = holdout
+        self.progress = lambda share, stage: None
+        self._part = 0.0, 0.0, ''       # where the method at work begins, what it takes, its name
         self.origin = origin_amid(inputs.t_fix, inputs.geodetic)
         geodetic = inputs.geodetic.copy()
         lost = np.isnan(geodetic[:, 2])
@@ -90,12 +96,18 @@ class LegRun:
         if not self.examine():
             return leg_result(self.leg, self.inputs, self.reasons)
         methods, paths = {}, {}
-        for name in self._asked():
+        asked = self._asked()
+        whole, done = sum(EFFORT[name] for name in asked) + TRACKS, 0.0
+        for name in asked:
+            self._part = done, EFFORT[name] / whole, name
+            self.progress(done, name)
+            done += EFFORT[name] / whole
             let_go(*vars(self.leg.imu).values())
             method, paths[name] = run_method(name, self)
             about = self.about_alignment if name in ALIGNED else ()
             about += self.of_ends if name == 'two_point' else ()
             methods[name] = replace(method, reasons=(*about, *method.reasons))
+        self.progress(done, 'tracks')
         self.reasons += disagreements(methods)
         self.reasons += passed_over(methods, self.config.method, {r.code for r in self.reasons})
         estimates, _ = choose(methods, self.config.method)
@@ -112,6 +124,11 @@ class LegRun:
             for (name, m), path in zip(methods.items(), paths.values(), strict=True)}
         return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
                           deciding=deciding(self.config.method), **shown)
+
+    def passed(self, passes: int) -> None:
+        """Tell that a method has made so many passes of as many as it takes."""
+        begin, width, name = self._part
+        self.progress(begin + width * (1 - float(np.exp(-passes / USUAL_PASSES))), name)
 
     def examine(self) -> bool:
         """Say all of the leg that needs no method; return whether methods can be run."""

@@ -83,7 +83,7 @@ def tracks(run, paths) -> dict:
     run.reasons += check_worse(*relative, bool(run.nominal))
     kept = near(run, after, start, between)
     return more | {'evidence': evidence(run.leg, run.inputs, run.track, run.fixes_n, kept, start,
-                                        paths, run.config)}
+                                        paths, run.config, run.t_fit)}
 
 
 def check_of(run, path) -> dict:

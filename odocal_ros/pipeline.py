@@ -4,6 +4,7 @@ The pipeline: one pure function from a leg to its result, one from results to a 
 No state, no clock, no files: the live node and the replay call these and nothing else.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +28,8 @@ NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX
 
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
-              notes: tuple[Reason, ...] = (), holdout: bool = False) -> LegResult:
+              notes: tuple[Reason, ...] = (), holdout: bool = False,
+              progress: Callable[[float, str], None] | None = None) -> LegResult:
     """
     Take one leg from samples to result.
 
@@ -43,6 +45,9 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
         What the door knows of the data already (a truncated bag).
     holdout : bool
         Keep the last fifth of the distance back from the fit and check the correction on it.
+    progress : callable, optional
+        Called now and then with the share that is done, 0 to 1, and what is being done. Of a fit
+        nobody knows the end: its share is that of usual ones.
 
     Returns
     -------
@@ -53,12 +58,15 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     if run is None:
         return leg_result(leg, inputs, reasons)
     told = [*reasons]
+    run.progress = progress or run.progress
     result = run.result()
     back, scale = _reversed(result, inputs)
     if not len(back):
         return result
     told += said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
-    return LegRun(leg, inputs.mirrored(back), config, told, alignment, holdout).result()
+    again = LegRun(leg, inputs.mirrored(back), config, told, alignment, holdout)
+    again.progress = run.progress
+    return again.result()
 
 
 def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:

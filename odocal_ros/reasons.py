@@ -38,6 +38,8 @@ class Code(Enum):
     STAMPS_NOT_RISING = NOTE, 'Mend the clock of the sender; the rows in order were used.'
     IMU_GAP = REJECT, ('Mend the Imu stream (QoS depth, CPU load, cable), or mark a leg beside '
                        'the gap; leg.max_gap is the limit.')
+    LEG_CUT = NOTE, ('Mend the Imu stream (QoS depth, CPU load, cable): a leg without a gap tells '
+                     'more; leg.max_gap is the limit.')
     TOPIC_GAP = NOTE, 'Mend the stream; the gap lowers the weight, not the leg.'
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')
@@ -154,6 +156,8 @@ class Code(Enum):
     # several legs, several calibrations
     LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
                               'the combined sigma was widened.')
+    SCALE_CHANGED = CAUTION, ('Look at tyre pressure, load and tyres; the scale given is that '
+                              'since the change.')
     LEGS_UNLIKE = REJECT, ('Combine legs of one vehicle, one mounting and one set of topics and '
                            'settings; calibrate the others by themselves.')
     LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'

@@ -50,6 +50,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'were left out that leave the rest in order.',
         Code.IMU_GAP: 'The Imu is silent, or repeats one value, for longer than `leg.max_gap`. '
         'How the vehicle turned meanwhile is lost, and with it the track.',
+        Code.LEG_CUT: 'The Imu was silent for longer than `leg.max_gap`: the leg is cut there, '
+        'and its parts are calibrated as legs and combined. A part that does not carry, as one of '
+        'a few seconds, is left out; where none does, the leg is rejected (`IMU_GAP`).',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
         'intervals, or the odometer begins late or ends early. Travel across the gap is bridged '
         'and its doubt is in the sigma.',
@@ -196,6 +199,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
     'Several legs': {
         Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow; in what, and of the '
         'smoother which leg most, is said. The sigma of the combination holds that.',
+        Code.SCALE_CHANGED: 'With leg.automatic: a leg has another scale than those before, by '
+        'more than 3 sigma of the difference, the walk by verdict.scale_drift_per_day among it. '
+        'From that leg on the scale is another one; what legs share besides goes on.',
         Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
         'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
         'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '

@@ -29,13 +29,13 @@ from odocal_ros.glitches import (
 )
 from odocal_ros.leg import Leg
 from odocal_ros.nav.dead_reckoning import rough_scale
+from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import let_go, take
 from odocal_ros.wheel_travel import wheels
 
-GAP_FACTOR = 5.0         # a gap in odometer or fixes, in median intervals
 NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
            'fix': Code.FIXES_UNUSABLE}
 LABEL = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
@@ -275,13 +275,11 @@ def _longest_rising(stamp):
 
 def _gaps(slot, t, found):
     """Name the longest gap of odometer or fixes where it is far beyond their own rhythm."""
-    if len(t) < 10:
-        return
-    step = np.diff(t)
-    worst = int(np.argmax(step))
-    if step[worst] > max(GAP_FACTOR * np.median(step), 0.2):
-        found.append(Reason(Code.TOPIC_GAP, f'{LABEL[slot]} gap of {step[worst]:.2f} s at '
-                            f't = {t[worst]:.2f} s (median interval {np.median(step):.3f} s)'))
+    gaps = gaps_in_rhythm(t)
+    if len(gaps):
+        begin, end = gaps[np.argmax(gaps[:, 1] - gaps[:, 0])]
+        found.append(Reason(Code.TOPIC_GAP, f'{LABEL[slot]} gap of {end - begin:.2f} s at '
+                            f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)'))
 
 
 def imu_gap(t_imu, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:

@@ -48,7 +48,16 @@ def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held)
 
 
 def test_auto_takes_it_and_computes_two_point_beside_it(made):
-    leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None))
+    told = []
+    leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None),
+                    progress=lambda share, stage: told.append((share, stage)))
+    # how far it is, pass by pass, and never all before the end
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[0] == 0
+    assert 0.8 < shares[-1] < 1
+    assert list(dict.fromkeys(stage for _, stage in told)) == ['two_point', 'smoother', 'tracks']
+    assert len(told) > 8
     assert set(leg.methods) == {'smoother', 'two_point'}
     assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
 

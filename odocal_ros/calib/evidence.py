@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.sections import Sections, sections
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import matrix_from_quat
 
 ROWS = 5000          # of each kind kept
@@ -40,9 +41,11 @@ class Evidence:
     excluded_because: tuple[str, ...]    # (x,)
     fixes: int                           # before decimation
     excluded: int
+    gaps: tuple[tuple[str, float, float], ...] = ()   # of Imu and odometer: which, begin, end
+    t_fit: float = np.inf                # s: what comes after it was kept back from the fit
 
 
-def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
+def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf) -> Evidence:
     """
     Collect what the report draws of a leg.
 
@@ -65,6 +68,8 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
         calibrated.
     config : Config
         Settings in force.
+    t_fit : float
+        End of what was fitted, s.
 
     Returns
     -------
@@ -96,7 +101,18 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config) -> Evidence:
         residual_before=_split(before(t_fix) - fix_n, forward)[k],
         sections=sections(fix_distance, after(t_fix), fix_n, sigma),
         t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
-        fixes=len(t_fix), excluded=len(because))
+        fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
+        t_fit=t_fit)
+
+
+def _gaps(inputs, span, config):
+    """Return where Imu or odometer pause while the vehicle moves: (which, begin, end)."""
+    travel = inputs.travel
+    found = [('Imu', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
+    found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
+              if travel.at(a) != travel.at(b)]      # some counters are silent where they stand
+    return tuple((name, float(a), float(b)) for name, a, b in found
+                 if a < span[1] and b > span[0])
 
 
 def _pinned(path, pin):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
 
 Floats = NDArray[np.float64]
@@ -33,6 +34,7 @@ class Joint:
     spread : sigma by which legs differ, of each constant that does.   deviation : (J, m) of each
     leg from the others, in sigmas, before that.   factor : on all sigmas, in ``covariance``.
     bent : (J,) rad, error of taking the leg's equations to where the constants are.
+    carried : what all of them tell, for legs to come.
     """
 
     names: tuple[str, ...]
@@ -43,6 +45,7 @@ class Joint:
     chi2: float
     freedom: int
     deviation: Floats
+    carried: Border
     spread: dict[str, float] = field(default_factory=dict)
     factor: float = 1.0
     bent: Floats = field(default_factory=lambda: np.zeros(0))
@@ -81,7 +84,8 @@ def joint(borders, steps, drifting='scale_factor', angles=(), curved=()) -> Join
     x, C = legs.solve(spread)
     where = legs.place(len(borders) - 1)
     return Joint(legs.names, x[where], C[np.ix_(where, where)] * factor**2, legs.sigma, legs.used,
-                 chi2, freedom, deviation, spread, factor, bent)
+                 chi2, freedom, deviation, legs.carried(x[where], spread).widened(factor), spread,
+                 factor, bent)
 
 
 def deviate(chi2, freedom):

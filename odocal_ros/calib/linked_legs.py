@@ -70,6 +70,17 @@ class LinkedLegs:
             scale[self.place(j)] = self.unit
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
+    def carried(self, value, spread=None) -> Border:
+        """Return what all legs tell, of the last leg's constants, where those are ``value``."""
+        A, b = self.system(spread)
+        last = self.place(len(self.borders) - 1)
+        gone = np.setdiff1d(np.arange(A.shape[1]), last)
+        # orthogonal rows of which only the first hold what is eliminated
+        R = np.linalg.qr(np.column_stack([A[:, gone], A[:, last], b]), mode='r')[len(gone):]
+        rows = R[:, len(gone):-1] / self.unit
+        return Border(self.names, value, rows.T @ rows, rows.T @ (R[:, -1] - rows @ value),
+                      self.centre, self.sigma, self.used)
+
     def disagreement(self, spread=None):
         """
         Return by how much the least cost rises when legs are one vehicle's, and freedom.

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.border import Border
+from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
@@ -54,7 +55,7 @@ class MethodResult:
     parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
     sources: tuple[Source, ...] = ()
     details: dict = field(default_factory=dict)
-    border: Border | None = None        # of one leg, None where the method has none
+    border: Border | None = None        # of the leg, or of all; None: the method has none
 
     @property
     def verdict(self) -> Verdict:
@@ -129,6 +130,7 @@ class Calibration:
     legs: tuple[LegResult, ...]
     imu_rotation_xyzw: tuple[float, ...] | None = None  # base_link <- imu frame
     imu_rotation_rpy: tuple[float, ...] | None = None
+    carried: Carried | None = None      # what it leaves for legs to come
 
     @property
     def verdict(self) -> Verdict:

@@ -1,5 +1,7 @@
 """What a service answers, in one line."""
 
+from collections.abc import Sequence
+
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
@@ -10,7 +12,7 @@ from odocal_ros.reasons import Verdict
 MOST_REASONS = 3
 
 
-def outcome(calibration: Calibration, leg: LegResult | None = None, leg_id: int = 0,
+def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,
             good: str = '', advice: str = '') -> tuple[bool, str]:
     """
     Return the answer that carries a result: values, verdict, legs, what to do better.
@@ -19,8 +21,11 @@ def outcome(calibration: Calibration, leg: LegResult | None = None, leg_id: int 
     A rejected calibration is no success: a script must not take its values for good.
     """
     text = sentence(calibration)
-    if leg is not None and len(calibration.legs) > 1:
-        text = f'leg {leg_id}, {leg.distance:.0f} m, {leg.verdict.value}; all legs {text}'
+    if parts and len(calibration.legs) > 1:
+        verdict = Verdict.worst(one.verdict for one in parts)
+        cut = f' in {len(parts)} parts' if len(parts) > 1 else ''
+        text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
+                f'{verdict.value}; all legs {text}')
     parts = [text, good]
     for reason in _worth_telling(calibration)[:MOST_REASONS]:
         parts += [f'{reason.code.name}: {reason.text}', reason.remedy]

@@ -20,10 +20,16 @@ class Computing:
         self._worker, self._failed, self._done = worker, failed, done
         self._job: object | None = None
         self._waiting: list[Future] = []
+        self.at: tuple[float, str] = 0.0, ''      # share done, and what is being done
+
+    def tell(self, share: float, stage: str) -> None:
+        """Take over how far the job is; called by the worker's thread."""
+        self.at = share, stage
 
     def submit(self, job, take) -> None:
         """Run a job in the worker and hand its result to ``take``."""
         self._job = token = object()
+        self.at = 0.0, ''
 
         def then(result, error):
             if token is not self._job:

@@ -46,7 +46,9 @@ class Console:
         self._due_ns, self._pause_ns = 0, FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
-            self._log.info(f'ready ({rates}): stand still for 10 s, then call ~/start_leg')
+            what = ('legs begin and end by themselves' if now.config.leg.automatic else
+                    'stand still for 10 s, then call ~/start_leg')
+            self._log.info(f'ready ({rates}): {what}')
         elif self._silence:
             self._log.info('all inputs are there again')
         self._ready, self._silence = True, False

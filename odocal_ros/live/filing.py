@@ -9,8 +9,10 @@ from rclpy.task import Future
 from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
 from odocal_ros.live import answers, outputs
-from odocal_ros.live.shelf import Shelf
+from odocal_ros.live.shelf import LATEST, Shelf
 from odocal_ros.live.worker import Worker
+from odocal_ros.output.stored import Stored
+from odocal_ros.output.worse import stored_in
 
 
 class Filing:
@@ -98,3 +100,8 @@ class Filing:
             self._show()
 
         self._worker.submit(partial(self._shelf.withdraw, outputs.marks(left)), then)
+
+
+def latest_of(config: Config, node: str) -> Stored | None:
+    """Return the result that earlier runs of a node hold for the best, None without."""
+    return stored_in(outputs.output_root(config, node) / LATEST)

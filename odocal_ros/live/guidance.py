@@ -18,7 +18,9 @@ def hint(now: Situation) -> str:
     """Return what is missing, or what to do next."""
     session, state = now.session, now.session.state
     if state is State.COMPUTING:
-        return 'the answer of ~/stop_leg comes in a moment'
+        share, stage = now.computed
+        return (f'computing: {100 * share:.0f} %' + (f' ({stage})' if stage else '')
+                + ('' if session.by_itself else '; then ~/stop_leg answers'))
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')
@@ -32,7 +34,8 @@ def hint(now: Situation) -> str:
         actions, facts = _while_recording(now)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
-        return _before_start(now.still_s)
+        return ('drive off: a leg begins by itself' if now.config.leg.automatic
+                else _before_start(now.still_s))
     return after_result(now)
 
 
@@ -115,29 +118,38 @@ def _before_start(still_s: float) -> str:
 def _while_recording(now: Situation) -> tuple[list[str], list[str]]:
     """Return what to do, and what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
+    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
     slow = now.max_speed < now.session.config.leg.min_speed
     if metres > 0 or slow:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
-        return [', '.join(wants), f'then stand still {REST_S:.0f} s and call ~/stop_leg'], []
+        end = _end(now) if now.session.by_itself else (
+            f'then stand still {REST_S:.0f} s and call ~/stop_leg')
+        return [', '.join(wants), end], facts
     if now.outlook is None:
-        return [*wants, _end(now)], []
-    facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution
+        return [*wants, _end(now)], facts
     facts.append(now.outlook.words())
     if now.outlook_age_s > OLD_S:
         facts.append(f'as it was {now.outlook_age_s:.0f} s ago')
-    return wants + ([_end(now)] if now.outlook.complete else []), facts
+    ends = now.outlook.complete or now.session.by_itself
+    return wants + ([_end(now)] if ends else []), facts
 
 
 def _fault(now: Situation) -> str:
     """Return what the leg would be rejected for, and what to do."""
     worst = now.faults[0]
+    if now.session.by_itself:
+        return (f'the leg will not be used: {worst.code.name}: {worst.text}. '
+                f'{worst.remedy.rstrip(".")}; the next begins by itself')
     return (f'call ~/cancel_leg and start again: the leg would be rejected: {worst.code.name}: '
             f'{worst.text}. {worst.remedy.rstrip(".")}')
 
 
 def _end(now: Situation) -> str:
     """Return how to end the leg."""
+    if now.session.by_itself:
+        left = now.session.config.leg.automatic_minutes - now.duration_s / 60
+        return (f'the leg ends by itself, at a standstill or within {max(1, round(left))} min')
     if now.still_s < now.session.config.leg.standstill:
         return f'stand still {REST_S:.0f} s at the end point, then call ~/stop_leg'
     left = seconds_to_stand(now)
@@ -157,7 +169,9 @@ def after_result(now: Situation) -> str:
     if grave:
         return grave[0].remedy
     saved = config.output.autosave or now.saved
-    text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
+    text = 'drive on: legs begin and end by themselves'
+    if not config.leg.automatic:
+        text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
     notes = _notes(reasons, quantities_ok(now))
     return '; '.join([text, *notes])
 

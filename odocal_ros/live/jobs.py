@@ -1,26 +1,62 @@
 """The heavy work, as the worker thread runs it: pure of the node and its state."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 from std_msgs.msg import Header
 
+from odocal_ros.automatic import fold, refusal
+from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live.outputs import paths
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.parts import calibrate_parts
+from odocal_ros.pipeline import combine
+from odocal_ros.reasons import Reason
+
+MOST_KEPT = 30      # legs in memory and in the report; what those before tell is carried on
 
 
-def compute(recorder: LegRecorder, start_ns: int, stop_ns: int, kept: list[LegResult],
-            config: Config) -> tuple[LegResult, Calibration, tuple]:
+@dataclass(frozen=True, eq=False)
+class Computed:
+    """
+    What a leg gave.
+
+    results : one, or one of each part where the Imu had a gap.
+    refused : why a leg begun by itself does not count; there is no calibration then.
+    carried, folded : what earlier legs tell now, and how many of those kept are in it.
+    """
+
+    results: tuple[LegResult, ...]
+    paths: tuple
+    calibration: Calibration | None = None
+    refused: Reason | None = None
+    carried: Carried | None = None
+    folded: int = 0
+
+
+def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
+            kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
+            by_itself: bool = False, progress: Callable[[float, str], None] | None = None,
+            ) -> Computed:
     """Return a leg's result, its combination with the legs kept, and the paths to show."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    result = calibrate(leg, config)
-    calibration = combine([*kept, result], config)
-    return result, calibration, leg_paths(result, config)
+    results = tuple(calibrate_parts(leg, config, progress=progress))
+    paths = leg_paths(max(results, key=lambda one: one.distance), config)
+    if by_itself and (why := refusal(results[0])):
+        return Computed(results, paths, refused=why)
+    folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
+    carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
+    left = [one for leg in kept[folded:] for one in leg]
+    calibration = combine([*left, *results], config, carried)
+    return Computed(results, paths, calibration, None, carried, folded)
 
 
-def recombine(kept: list[LegResult], config: Config) -> tuple[Calibration, tuple]:
+def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
+              ) -> tuple[Calibration, tuple]:
     """Return the combination of the legs left, and the paths of the last."""
-    return combine(kept, config), leg_paths(kept[-1], config)
+    return combine(kept, config, carried), leg_paths(kept[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> tuple:

@@ -25,15 +25,17 @@ class ImuGaps:
         self._newest_ns = start_ns
         self._edges_ns: list[int] = []      # on both sides of a gap
 
-    def feed(self, block) -> None:
-        """Take Imu rows."""
+    def feed(self, block) -> int:
+        """Take Imu rows; return where they go on after a gap, 0 without one."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):
-            return
+            return 0
         known = np.append(self._newest_ns, np.sort(stamps))
-        for k in np.flatnonzero(np.diff(known) > self._limit_s * 1e9):
+        gaps = np.flatnonzero(np.diff(known) > self._limit_s * 1e9)
+        for k in gaps:
             self._edges_ns += known[k:k + 2].tolist()
         self._newest_ns = int(known[-1])
+        return self._edges_ns[-1] if len(gaps) else 0
 
     def reasons(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """Return IMU_GAP if there was one; ``silent_s``: since when only the others speak."""

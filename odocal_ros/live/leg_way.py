@@ -12,12 +12,12 @@ from rclpy.task import Future
 from odocal_ros.calib.result import Calibration
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
-from odocal_ros.live import answers, jobs
-from odocal_ros.live.ability import Ability
+from odocal_ros.live import answers, jobs, outputs
+from odocal_ros.live.ability import Ability, ability
 from odocal_ros.live.computing import Computing
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
-from odocal_ros.live.guidance import after_result, quantities_ok
+from odocal_ros.live.guidance import after_result, clocks_differ, hint, quantities_ok
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.journal_text import replay_command
 from odocal_ros.live.outlets import Outlets
@@ -50,15 +50,14 @@ class LegWay:
         self._log, self._clock = node.get_logger(), node.get_clock()
         self._worker = Worker()
         self._watch = Watch(self._worker, self._log)
-        recording.tap = self._watch.feed
+        self._node_name = node.get_fully_qualified_name()
         self._computing = Computing(self._worker, self._fail, self.show_status)
         self._ability: Ability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
         self._console = Console(self._log)
-        self._filing = Filing(self._worker, self._log, self.show_status,
-                              node.get_fully_qualified_name())
+        self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def tick(self) -> None:
@@ -117,6 +116,7 @@ class LegWay:
         outlook = self._watch.outlook
         return self._outlets.situation(
             self._recording, session=session, saved=self._filing.saved,
+            computed=self._computing.at,
             save_trouble=self._filing.trouble, distance_m=self._distance_m,
             config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, outlook=outlook,
@@ -147,10 +147,35 @@ class LegWay:
         if gone_s > session.config.leg.max_duration:
             self._log.warning(
                 f'leg {session.leg_id} is longer than leg.max_duration and is stopped')
-            self._end_leg()
+            self.end_leg_now()
 
-    def _end_leg(self) -> None:
-        mark_ns = self._mark_ns()
+    def _why_not(self) -> str:
+        """Return why no leg can be started, empty where one can."""
+        missing = self._recording.inputs.missing(self._config())
+        clocks = self._recording.progress.clocks.differing(self._config())
+        return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
+
+    def _begin_leg(self, mark_ns: int, by_itself: bool = False) -> str:
+        """Open a leg at a mark and return what there is to say."""
+        session = self.session
+        session.start(mark_ns, self._config(), by_itself)
+        self._journal.begin(session, self._recording.inputs.topics)
+        if not by_itself:
+            self._recording.progress.begin_leg()
+        self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
+        self._ability = ability(session.config, self._recording.heard_before(
+            session.config.leg.preroll))
+        self.show_status()
+        text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
+                f'{hint(self.situation())}. As configured, {self._ability.words()}')
+        self._log.info(text)
+        return text
+
+    def end_leg_now(self) -> None:
+        """End the leg at the newest Imu stamp."""
+        self._end_leg(self._mark_ns())
+
+    def _end_leg(self, mark_ns: int) -> None:
         self._distance_m = self._recording.progress.distance_m()
         self.session.stop(mark_ns)
         self._watch.end()
@@ -171,9 +196,10 @@ class LegWay:
 
     def _compute(self, samples: LegRecorder) -> None:
         session = self.session
-        kept = [leg.result for leg in session.legs]
-        self._computing.submit(partial(jobs.compute, samples, session.start_ns, session.stop_ns,
-                             kept, session.config), self._take_leg)
+        kept = [leg.results for leg in session.legs]
+        self._computing.submit(partial(
+            jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
+            session.carried, session.by_itself, self._computing.tell), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
         self.session.fail(trouble)
@@ -182,20 +208,28 @@ class LegWay:
                   'it') if self.session.open_leg else 'call ~/reset'
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
-    def _take_leg(self, outcome) -> None:
-        result, calibration, paths = outcome
-        self.session.finish(result, calibration)
-        self._snapshot, self._distance_m = None, result.distance
-        success, text = self._take_result(calibration, paths, result)
+    def _take_leg(self, done: jobs.Computed) -> None:
+        leg_id, self._snapshot = self.session.leg_id, None
+        self._distance_m = sum(one.distance for one in done.results)
+        if done.calibration is None:
+            self.session.leave_out(done.refused)
+            text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
+                    f'{done.refused.code.name}: {done.refused.text}')
+            self._log.info(text)
+            self._computing.answer(False, text)
+            return
+        self.session.finish(done.results, done.calibration)
+        self.session.carry_on(done.carried, done.folded)
+        success, text = self._take_result(done.calibration, done.paths, done.results)
         if success and self._config().output.autosave:
-            self._save(calibration)
+            self._save(done.calibration)
 
-    def _take_result(self, calibration, paths, leg=None) -> tuple[bool, str]:
+    def _take_result(self, calibration, paths, parts=()) -> tuple[bool, str]:
         """Publish a result and answer those who wait for it."""
         self._outlets.set_results(calibration)
         self._outlets.show_paths(paths)
         now = self.situation()
-        success, text = answers.outcome(calibration, leg, self.session.leg_id,
+        success, text = answers.outcome(calibration, parts, self.session.leg_id,
                                         words(quantities_ok(now)), after_result(now))
         self._log.info(text)
         self._computing.answer(success, text)

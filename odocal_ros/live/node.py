@@ -134,8 +134,9 @@ class Calibrator(Node):
             self.operation.tick()
             if self._due('look', LOOK_S):
                 self.recording.look_around(self.config)
-                if not self.operation.session.open_leg:
-                    self.recording.forget(self.config.leg.preroll)
+                session = self.operation.session
+                self.recording.forget(self.config.leg.preroll,
+                                      session.start_ns if session.open_leg else 0)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
                 self.outlets.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):

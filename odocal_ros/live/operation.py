@@ -5,14 +5,13 @@ from functools import partial
 from rclpy.task import Future
 
 from odocal_ros.live import answers, jobs, outputs
-from odocal_ros.live.ability import ability
-from odocal_ros.live.guidance import after_result, clocks_differ, hint, quantities_ok
-from odocal_ros.live.leg_way import LegWay
+from odocal_ros.live.automatic_way import AutomaticWay
+from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.quantities import words
 from odocal_ros.live.session import Refused, State
 
 
-class Operation(LegWay):
+class Operation(AutomaticWay):
     """
     The commands of the node's services.
 
@@ -22,32 +21,20 @@ class Operation(LegWay):
     def start_leg(self) -> tuple[bool, str]:
         """Open a leg at the newest Imu stamp."""
         session, mark_ns = self.session, self._mark_ns()
-        if session.state is State.RECORDING:
+        if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {outputs.iso(session.start_ns)}, leg '
                           f'{session.leg_id}; {hint(self.situation())}')
-        missing = self._recording.inputs.missing(self._config())
-        if missing:
-            raise Refused('no leg can be started: ' + '; '.join(missing))
-        clocks = self._recording.progress.clocks.differing(self._config())
-        if clocks:
-            raise Refused('no leg can be started: ' + clocks_differ(clocks))
-        session.start(mark_ns, self._config())
-        self._journal.begin(session, self._recording.inputs.topics)
-        self._recording.progress.begin_leg()
-        self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
-        self._ability = ability(session.config, self._recording.heard_before(
-            session.config.leg.preroll))
-        self.show_status()
-        text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
-                f'{hint(self.situation())}. As configured, {self._ability.words()}')
-        self._log.info(text)
-        return True, text
+        if why := self._why_not():
+            raise Refused(f'no leg can be started: {why}')
+        if session.state is State.RECORDING:      # one that nobody asked for
+            self._drop_leg(f'leg {session.leg_id} makes room for one of the operator')
+        return True, self._begin_leg(mark_ns)
 
     def stop_leg(self) -> tuple[bool, str] | Future:
         """End the leg; the answer carries the result."""
         session = self.session
         if session.state is State.RECORDING:
-            self._end_leg()
+            self.end_leg_now()
         elif session.open_leg and session.state is State.FAILED and self._snapshot is not None:
             session.retry(self._config())
             self._compute(self._snapshot)
@@ -79,7 +66,7 @@ class Operation(LegWay):
 
     def undo_leg(self) -> tuple[bool, str] | Future:
         """Drop the last kept leg and combine the others anew."""
-        left = [leg.result for leg in self.session.begin_undo()]
+        left = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
         self._filing.withdraw(left)
@@ -94,7 +81,8 @@ class Operation(LegWay):
             self.session.finish_undo(outcome[0])
             self._take_result(*outcome)
 
-        self._computing.submit(partial(jobs.recombine, left, self._config()), take)
+        self._computing.submit(
+            partial(jobs.recombine, left, self._config(), self.session.carried), take)
         return self._computing.promise()
 
     def reset(self) -> tuple[bool, str]:

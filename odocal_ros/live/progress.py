@@ -13,9 +13,9 @@ from odocal_ros.config import Config
 from odocal_ros.force import felt
 from odocal_ros.live.ability import Heard, stated_variance
 from odocal_ros.nav.earth import radii
+from odocal_ros.odometer_steps import Steps
 from odocal_ros.samples import OdometerForm
 
-STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
 FASTEST = 100.0        # m/s: what goes faster is a counter reset
 SPEED_NS = 1_000_000_000   # speeds are taken over that long, or longer
 STANDS_S = 0.5         # without a count: the vehicle stands
@@ -48,7 +48,7 @@ class Travel:
         self.total = 0.0
         self.moved_ns = 0        # stamp of the last motion
         self.newest_ns = 0
-        self._last: tuple | None = None
+        self._rows = Steps(form)
         self._anchor = 0.0
         self._rest = 0.0, 0      # length, s, and end of the last standstill
         self.top = 0.0           # highest speed, units/s
@@ -56,14 +56,14 @@ class Travel:
 
     def feed(self, block, scale: float) -> None:
         """Take a block; scale: m per unit, 0 unknown."""
-        steps, stamps, seconds = self._steps(block)
+        steps, stamps, seconds = self._rows.of(block)
         if not len(steps):
             return
         if scale > 0:
             steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
         path = self.total + np.cumsum(np.abs(steps))
         for total, stamp in zip(path, stamps, strict=True):
-            if total - self._anchor > STILL.get(self.form.scale_unit, 0.02):
+            if total - self._anchor > self._rows.still:
                 rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
                 if rest_ns > REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
@@ -75,25 +75,6 @@ class Travel:
             if since_ns:
                 self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
             self._since = self.total, self.newest_ns
-
-    def _steps(self, block):
-        """Return the travel of each row since the row before, its stamp and its duration, s."""
-        stamps, values = block.stamp_ns, block.value
-        if self._last is not None:
-            stamps = np.r_[self._last[0], stamps]
-            values = np.r_[self._last[1], values]
-        self._last = (block.stamp_ns[-1:], block.value[-1:])
-        seconds = np.diff(stamps) * 1e-9
-        if self.form.quantity == 'increment':
-            steps = values[1:]
-        elif self.form.quantity == 'rate':
-            steps = values[1:] * seconds
-        else:
-            steps = np.diff(values)
-            if 0 < self.form.modulus < 2**63:
-                half = self.form.modulus // 2
-                steps = (steps + half) % self.form.modulus - half
-        return np.asarray(steps, dtype=np.float64), stamps[1:], seconds
 
     def still_s(self) -> float:
         """Return how long the vehicle has stood."""

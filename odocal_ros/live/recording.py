@@ -64,14 +64,15 @@ class Recording:
         self.inputs.set_sim_time(
             self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
-    def forget(self, preroll_s: float) -> None:
-        """Bound the memory of what came before the pre-roll."""
+    def forget(self, preroll_s: float, start_ns: int) -> None:
+        """Bound the memory of what came before the pre-roll, of a leg that began then."""
         # by each topic's own stamps: one on a foreign clock must not grow without bound
         for source in self.inputs.by_slot.values():
             slots = (source.slot, 'odometer_right') if self._both(source) else (source.slot,)
             if source.health.newest_ns:
+                since_ns = min(source.health.newest_ns, start_ns or source.health.newest_ns)
                 self.recorder.forget_before(
-                    source.health.newest_ns - round((preroll_s + MARGIN_S) * 1e9), slots)
+                    since_ns - round((preroll_s + MARGIN_S) * 1e9), slots)
 
     def _both(self, source: Input) -> bool:
         """Return whether a topic's messages hold both wheels."""

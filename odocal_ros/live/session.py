@@ -7,11 +7,12 @@ A state machine without ROS, clock or thread; a wrong call raises ``Refused`` wi
 from dataclasses import dataclass
 from enum import Enum
 
+from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
-from odocal_ros.reasons import Verdict
+from odocal_ros.reasons import Reason, Verdict
 
 
 class Refused(OdocalError):
@@ -31,12 +32,12 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeptLeg:
-    """A leg that counts."""
+    """A leg that counts; of parts where the Imu had a gap."""
 
     leg_id: int
     start_ns: int
     stop_ns: int
-    result: LegResult
+    results: tuple[LegResult, ...]
 
 
 class Session:
@@ -58,6 +59,9 @@ class Session:
         self.restored: Restored | None = None   # from start-up, in force while no leg is kept
         self.trouble = ''
         self.lost = ''      # why the leg last touched was dropped by nobody's wish
+        self.by_itself = False      # the leg last started: by leg.automatic
+        self.unused: Reason | None = None      # why the last such leg does not count
+        self.carried: Carried | None = None    # of legs that are not kept, or before this session
         self._last_id = 0
 
     @property
@@ -71,7 +75,7 @@ class Session:
         closed = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
         return self.state is State.RECORDING or closed
 
-    def start(self, mark_ns: int, config: Config) -> None:
+    def start(self, mark_ns: int, config: Config, by_itself: bool = False) -> None:
         """Open a leg at a mark, under the configuration in force."""
         if self.state is State.COMPUTING:
             raise Refused(f'leg {self.leg_id} is being computed: call again when ~/stop_leg has '
@@ -81,7 +85,7 @@ class Session:
                           'again, or drop it with ~/cancel_leg')
         self._last_id += 1
         self.leg_id, self.start_ns, self.stop_ns = self._last_id, mark_ns, 0
-        self.config = config
+        self.config, self.by_itself = config, by_itself
         self.state, self.event, self.trouble = State.RECORDING, 'started', ''
         self.lost = ''
 
@@ -97,10 +101,20 @@ class Session:
         self.config = config
         self.state, self.trouble = State.COMPUTING, ''
 
-    def finish(self, result: LegResult, calibration: Calibration) -> None:
+    def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg."""
-        self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, result))
+        self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
+        self.unused = None
         self._settle(calibration)
+
+    def leave_out(self, why: Reason) -> None:
+        """Drop the computed leg, which nobody asked for and which is no good."""
+        self.event, self.unused = 'cancelled', why
+        self._settle(self.calibration)
+
+    def carry_on(self, carried: Carried, legs: int) -> None:
+        """Let go of the first kept legs: what they tell is carried on."""
+        self.carried, self.legs = carried, self.legs[legs:]
 
     def fail(self, trouble: str) -> None:
         """Note that the computation failed; the leg stays open."""
@@ -139,6 +153,7 @@ class Session:
         dropped, self.legs = self.legs, []
         self.calibration, self.state, self.trouble = None, State.IDLE, ''
         self.restored, self.lost = None, ''
+        self.carried = self.unused = None
         return dropped
 
     def dropped(self, leg: KeptLeg) -> None:

@@ -31,6 +31,7 @@ class Situation:
     outlook: Outlook | None = None               # of the leg that is recorded
     faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
     outlook_age_s: float = nan                   # since the way it is of
+    computed: tuple[float, str] = (0.0, '')      # share of a leg's result, and what is at work
     saved: str = ''
     lost: str = ''                               # a leg that nobody wanted dropped
     save_trouble: str = ''                       # why the newest result is in no folder

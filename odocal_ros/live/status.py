@@ -16,15 +16,16 @@ from odocal_ros.live.health import Health
 from odocal_ros.live.outlook import as_keys
 from odocal_ros.live.session import State
 from odocal_ros.live.situation import Situation
-from odocal_ros.reasons import Verdict
+from odocal_ros.reasons import Code, Verdict
 
+SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
 NAME = 'calibrator: calibration'  # replay finds marks by this name
 # key: result.* parameter
 # decimals that mean something
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
-    'metres_to_go_yaw'), 1) | {
+    'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
         'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4}
 VALUES = {
@@ -66,6 +67,9 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'cannot_tell': '; '.join(now.ability.cannot) if now.ability else '',
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'save_trouble': now.save_trouble, 'lost': now.lost,
+        'automatic': _automatic(now), 'unused': _unused(session),
+        'computing_percent': 100 * now.computed[0] if session.state is State.COMPUTING else 0.0,
+        'carried_legs': session.carried.legs if session.carried else 0,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
     } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
     return DiagnosticStatus(
@@ -95,7 +99,8 @@ def level(now: Situation) -> bytes:
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
     doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
                                 or now.save_trouble or now.lost or now.faults
-                                or now.doubled)
+                                or now.doubled or _changes(now.session)
+                                or now.session.unused and now.session.unused.code not in SHORT)
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
@@ -103,6 +108,8 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
     """Return one sentence: what is, how good it is, and what to do next."""
     session = now.session
     legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
+    if session.carried:
+        legs += f' and {session.carried.legs} before'
     seen = {
         'waiting': 'Waiting',
         'idle': 'Ready',
@@ -119,7 +126,29 @@ def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
         ('the journal cannot be written', now.journal_trouble)) if trouble]
-    return '; '.join(filter(None, (seen, good, now.lost, text, *now.doubled, *troubles)))
+    return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
+                                   _unused(session), *now.doubled, *troubles)))
+
+
+def _changes(session) -> list[str]:
+    """Return what is to be said of a scale that changed between legs."""
+    reasons = session.calibration.reasons if session.calibration else ()
+    return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
+
+
+def _unused(session) -> str:
+    """Return why the last leg that began by itself does not count."""
+    why = session.unused
+    return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
+
+
+def _automatic(now: Situation) -> str:
+    """Return what leg.automatic is at, empty where it is off."""
+    if not now.config.leg.automatic:
+        return ''
+    if now.session.state is not State.RECORDING:
+        return 'waiting'
+    return 'leg' if now.session.by_itself else 'leg of the operator'
 
 
 def _reason_codes(now: Situation) -> str:

@@ -13,8 +13,8 @@ from odocal_ros.live.outlook import Outlook
 from odocal_ros.live.sketch import Sketch
 from odocal_ros.live.smoother_so_far import SmootherSoFar
 from odocal_ros.live.worker import Worker
-from odocal_ros.reasons import Reason, Verdict
-from odocal_ros.samples import join
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.samples import join, take
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
 SHARE = 1 / 20             # of one core is what looking may cost in the long run
@@ -45,29 +45,43 @@ class Watch:
         self._pause_until = 0.0
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
-        """Watch a leg that starts at a mark; ``recorder`` holds what came before."""
+        """Watch a leg that starts at a mark; ``recorder`` holds what came so far."""
         self.end()
-        self._over, self._start_ns, self._config = threading.Event(), start_ns, config
-        self._sketch, self._before = Sketch(recorder.form), recorder
-        self._smoother = SmootherSoFar()
+        self._config, self._before = config, recorder
+        self._look_from(start_ns, recorder.form)
         self._gaps = ImuGaps(start_ns, config.leg.max_gap)
-        self._due_ns = start_ns + EVERY_NS
+        self._gaps.feed(recorder.rows('imu'))      # a mark may lie back, as leg.automatic sets it
 
     def end(self) -> None:
         """Let go of the leg."""
+        self._forget()
+        self._sketch = self._gaps = None
+
+    def _forget(self) -> None:
+        """Let a look that is under way give up, and forget what was seen."""
         self._over.set()
-        self.outlook = self._sketch = self._before = self._gaps = None
+        self.outlook = self._before = None
         self._faults = ()
         self._fresh = []
         self._looking = self._warm = False
         self._pause_until = 0.0
 
+    def _look_from(self, start_ns: int, form) -> None:
+        """Look at what comes after a stamp."""
+        self._over, self._start_ns = threading.Event(), start_ns
+        self._sketch, self._smoother = Sketch(form), SmootherSoFar()
+        self._due_ns = start_ns + EVERY_NS
+
     def feed(self, slot: str, block) -> None:
         """Remember a block as it went into the recorder."""
-        if self._sketch is not None:
-            self._fresh.append((slot, block))
-            if slot == 'imu' and self._gaps is not None:
-                self._gaps.feed(block)
+        if self._sketch is None:
+            return
+        if slot == 'imu' and self._gaps is not None and (again_ns := self._gaps.feed(block)):
+            # the leg is cut there: what is foreseen is of the part since then
+            self._forget()
+            self._look_from(again_ns, self._sketch.form)
+            block = take(block, block.stamp_ns >= again_ns)
+        self._fresh.append((slot, block))
 
     def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """
@@ -77,7 +91,9 @@ class Watch:
         """
         if self._gaps is None:
             return ()
-        seen = (*self._gaps.reasons(silent_s), *self._faults,
+        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there, figures are of the part '
+                      'since') for r in self._gaps.reasons(silent_s)]
+        seen = (*cut, *self._faults,
                 *(self.outlook.faults if self.outlook else ()))
         first = {r.code: r for r in reversed(seen)}
         order = list(Verdict)

@@ -4,14 +4,12 @@ import json
 from pathlib import Path
 import sys
 
+from odocal_ros.calib.causes import ANOTHER, change_in_words, OTHER, TYRES
 from odocal_ros.offline.say import say
 
 HELP = 'change between calibrations against their sigmas'
-ANOTHER = 0.1    # relative change of a scale beyond what tyres do
-FINE = 1e-3      # relative change below which a scale's is said in ppm
 CAUSES = {
-    'scale': 'tyre pressure, wear, load or another tyre; calibrate again to be sure, then use the '
-             'newer value',
+    'scale': f'{TYRES}; calibrate again to be sure, then use the newer value',
     'track': 'another rim or tyre; calibrate again to be sure',
     'yaw': 'the IMU was moved, or the heading comes from another source; calibrate again to be '
            'sure',
@@ -78,8 +76,7 @@ def _cause(change, difference, stored):
     cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
     if 'scale' in words and abs(
             difference.change) > ANOTHER * stored[difference.since].value(change.parameter):
-        cause = ('another vehicle, gear, counter or unit: no tyre changes so much; compare '
-                 'calibrations of one odometer')
+        cause = f'{OTHER}; compare calibrations of one odometer'
     return (f'{_label(change.parameter)} changed by {_amount(change, difference, stored)} '
             f'({abs(difference.sigmas):.1f} sigma) since {stored[difference.since].name}: {cause}')
 
@@ -92,8 +89,7 @@ def _amount(change, difference, stored):
     """Return a change as people read it: scales in per cent or ppm, angles in deg."""
     old = stored[difference.since].estimates[change.parameter].value
     if change.parameter.startswith('scale_'):
-        change = difference.change / old
-        return f'{1e6 * change:+.0f} ppm' if abs(change) < FINE else f'{100 * change:+.3g} %'
+        return change_in_words(difference.change / old)
     if change.unit == 'rad':
         return f'{57.29577951308232 * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'

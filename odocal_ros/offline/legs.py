@@ -6,6 +6,7 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
+from odocal_ros.automatic import LegSearch
 from odocal_ros.bagio.limits import LATEST_NS
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
@@ -149,7 +150,8 @@ def find_legs(recorder, bag, asked, marks, config) -> list[tuple[int, int]]:
     bag : Bag
         For its time span.
     asked : list of LegSpan or 'each-stop'
-        Empty: marks if there are any, else one leg from standstill to standstill.
+        Empty: marks if there are any, else legs by themselves with leg.automatic, else one from
+        standstill to standstill.
     marks : list of (start, stop)
         As the node marked them.
     config : Config
@@ -169,6 +171,8 @@ def find_legs(recorder, bag, asked, marks, config) -> list[tuple[int, int]]:
         return legs
     if marks:
         return _marked(marks, last, bag)
+    if config.leg.automatic:
+        return by_themselves(recorder, last, config) or [(first, last)]
     return [_by_standstill(recorder, first, last, config)]
 
 
@@ -226,6 +230,15 @@ def _stops(recorder, first, last, config):
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, way) if len(spans) else np.empty((0, 2))
     return first + np.round(spans * 1e9).astype(np.int64), (metres, float(way[-1]))
+
+
+def by_themselves(recorder, last, config) -> list[tuple[int, int]]:
+    """Return the legs that the node would have begun and ended by itself."""
+    search = LegSearch(config)
+    for slot in ('fix', 'imu', 'odometer'):
+        search.feed(slot, recorder.rows(slot), recorder.form)
+    return [(leg.start_ns, leg.stop_ns or last) for leg in search.spans
+            if (leg.stop_ns or last) > leg.start_ns]
 
 
 def _by_standstill(recorder, first, last, config):

@@ -187,6 +187,8 @@ def _legs_of(path, args, asked, config, journal, unit):
             if isinstance(note, str):
                 _tell(args, note)
         results = _calibrated(recorder, spans, config, notes, name, args)
+        if config.leg.automatic and not (marks or asked):
+            results = _worth_keeping(results, args)
         with Phase(f'checksum of {name}', quiet):
             described = {'bag': name, 'sha256': digest.result(), 'topics': topics}
         frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
@@ -197,16 +199,32 @@ def _calibrated(recorder, spans, config, notes, name, args):
     from dataclasses import replace
 
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.pipeline import calibrate
+    from odocal_ros.parts import calibrate_parts
     results = []
     with Phase('calibrating', args.quiet or args.json) as phase:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
-            if len(spans) > 1:
-                phase((number - 1) / len(spans), f'calibrating leg {number} of {len(spans)}')
+            which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            results.append(replace(calibrate(leg, config, notes=notes[number - 1],
-                                             holdout=args.holdout), bag=name))
+            parts = calibrate_parts(
+                leg, config, notes=notes[number - 1], holdout=args.holdout,
+                progress=lambda share, stage, done=number - 1, which=which: phase(
+                    (done + share) / len(spans), which + stage))
+            results += [replace(one, bag=name) for one in parts]
     return results
+
+
+def _worth_keeping(results, args):
+    """Return legs found by themselves but for those that are no good, as the node has it."""
+    from odocal_ros.automatic import refusal
+    why = [refusal(leg) for leg in results]
+    if all(why):
+        return results
+    for leg, reason in zip(results, why, strict=True):
+        if reason:
+            start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
+            _tell(args, f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
+                  f'{reason.code.name}: {reason.text}')
+    return [leg for leg, reason in zip(results, why, strict=True) if not reason]
 
 
 def _styled(stream) -> bool:

@@ -54,6 +54,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
                               'rpy': calibration.imu_rotation_rpy}
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
+    carried = calibration.carried if config.leg.automatic else None
     return _plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
@@ -65,7 +66,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
         'check': {name: _check(check) for name, check in checks.items()} | {
             'per_distance': _per_distance(calibration.legs)},
         'inputs': inputs,
-        'config': flat(config)})
+        'config': flat(config)} | ({'carried': carried.as_dict()} if carried else {}))
 
 
 def _method(method: MethodResult) -> dict:

@@ -20,6 +20,7 @@ from odocal_ros.output.plots_svg import (
     thinned,
 )
 
+PAUSE = {'no fix used': PINK, 'no Imu': RED, 'no odometer': GREEN}
 GAP = 5.0       # median intervals between fixes: more is marked
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
           1: ('satellite based aid, SBAS (1)', 's', GREEN),
@@ -94,16 +95,25 @@ def _track(found, name, before_word, slips):
 
 
 def _marks(ax, found, at, slips):
-    """Mark on the track what is odd: fixes not used, times without any, slips."""
+    """Mark on the track what is odd: fixes not used, gaps, slips, and where the fit ends."""
     few = found.t_excluded[evenly(len(found.t_excluded))]
     if len(few):
         ax.plot(*at(few), 'x', color=RED, markersize=5, zorder=4, label='fix not used')
     step = np.diff(found.t_fix)
-    for i, k in enumerate(np.flatnonzero(step > max(GAP * np.median(step), 1.0)) if len(step)
-                          else ()):
-        t = np.linspace(found.t_fix[k], found.t_fix[k + 1], 50)
-        ax.plot(*at(t), '-', color=PINK, linewidth=4, alpha=0.6, zorder=1,
-                label='no fix used' if i == 0 else None)
+    gaps = [('no fix used', found.t_fix[k], found.t_fix[k + 1]) for k in np.flatnonzero(
+        step > max(GAP * np.median(step), 1.0))] if len(step) else []
+    gaps += [(f'no {name}', begin, end) for name, begin, end in found.gaps]
+    said = set()
+    for label, begin, end in gaps:
+        ends = np.clip((begin, end), found.t[0], found.t[-1])
+        ax.plot(*at(np.linspace(*ends, 50)), '-', color=PAUSE[label], linewidth=4, alpha=0.6,
+                zorder=1, solid_capstyle='butt', label=None if label in said else label)
+        if label != 'no fix used':       # some are short: the cut is seen by its ends
+            ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
+        said.add(label)
+    if found.t_fit < found.t[-1]:
+        ax.plot(*at(np.array([found.t_fit])), 'D', color='black', markersize=6,
+                markerfacecolor=PINK, zorder=5, label='fitted to here')
     if len(slips):
         ax.plot(*at(np.array([s['t'] + s['duration'] / 2 for s in slips])), '^', color='black',
                 markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')

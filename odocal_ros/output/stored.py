@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+from odocal_ros.calib.carried import Carried, carried_from
 from odocal_ros.calib.result import BESIDE, Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, SCHEMA
@@ -31,6 +32,8 @@ class Stored:
     bags: frozenset[str]
     config: dict
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
+    vehicle: str = ''
+    carried: Carried | None = None      # what it leaves for legs to come, with leg.automatic
 
     @property
     def usable(self) -> bool:
@@ -97,7 +100,9 @@ def _stored(content, name) -> Stored:
         frozenset(i['sha256'] for i in inputs if isinstance(i.get('sha256'), str)),
         _part(content, 'config', dict),
         {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
-         if key not in BESIDE})
+         if key not in BESIDE},
+        str(content.get('vehicle') or ''),
+        carried_from(content['carried']) if isinstance(content.get('carried'), dict) else None)
 
 
 def _part(content, key, kind):

@@ -19,8 +19,8 @@ def is_worse(old: Stored, new: Stored) -> str:
 
     The old one is good unless rejected. The new one is worse when it is rejected, when it lacks a
     value that the old one has, or gives it with a sigma more than twice as large. One that holds
-    all legs of the old one and more knows better in any case: legs that disagree widen a sigma,
-    and the narrow one was wrong.
+    all legs of the old one and more, or carries them on, knows better in any case: legs that
+    disagree widen a sigma, and the narrow one was wrong.
     """
     if not old.usable:
         return ''
@@ -29,7 +29,8 @@ def is_worse(old: Stored, new: Stored) -> str:
                      and Code[name].gravity is Verdict.REJECTED]
         codes = ', '.join(dict.fromkeys(rejecting[:3] or new.reasons[:3]))
         return f'the new one is rejected ({codes}), the old one is {old.verdict.value}'
-    if old.legs and old.legs < new.legs:
+    if old.legs and old.legs < new.legs \
+            or old.carried and new.carried and new.carried.goes_on_from(old.carried):
         return ''
     for name in JUDGED:
         why = _worse(name.replace('_', ' '), old.estimates.get(name), new.estimates.get(name))

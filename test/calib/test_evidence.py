@@ -1,5 +1,6 @@
 """What a report draws of a leg: residuals by direction, scale by section, fixes left out."""
 
+from dataclasses import replace
 import warnings
 
 import numpy as np
@@ -25,7 +26,7 @@ def path_n(t):
     return np.stack([np.minimum(s, 500.0), np.maximum(s - 500.0, 0.0), 0.0 * t], -1)
 
 
-def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None):
+def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None, **streams):
     """Return evidence of that drive; fixes lie by ``off`` to the east and north of the path."""
     config = config or Config()
     t = np.arange(0.0, END, 0.02)
@@ -44,6 +45,7 @@ def drive(off=(0.0, 0.0), bad=(), sigma=0.5, config=None):
                      np.full(n, 2), status)
     leg = Leg(START_NS, START_NS + round(END * 1e9), fix=fix)
     inputs, _ = screen(leg, config)
+    inputs = replace(inputs, **streams)
     fixes_n = path_n(inputs.t_fix) + [*off, 0.0]
     kept = np.ones(len(inputs.t_fix), bool)
     kept[[row for row, what in bad if what == 'far']] = False
@@ -152,3 +154,14 @@ def test_a_negative_variance_is_a_row_like_others_without_a_warning():
         warnings.simplefilter('error')
         found = drive(bad=[(7, 'negative')])
     assert found.fixes == drive().fixes
+
+
+def test_pauses_of_imu_and_odometer_are_kept_where_the_vehicle_moves():
+    t = np.arange(0.0, END, 0.02)
+    imu = t[(t <= 30.0) | (t >= 32.0)]
+    rows = t[((t < 3.0) | (t >= 8.0)) & ((t <= 70.0) | (t >= 71.0))]     # stands until t = 10
+    found = drive(t_imu=imu, travel=Travel(rows, 10.0 * np.clip(rows - 10.0, 0.0, None), 0.0))
+    assert [name for name, _, _ in found.gaps] == ['Imu', 'odometer']
+    np.testing.assert_allclose([gap[1:] for gap in found.gaps], [(30.0, 32.0), (70.0, 71.0)],
+                               atol=0.021)
+    assert drive(t_imu=t, travel=Travel(t, t, 0.0)).gaps == ()

@@ -227,7 +227,7 @@ def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
 # answers
 
 def test_an_answer_has_values_quantities_reasons_and_what_to_do_next():
-    success, text = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), None, 0,
+    success, text = answers.outcome(result(None, Code.YAW_FAR_FROM_NOMINAL), (), 0,
                                     'OK: scale; not OK: yaw', 'drive another leg')
     assert success
     assert text == (

@@ -116,3 +116,27 @@ def test_no_start_and_no_cancel_while_an_undo_is_computed():
         session.start(90, CONFIG)
     with pytest.raises(Refused, match='no leg is running'):
         session.cancel()
+
+
+def test_a_leg_that_nobody_asked_for_leaves_no_trace_when_it_is_no_good():
+    session = with_legs(1)
+    before = session.calibration
+    session.start(50, CONFIG, by_itself=True)
+    session.stop(60)
+    session.leave_out(Reason(Code.LEG_TOO_SHORT, '30 m'))
+    assert (session.state, session.event, session.open_leg) == (
+        State.CALIBRATED, 'cancelled', False)
+    assert session.calibration is before
+    assert session.unused.text == '30 m'
+    session.start(70, CONFIG, by_itself=True)
+    session.stop(80)
+    session.finish(result(), calibration())
+    assert session.unused is None
+
+
+def test_what_is_carried_on_goes_with_a_reset():
+    session = with_legs(3)
+    session.carry_on('two legs', 2)
+    assert [leg.leg_id for leg in session.legs] == [3]
+    session.begin_reset()
+    assert session.carried is None

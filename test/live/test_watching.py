@@ -61,3 +61,5 @@ def test_the_bars_are_shares_of_what_is_asked():
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
         'way': 0.75, 'standing': 0.6, 'scale': 0.25, 'yaw': 0.0}
+    assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {
+        'computing': (0.4, '40 %')}

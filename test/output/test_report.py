@@ -18,11 +18,14 @@ from odocal_ros.calib.sections import Sections
 from odocal_ros.config import Config, with_settings
 from odocal_ros.output import report
 from odocal_ros.output.files import as_json, write_results
+from odocal_ros.output.plots import leg_figures
+from odocal_ros.output.plots_svg import look
 from odocal_ros.output.report import report_html, report_or_why
 
 CREATED, MADE = '2026-01-02T03:04:05+00:00', '2026-01-02 03:04:05 UTC'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
+ALL_ODD = ('fix not used', 'no Imu', 'no odometer', 'fitted to here', 'slip')
 FIGURES = ('Track', 'Residuals', 'Scale by section', 'Speed and turn rate', 'Fix quality')
 
 
@@ -209,6 +212,23 @@ def test_names_from_outside_are_text_not_markup(good):
     assert parsed.tags['script'] == 0
     assert unescape('&lt;script&gt;alert("x")') in text
     assert 'imu.grade tactical consumer' in text
+
+
+def test_what_is_odd_is_marked_on_the_track(good):
+    def words(found):
+        smoothed = {'slips': [{'t': 50.0, 'duration': 1.0}]}
+        with look():
+            return unescape(leg_figures(found, 'one', smoothed=smoothed)[0][2])
+    plain = evidence()
+    odd = replace(plain, gaps=(('Imu', 100.0, 103.0), ('odometer', 200.0, 201.0),
+                               ('odometer', 300.0, 300.5)), t_fit=480.0)
+    assert {text: words(odd).count(f'>{text}<') for text in ALL_ODD} == dict.fromkeys(ALL_ODD, 1)
+    assert [text for text in ALL_ODD if f'>{text}<' in words(plain)] == ['fix not used', 'slip']
+    hole = (plain.t_fix < 100.0) | (plain.t_fix > 130.0)
+    lost = replace(plain, **{name: getattr(plain, name)[hole] for name in (
+        't_fix', 'fix_n', 'fix_distance', 'fix_sigma', 'fix_status', 'residual',
+        'residual_before')})
+    assert '>no fix used<' in words(lost)
 
 
 def test_many_legs_stay_within_the_size(good, monkeypatch):

@@ -3,9 +3,11 @@
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.causes import cause_of_change, change_in_words
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.calib.scale_steps import FREE, scale_steps
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
 from odocal_ros.calib.smoother.priors import SHARED
 from odocal_ros.calib.smoother.remarks import beside, FLOOR
@@ -32,21 +34,26 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     config : Config
         Limits, ``verdict.scale_drift_per_day``.
     numbers : sequence of int, optional
-        What the legs are called; 1, 2, ....
+        What the legs are called; 1, 2, ...; 0: legs of an earlier result, carried on.
 
     Returns
     -------
     MethodResult: what one fit of all legs would say, the scale as the last leg has it. A value
     that no leg tells may come of all; one that the legs dispute has their scatter in its sigma
-    (LEGS_DISAGREE).
+    (LEGS_DISAGREE). With ``leg.automatic`` a scale may change between two legs for good
+    (SCALE_CHANGED).
 
     """
     order = np.argsort(times_ns, kind='stable')
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
     days = np.diff(np.asarray(times_ns)[order]) / DAY
-    found = joint([leg.border for leg in legs], config.verdict.scale_drift_per_day * np.sqrt(days),
-                  CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
+    borders = [leg.border for leg in legs]
+    steps = config.verdict.scale_drift_per_day * np.sqrt(days)
+    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P]) \
+        if config.leg.automatic else []
+    steps[[change.leg - 1 for change in changes]] = FREE
+    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
     sigma = np.sqrt(np.diag(C))
@@ -61,9 +68,24 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
         why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
                           f'{in_words(unsaid)}; what the settings say of it is kept'))
     sources = _sources(found.used[at] * found.factor, C)
-    return MethodResult('smoother', (*_disputed(found, names), *why), estimates, PARAMETERS,
+    said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
+    return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
-                        | {'beside': beside(found.value[at], C, grade_of(config.imu))})
+                        | {'beside': beside(found.value[at], C, grade_of(config.imu))},
+                        found.carried)
+
+
+def _changed(change, times_ns, numbers) -> Reason:
+    """Say by how much the scale changed between two legs, since when, and why that may be."""
+    relative = float(np.expm1(change.change))
+    since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
+    return Reason(Code.SCALE_CHANGED, f'the scale changed by {change_in_words(relative)} '
+                  f'({abs(change.sigmas):.1f} sigma) since {since.replace("T", " ")} UTC, seen '
+                  f'in {_name(numbers[change.leg])}: {cause_of_change(relative)}')
+
+
+def _name(number) -> str:
+    return f'leg {number}' if number else 'the saved result'
 
 
 def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
@@ -77,7 +99,7 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
         if name not in PARAMETERS and abs(z[k]) < max(FAR_OFF, worst):
             continue
         # of two each differs from the other alike
-        who = f', leg {numbers[k]} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
+        who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
         said.append(f'{name} differs between the {J} legs {np.sqrt((z**2).mean()):.1f} times more '
                     f'than their sigmas allow{who}')
     if found.factor > 1:

@@ -1,0 +1,66 @@
+"""What earlier legs tell of a vehicle, without the legs: for days to come, and over a restart."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from odocal_ros.calib.border import Border
+
+NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """
+    The border of all legs so far, the scale as the last of them has it.
+
+    unit : of the scale.   first_ns, last_ns : when the first and the last of them began.
+    legs : how many.
+    """
+
+    border: Border
+    unit: str
+    first_ns: int
+    last_ns: int
+    legs: int
+
+    def goes_on_from(self, other: 'Carried') -> bool:
+        """Return whether all that another holds is in it."""
+        return self.first_ns == other.first_ns and self.legs > other.legs
+
+    def as_dict(self) -> dict:
+        """Return it as calibration.json has it."""
+        border = {f.name: np.asarray(getattr(self.border, f.name)).tolist()
+                  for f in fields(Border)}
+        return {'unit': self.unit, 'first_ns': self.first_ns, 'last_ns': self.last_ns,
+                'legs': self.legs, 'border': border}
+
+
+def carried_from(content: dict) -> Carried:
+    """
+    Return what ``as_dict`` gave, null for what is not finite.
+
+    Raises
+    ------
+    ValueError
+        It is not that.
+
+    """
+    try:
+        entry = content['border']
+        names = tuple(map(str, entry['names']))
+        m = len(names)
+        numbers = {f.name: _array(entry[f.name], (m, m) if f.name == 'information' else (m,),
+                                  NOTHING.get(f.name, np.nan))
+                   for f in fields(Border) if f.name != 'names'}
+        return Carried(Border(names, **numbers), str(content['unit']), int(content['first_ns']),
+                       int(content['last_ns']), int(content['legs']))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f'carried: {error}') from None
+
+
+def _array(values, shape, nothing):
+    found = np.array([nothing if x is None else float(x) for x in np.ravel(values)])
+    if found.size != np.prod(shape) or np.isnan(found).any():
+        raise ValueError(f'{np.size(values)} numbers where {shape} are wanted, or null')
+    return found.reshape(shape)

@@ -1,0 +1,51 @@
+"""Where, between legs of a vehicle, the scale changed by more than a walk: new tyres, a load."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.linked_legs import LinkedLegs
+
+CHANGED = 3.0       # sigmas of the difference: by chance once in 370 legs
+FREE = 1.0          # of ln K: what a change may be
+
+
+@dataclass(frozen=True)
+class ScaleStep:
+    """A change: from leg ``leg`` - 1 to ``leg`` of the borders, of ln K, and in sigmas."""
+
+    leg: int
+    change: float
+    sigmas: float
+
+
+def scale_steps(borders, steps, drifting: str, angles=()) -> list[ScaleStep]:
+    """
+    Hold each leg's scale against what those before foretell.
+
+    Parameters
+    ----------
+    borders : sequence of Border
+        By time.
+    steps : (J - 1,) array
+        Sigma by which ``drifting`` walks from leg to leg.
+    drifting, angles : str, sequence of str
+        As for ``joint``.
+
+    Returns
+    -------
+    Changes beyond CHANGED, in order. After one, a leg is held against those since.
+
+    """
+    steps, found = np.array(steps, float), []
+    for j in range(1, len(borders)):
+        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+        sigmas = float(legs.deviations()[j, legs.drifting])
+        if abs(sigmas) <= CHANGED:
+            continue
+        steps[j - 1] = FREE
+        legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
+        x, _ = legs.solve()
+        before, now = (x[legs.place(k)[legs.drifting]] for k in (j - 1, j))
+        found.append(ScaleStep(j, float(now - before), sigmas))
+    return found

@@ -1,0 +1,110 @@
+"""Legs that begin and end by themselves in the node, where ``leg.automatic`` asks for it."""
+
+from odocal_ros.automatic import LegSearch
+from odocal_ros.live.filing import latest_of
+from odocal_ros.live.leg_way import LegWay
+from odocal_ros.live.outputs import iso
+from odocal_ros.live.session import State
+from odocal_ros.output.stored import Stored
+from odocal_ros.reasons import Code
+
+
+class AutomaticWay(LegWay):
+    """
+    The way of legs that nobody marks: ``LegSearch`` says where, from the samples alone.
+
+    A leg of the operator's goes before; the search goes on where it ended.
+    """
+
+    def __init__(self, *args) -> None:
+        super().__init__(*args)
+        self._search: LegSearch | None = None
+        self._searched = None                 # the settings it was made with
+        self._counted_ns = 0                  # start of the leg whose metres are counted
+        self._warned: set[str] = set()        # changes of the scale that were said
+        self._recording.tap = self._hear
+
+    def tick(self) -> None:
+        """Take over what the worker has done and what time has brought."""
+        super().tick()
+        self._keep_search()
+        if self._search is not None and self._search.spans:
+            self._by_itself(self._search)
+
+    def _hear(self, slot: str, block) -> None:
+        self._watch.feed(slot, block)
+        if self._search is not None:
+            self._search.feed(slot, block, self._recording.inputs.form)
+
+    def _keep_search(self) -> None:
+        """Have a search of the settings in force, none where nobody asks for it."""
+        leg = self._config().leg
+        wanted = leg if leg.automatic else None
+        if wanted == self._searched:
+            return
+        before, self._searched = self._searched, wanted
+        self._search = LegSearch(self._config()) if wanted else None
+        if wanted and before is None:
+            self._go_on()
+
+    def _go_on(self) -> None:
+        """Take up what earlier runs of the node have left."""
+        found = latest_of(self._config(), self._node_name)
+        why = _not_ours(found, self._config()) if found and found.carried else None
+        if why:
+            self._log.warning(f'{found.name} is not gone on from: {why}')
+        elif found and found.carried:
+            self.session.carried = found.carried
+            self._log.info(f'goes on from {found.name}: {found.carried.legs} legs, the last of '
+                           f'{iso(found.carried.last_ns)}')
+
+    def _by_itself(self, search: LegSearch) -> None:
+        session, span, newest = self.session, search.spans[0], search.spans[-1]
+        if session.state is not State.RECORDING and newest.start_ns != self._counted_ns:
+            self._counted_ns = newest.start_ns      # the leg before may still be computed
+            self._recording.progress.begin_leg()
+        if session.state is State.FAILED and session.open_leg and session.by_itself:
+            self._drop_leg(lost=session.trouble)
+        elif session.state is State.RECORDING:
+            if session.by_itself and span.stop_ns:
+                search.spans.popleft()
+                self._end_leg(span.stop_ns)
+        elif not session.open_leg and not session.busy and not self._why_not():
+            if span.start_ns < self._recording.newest_imu_ns - self._config().leg.preroll * 1e9:
+                search.spans.popleft()      # its samples are forgotten
+            else:
+                self._begin_leg(span.start_ns, by_itself=True)
+
+    def end_leg_now(self) -> None:
+        """End the leg by the operator's wish, or for its length; it counts as one of his."""
+        self.session.by_itself = False
+        super().end_leg_now()
+        self._look_after(self.session.stop_ns, at_rest=False)
+
+    def _drop_leg(self, text: str = '', lost: str = '') -> None:
+        super()._drop_leg(text, lost)
+        self._look_after(self._recording.newest_imu_ns, at_rest=True)
+
+    def _start_time_anew(self) -> None:
+        super()._start_time_anew()
+        self._search = LegSearch(self._config()) if self._searched else None
+
+    def _look_after(self, stamp_ns: int, at_rest: bool) -> None:
+        if self._search is not None:
+            self._search.begin_anew(stamp_ns, at_rest)
+
+    def _take_leg(self, done) -> None:
+        super()._take_leg(done)
+        for reason in done.calibration.reasons if done.calibration else ():
+            if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
+                self._warned.add(reason.text)
+                self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')
+
+
+def _not_ours(found: Stored, config) -> str:
+    """Return why a result is of another vehicle or mounting, empty where it is not."""
+    if found.vehicle != config.vehicle:
+        return f'it is of vehicle {found.vehicle!r}'
+    if list(found.config.get('imu.mounting_rpy', ())) != list(config.imu.mounting_rpy):
+        return 'imu.mounting_rpy was another'
+    return ''

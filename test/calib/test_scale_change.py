@@ -1,0 +1,157 @@
+"""Legs carried on without their rows, and a scale that changes between two of them."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from smoother_legs import made
+from test_legs_on_border import apart, leg_result, Toy, TRUTH
+
+from odocal_ros.automatic import fold
+from odocal_ros.calib.carried import carried_from
+from odocal_ros.calib.joint import joint
+from odocal_ros.calib.scale_steps import CHANGED, scale_steps
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.combination import combine
+from odocal_ros.config import with_settings
+from odocal_ros.output.files import as_json
+from odocal_ros.reasons import Code, Verdict
+
+STEPS = np.array([0.02, 0.0, 0.05, 0.01])
+SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+
+
+@pytest.mark.parametrize('first', [1, 2, 4])
+def test_legs_carried_on_are_one_fit_with_those_to_come(first):
+    borders = Toy(np.random.default_rng(5)).borders()
+    whole = joint(borders, STEPS, 'k')
+    before = joint(borders[:first], STEPS[:first - 1], 'k').carried
+    found = joint([before, *borders[first:]], STEPS[first - 1:], 'k')
+    assert apart(found.value, whole.value, whole.covariance) < 1e-6
+    sigma = np.sqrt(np.diag(whole.covariance))
+    assert np.abs((found.covariance - whole.covariance) / np.outer(sigma, sigma)).max() < 1e-6
+
+
+def drawn(rng, toy, change=0.0, since=3):
+    """Return the steps found in five legs whose scale walks, and changes once."""
+    constants = np.tile(TRUTH, (5, 1))
+    constants[:, 0] += np.concatenate([[0.0], np.cumsum(STEPS * rng.standard_normal(4))])
+    constants[since:, 0] += change
+    return scale_steps(toy.draw(rng, constants).borders(), STEPS, 'k')
+
+
+def test_a_walk_is_no_change_but_by_chance():
+    rng = np.random.default_rng(6)
+    toy = Toy(rng, states=6, rows=60)
+    alarms = sum(len(drawn(rng, toy)) for _ in range(500))
+    # three legs of five can be held against others: one in 370 of 1500 is 4
+    assert 0 < alarms <= 12
+
+
+def test_a_change_is_found_where_it_was_and_as_large():
+    rng = np.random.default_rng(7)
+    toy = Toy(rng, states=6, rows=60)
+    for _ in range(20):
+        (found,) = drawn(rng, toy, change=-0.9)
+        assert found.leg == 3
+        assert found.change == pytest.approx(-0.9, abs=4 * 0.06)     # walk and noise of the legs
+        assert found.sigmas < -CHANGED
+
+
+@pytest.fixture(scope='module')
+def session():
+    """Return settings and the legs of a short drive and of the same vehicle on other days."""
+    results = []
+    for seed in (1, 2, 3):
+        _, config, leg = made(duration=200.0, imu_grade='industrial', seed=seed)
+        results.append(smooth(leg, config))
+    return with_settings(config, {'method': 'smoother', 'leg.automatic': True}), results
+
+
+def legs_of(results, change=0.0, since=2):
+    """Return legs of results, the scale of the later ones changed."""
+    out = []
+    for i, one in enumerate(results, 1):
+        moved = one.border
+        if i > since:
+            moved = replace(moved, value=moved.value + np.log1p(change) * (
+                np.arange(len(moved.names)) == 0))
+            scale = one.estimates[SCALE]
+            one = replace(one, estimates=one.estimates | {SCALE: replace(
+                scale, value=scale.value * (1 + change))})
+        out.append(leg_result(replace(one, border=moved), i))
+    return out
+
+
+def changed(calibration):
+    return [r.text for r in calibration.reasons if r.code is Code.SCALE_CHANGED]
+
+
+def test_a_tyre_that_lost_air_is_said_and_the_scale_follows(session):
+    config, results = session
+    before = combine(legs_of(results), config)
+    assert changed(before) == []
+    after = combine(legs_of(results, -0.009), config)
+    (text,) = changed(after)
+    assert text.startswith('the scale changed by -0.')
+    assert float(text.split()[4]) == pytest.approx(-0.9, abs=0.02)      # one leg's sigma
+    assert 'since 1970-01-01 00:33 UTC, seen in leg 3: tyre pressure, wear, load' in text
+    assert after.verdict is Verdict.CAUTION
+    e, old = after.estimates[SCALE], before.estimates[SCALE]
+    alone = legs_of(results, -0.009)[2].methods['smoother'].estimates[SCALE]
+    assert abs(e.value - alone.value) < alone.sigma
+    assert e.value < 0.995 * old.value
+    # what a tyre does not touch is as well known as before
+    assert after.estimates[YAW].sigma == pytest.approx(before.estimates[YAW].sigma, rel=0.05)
+    # without leg.automatic a leg that differs widens the sigma instead
+    plain = combine(legs_of(results, -0.009), with_settings(config, {'leg.automatic': False}))
+    assert changed(plain) == []
+    assert Code.LEGS_DISAGREE in {r.code for r in plain.reasons}
+
+
+def test_a_result_on_the_disk_goes_on(session):
+    config, results = session
+    legs = legs_of(results)
+    whole = combine(legs, config)
+    two = combine(legs[:2], config)
+    written = json.loads(json.dumps(as_json(two, config, [], 'now'), allow_nan=False))
+    carried = carried_from(written['carried'])
+    assert (carried.legs, carried.first_ns, carried.last_ns) == (
+        2, legs[0].start_ns, legs[1].start_ns)
+    found = combine(legs[2:], config, carried)
+    for name in (SCALE, YAW):
+        a, b = found.estimates[name], whole.estimates[name]
+        assert a.value == pytest.approx(b.value, abs=1e-3 * b.sigma), name
+        assert a.sigma == pytest.approx(b.sigma, rel=1e-3), name
+    assert found.carried.legs == 3
+    assert found.carried.goes_on_from(carried)
+    assert not carried.goes_on_from(found.carried)
+    (text,) = changed(combine(legs_of(results, 0.02)[2:], config, carried))
+    assert text.startswith('the scale changed by +')
+    assert float(text.split()[4]) == pytest.approx(2.0, abs=0.1)
+    assert 'seen in leg 1' in text
+    # a clock that went back, or an odometer of another kind: they do not belong together
+    for other in (replace(carried, last_ns=10**18), replace(carried, unit='1')):
+        alone = combine(legs[2:], config, other)
+        assert alone.estimates[SCALE].value == results[2].estimates[SCALE].value
+
+
+def test_legs_folded_into_what_is_carried_count_as_before(session):
+    config, results = session
+    legs = legs_of(results)
+    whole, carried = combine(legs, config), fold(legs[:2], config)
+    found = combine(legs[2:], config, carried)
+    assert found.carried.legs == 3
+    for name in (SCALE, YAW):
+        a, b = found.estimates[name], whole.estimates[name]
+        assert a.value == pytest.approx(b.value, abs=1e-3 * b.sigma), name
+        assert a.sigma == pytest.approx(b.sigma, rel=1e-3), name
+    rejected = leg_result(results[0], 0, Code.IMU_GAP)       # nothing to carry
+    assert fold([rejected], config, carried) is carried
+
+
+def test_only_what_is_asked_for_is_written(session):
+    config, results = session
+    plain = with_settings(config, {'leg.automatic': False})
+    assert 'carried' not in as_json(combine(legs_of(results), plain), plain, [], 'now')

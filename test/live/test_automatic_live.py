@@ -1,0 +1,175 @@
+"""Legs without an operator: the node begins, ends, combines and saves them, and goes on later."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import subprocess
+import sys
+from types import SimpleNamespace
+
+from bench import answer_of, Client, NodeProcess, ROOT, wait_for
+from player import messages_of, part, Player
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+SETTINGS = {'leg.automatic': 'true', 'leg.automatic_minutes': '4.0'}
+CHANGE = -0.009            # of the scale, while the vehicle stands
+STOP = 189.0               # s: standstill after more than half of the minutes
+DAY = 86400 * 10**9
+
+
+def town(**options):
+    return simulate(SimOptions(**({
+        'scenario': 'town', 'duration': 420.0, 'imu_rate': 50.0, 'odometer_rate': 25.0,
+        'odometer': 'speed', 'fix_noise': 'rtk', 'imu_grade': 'industrial'} | options)))
+
+
+@pytest.fixture(scope='module')
+def drive():
+    """Drive through a town: two legs, between which the tyres lose air; goes on a day later."""
+    whole = town()
+    stop_ns = whole.imu.stamp_ns[0] + round(STOP * 1e9)
+    # a smaller wheel turns more: it claims more metres than before
+    value = whole.odometer.value / (1 + CHANGE * (whole.odometer.stamp_ns > stop_ns))
+    changed = replace(whole, odometer=replace(whole.odometer, value=value))
+    later = town(start_ns=whole.options.start_ns + DAY, seed=2)
+    later = replace(later, odometer=replace(later.odometer,
+                                            value=later.odometer.value / (1 + CHANGE)))
+    types, sent = messages_of(changed)
+    return SimpleNamespace(truth=whole.truth, types=types, sent=sent, later=messages_of(later)[1])
+
+
+@pytest.fixture(scope='module')
+def seen(drive, tmp_path_factory, domain):
+    """Run the node twice, and keep what it said."""
+    found = SimpleNamespace(folder=tmp_path_factory.mktemp('results'))
+    for run in (_first, _a_day_later):
+        settings = SETTINGS | {'output.directory': found.folder}
+        node = NodeProcess(*[x for name, value in settings.items()
+                             for x in ('-p', f'{name}:={value}')])
+        client = Client()
+        try:
+            player = Player(client.node, drive.types)
+            wait_for(player.matched, 'subscriptions of the node')
+            run(found, node, client, player, drive)
+        finally:
+            node.end()
+            client.close()
+    return found
+
+
+def _first(found, node, client, player, drive):
+    found.node = node
+    with player.playing(drive.sent, SPEED):
+        found.recording = client.until(state='recording', automatic='leg')
+        found.one = client.until(legs='1')
+        found.next = client.until(state='recording', leg_id='2')
+        found.two = client.until(legs='2')
+        found.computing = [s for s in client.statuses if s['state'] == 'computing'
+                           and s['leg_id'] == '1']
+        found.written = wait_for(lambda: _saved(client.status['saved'], 2), 'the second save')
+
+
+def _saved(folder, legs):
+    """Return what a result folder holds, None where it has not so many legs."""
+    if not folder:
+        return None
+    found = json.loads((Path(folder) / 'calibration.json').read_text())
+    return found if len(found['legs']) == legs else None
+
+
+def _a_day_later(found, node, client, player, drive):
+    with player.playing(drive.later, SPEED):
+        client.until(state='recording', automatic='leg')
+        found.start = client.call('start_leg')
+        found.operators = client.until(automatic='leg of the operator')
+        found.cancel = client.call('cancel_leg')
+        found.waits = client.until(automatic='waiting')
+        client.until(state='recording', automatic='leg')
+        wait_for(lambda: float(client.status['distance_m']) > 500.0, 'half a kilometre')
+        found.stop = answer_of(client.ask('stop_leg'))
+        found.later = client.until(legs='1')
+        client.until(state='recording', automatic='leg')       # and goes on
+        found.carried = wait_for(lambda: _saved(client.status['saved'], 1), 'the save')['carried']
+    found.again = node
+
+
+def test_legs_begin_and_end_by_themselves(seen, drive):
+    first_ns = drive.sent[0].stamp_ns
+
+    def seconds(status):
+        return [(int(status[f'leg_{mark}_ns']) - first_ns) / 1e9 for mark in ('start', 'stop')]
+    assert seconds(seen.one) == pytest.approx([19.4, 189.5], abs=0.5)
+    assert seconds(seen.two) == pytest.approx([189.5, 361.4], abs=0.5)
+    assert seen.next['leg_start_ns'] == seen.one['leg_stop_ns']
+    assert 'the leg ends by itself, at a standstill or within' in seen.recording['hint']
+    assert 'stop_leg' not in seen.recording['hint'] + seen.two['hint'] + seen.one['hint']
+    assert 'ready' in seen.node.text
+    assert '~/start_leg' not in seen.node.text
+
+
+def test_how_far_a_leg_is_computed_is_said(seen):
+    shares = [float(status['computing_percent']) for status in seen.computing]
+    assert shares == sorted(shares)
+    assert 0 < shares[-1] < 100
+    assert seen.computing[-1]['hint'].startswith(f'computing: {shares[-1]:.0f} % (')
+    assert seen.next['computing_percent'] == '0.0'
+
+
+def test_a_change_of_the_scale_is_said_and_followed(seen, drive):
+    assert seen.one['level'] == b'\0'
+    assert seen.two['level'] == b'\1'
+    assert seen.two['reasons'].split(',')[0] == 'SCALE_CHANGED'
+    assert 'the scale changed by -0.9' in seen.two['message']
+    warned, = [line for line in seen.node.lines if 'WARN' in line and 'SCALE_CHANGED' in line]
+    assert 'tyre pressure, wear, load or another tyre' in warned
+    for status, change in ((seen.one, 0.0), (seen.two, CHANGE)):
+        off = float(status['scale_factor']) - drive.truth.scale * (1 + change)
+        assert abs(off) < 4 * float(status['scale_factor_sigma'])
+
+
+def test_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics = {slot: bag.add_connection(
+            {'imu': '/imu/data'}.get(slot, f'/{slot}'), msgtype, typestore=store)
+            for slot, msgtype in drive.types.items()}
+        # as far as the node had heard when its second leg ended
+        for one in part(drive.sent, 0, 364):
+            bag.write(topics[one.slot], one.stamp_ns, one.raw)
+    options = [x for name, value in SETTINGS.items() for x in ('--set', f'{name}={value}')]
+    run = subprocess.run(
+        [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(tmp_path / 'bag'), '--json',
+         '--output', str(tmp_path / 'replayed'), *options], cwd=ROOT, text=True,
+        capture_output=True, check=False)
+    offline = json.loads(run.stdout)
+    written = seen.written
+    assert [(leg['start_ns'], leg['stop_ns']) for leg in offline['legs']] \
+        == [(leg['start_ns'], leg['stop_ns']) for leg in written['legs']]
+    for part_of in ('result', 'verdict', 'reasons', 'methods', 'check', 'carried'):
+        assert written[part_of] == offline[part_of], part_of
+
+
+def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
+    assert 'goes on from' in seen.again.text
+    assert seen.later['carried_legs'] == '2'
+    assert seen.carried['legs'] == 3
+    latest = json.loads((seen.folder / 'latest' / 'calibration.json').read_text())
+    assert latest['carried'] == seen.carried
+    assert 'SCALE_CHANGED' not in seen.later['reasons']       # it was said the day before
+    off = float(seen.later['scale_factor']) - drive.truth.scale * (1 + CHANGE)
+    assert abs(off) < 4 * float(seen.later['scale_factor_sigma'])
+
+
+def test_the_operator_goes_before(seen):
+    assert seen.start.success
+    assert seen.start.message.startswith('recording leg 2 since')
+    assert int(seen.operators['leg_id']) == 2
+    assert '~/stop_leg' in seen.operators['hint']
+    assert seen.cancel.success
+    assert 'drive off' in seen.waits['hint']
+    assert seen.stop.success

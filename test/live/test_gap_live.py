@@ -1,0 +1,89 @@
+"""The Imu falls silent in a leg: said at once, the leg is cut there, its parts make the result."""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+from types import SimpleNamespace
+
+from bench import answer_of, Client, NodeProcess, ROOT, wait_for
+from player import messages_of, part, Player
+import pytest
+
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0
+GAP = (100.0, 103.0)       # s of the drive
+
+
+@pytest.fixture(scope='module')
+def seen(tmp_path_factory, domain):
+    """Drive a leg with such a gap through a node, and keep what it said."""
+    drive = simulate(SimOptions(
+        scenario='town', duration=240.0, imu_rate=50.0, odometer_rate=25.0, odometer='speed',
+        fix_noise='rtk', imu_grade='industrial'))
+    types, sent = messages_of(drive)
+    first_ns = sent[0].stamp_ns
+    sent = [one for one in sent if one.slot != 'imu'
+            or not GAP[0] <= (one.stamp_ns - first_ns) * 1e-9 < GAP[1]]
+    found = SimpleNamespace(truth=drive.truth, folder=tmp_path_factory.mktemp('results'))
+    found.node = NodeProcess('-p', f'output.directory:={found.folder}')
+    client = Client()
+    try:
+        player = Player(client.node, types)
+        wait_for(player.matched, 'subscriptions of the node')
+        player.play(part(sent, 4, 15), SPEED)
+        client.until(state='idle', hint='call ~/start_leg')
+        client.call('start_leg')
+        player.play(part(sent, 15, 130), SPEED)
+        found.told = client.until(reasons='LEG_CUT')
+        found.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
+                                  and client.status, 'an estimate of the part since')
+        player.play(part(sent, 130, 190), SPEED)
+        stopping = client.ask('stop_leg')
+        player.play(part(sent, 190, 192), SPEED)
+        found.answer = answer_of(stopping)
+        found.status = client.until(state='calibrated')
+        saved = wait_for(lambda: client.status['saved'], 'the saved folder')
+        found.written = json.loads((Path(saved) / 'calibration.json').read_text())
+        found.undone = client.call('undo_leg')
+        found.journal = Path(found.status['journal'])
+        wait_for((found.journal / 'metadata.yaml').exists, 'the joined journal')
+        yield found
+    finally:
+        found.node.end()
+        client.close()
+
+
+def test_it_is_said_while_the_leg_is_driven(seen):
+    assert seen.told['level'] == b'\1'
+    assert 'the Imu is missing for 3.02 s at t = ' in seen.told['hint']
+    assert 'the leg is cut there' in seen.told['hint']
+    assert 'cancel_leg' not in seen.told['hint']
+    warned, = [line for line in seen.node.lines if 'WARN' in line and 'LEG_CUT' in line]
+    off = float(seen.foreseen['estimate_scale_factor']) - seen.truth.scale
+    assert abs(off) < 4 * float(seen.foreseen['estimate_scale_factor_sigma'])
+
+
+def test_its_parts_make_the_result(seen):
+    assert seen.answer.success
+    assert seen.answer.message.startswith('leg 1 in 2 parts, ')
+    assert seen.status['legs'] == '1'
+    one, other = seen.written['legs']
+    assert other['start_ns'] - one['stop_ns'] == pytest.approx(3.02e9, abs=1e6)
+    scale = seen.written['result']['scale_factor']
+    assert abs(scale['value'] - seen.truth.scale) < 4 * scale['sigma']
+    assert 'LEG_CUT' in {r['code'] for r in seen.written['reasons']}
+    assert seen.undone.message == 'leg 1 is undone, none is left'
+
+
+def test_a_replay_of_the_journal_gives_the_same(seen, tmp_path):
+    one, other = seen.written['legs']
+    marks = [f'{ns // 10**9}.{ns % 10**9:09}' for ns in (one['start_ns'], other['stop_ns'])]
+    run = subprocess.run(       # undone since: it must be asked for by its marks
+        [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(seen.journal), '--json',
+         '--leg', ':'.join(marks), '--output', str(tmp_path / 'out')],
+        cwd=ROOT, text=True, capture_output=True, check=False)
+    offline = json.loads(run.stdout)
+    for part_of in ('result', 'verdict', 'reasons', 'methods', 'check'):
+        assert seen.written[part_of] == offline[part_of], part_of
