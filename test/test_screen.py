@@ -114,6 +114,18 @@ def test_duplicates_are_used_once(leg):
             Code.STAMPS_NOT_RISING]
 
 
+def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
+    """A node in simulated time that stands still for 8 s of 10 has them all at the same time."""
+    def queued(samples):
+        t = seconds(leg, samples)
+        late = np.where(t % 10 < 8, t - t % 10 + 8, t)
+        return replace(samples, received_ns=leg.start_ns + np.round(late * 1e9).astype(np.int64))
+    slots = {slot: queued(getattr(leg, slot)) for slot in ('imu', 'odometer', 'fix')}
+    assert Code.CLOCKS_DIFFER not in said(replace(leg, **slots))[1]
+    slots['fix'] = replace(slots['fix'], stamp_ns=slots['fix'].stamp_ns + 700_000_000)
+    assert 'the fix stamps are +0.7' in said(replace(leg, **slots))[1][Code.CLOCKS_DIFFER]
+
+
 @pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
                                                ('fix', 'gnss.time_offset')])
 @pytest.mark.parametrize('late', [0.8, -0.8])

@@ -134,9 +134,14 @@ class FixPath:
 
 
 class Clocks:
-    """Compares the stamps of rows that arrived together: whose clock differs from the Imu's."""
+    """
+    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
 
-    def __init__(self) -> None:
+    simulated : arrivals are told by the stamps' own clock; else by one that a bag may outrun.
+    """
+
+    def __init__(self, simulated: bool = False) -> None:
+        self._simulated = simulated
         self._imu: deque = deque(maxlen=40)
         self._ahead_s: dict[str, deque] = {}
 
@@ -145,18 +150,21 @@ class Clocks:
         if slot == 'imu':
             self._imu.append((block.received_ns, block.stamp_ns))
         elif self._imu:
-            received = np.concatenate([r for r, _ in self._imu])
-            row = int(block.received_ns[-1])
+            # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+            received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+            first_received, first_stamp = int(received[0]), int(stamps[0])
+            received, stamps = received - first_received, stamps - first_stamp
+            row = int(block.received_ns[-1]) - first_received
             # one sent just after the Imu's newest has nothing behind it yet: carry on from there,
             # at the pace of a bag that is played
             beyond = max(0, row - int(received.max()))
-            if received.min() <= row and beyond <= CLOCK_REACH_NS:
-                stamps = np.concatenate([s for _, s in self._imu])
-                # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
-                pace = np.ptp(stamps) / max(np.ptp(received), 1)
-                imu_ns = beyond * pace + np.interp(row - received[0], received - received[0],
-                                                   stamps - stamps[0])
-                ahead = (int(block.stamp_ns[-1]) - int(stamps[0]) - imu_ns) * 1e-9
+            pace = 1.0 if self._simulated else np.ptp(stamps) / max(np.ptp(received), 1)
+            # messages that queued for a node in simulated time arrive late, the Imu's more so than
+            # others': which of them belong together is not known then
+            queued = np.ptp(received * pace - stamps) > CLOCK_LIMIT * 1e9
+            if received.min() <= row and beyond <= CLOCK_REACH_NS and not queued:
+                imu_ns = beyond * pace + np.interp(row, received, stamps)
+                ahead = (int(block.stamp_ns[-1]) - first_stamp - imu_ns) * 1e-9
                 self._ahead_s.setdefault(slot, deque(maxlen=CLOCK_ROWS)).append(ahead)
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
@@ -166,8 +174,10 @@ class Clocks:
                    'fix_velocity': config.gnss.time_offset}
         result = []
         for slot, ahead in self._ahead_s.items():
-            # the freshest of the last rows: latency on the way makes a row look older, never newer
-            value = max(ahead) + offsets.get(slot, 0.0) - config.imu.time_offset
+            offset = offsets.get(slot, 0.0) - config.imu.time_offset
+            # latency on the way makes a row look older: behind are those of whom the freshest is;
+            # that of an Imu's row makes others look newer: ahead are those of whom most are
+            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
             if abs(value) > CLOCK_LIMIT:
                 result.append((slot, value))
         return result
@@ -176,8 +186,8 @@ class Clocks:
 class Progress:
     """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
 
-    def __init__(self) -> None:
-        self.clocks = Clocks()
+    def __init__(self, simulated: bool = False) -> None:
+        self.clocks = Clocks(simulated)
         self._travel: dict[str, Travel] = {}
         self._path = FixPath()
         self._zero = 0.0
