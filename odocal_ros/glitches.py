@@ -137,7 +137,7 @@ def single(x, least):
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
         found[edge:-edge] = by_step(off, x, steps=2 * edge)
-    return found & (found.sum() <= RARE * len(x))
+    return found & (found.sum() <= max(RARE * len(x), CLUMP))
 
 
 def imu_glitches(t, w_i, f_i, imu):

@@ -97,7 +97,10 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     def rows(slot):
         sent = getattr(leg, slot)
-        clean = _rising(_finite(sent, slot, leg, found), slot, leg, found)
+        good, wild = _finite(sent, slot, leg, found)
+        clean = sent if good.all() else take(sent, good)
+        order = _rising(clean, slot, leg, found)
+        clean = clean if order is None else take(clean, order)
         t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset[slot]
         form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
         spikes = _spikes(slot, clean, t, form, config)
@@ -105,6 +108,10 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                                 f'{LABEL[slot]} messages stand alone far from their neighbours, '
                                 f'first at t = {t[np.argmax(spikes)]:.2f} s; dropped'))
+            if not about_clumps(wild).any():        # else what is about them is left out already
+                at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
+                wild[at[spikes]] = True
+                spikes |= _damaged(wild, good, slot, found)[at]
             clean, t = take(clean, ~spikes), t[~spikes]
         if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
             found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
@@ -193,7 +200,7 @@ def _where(samples, index, leg) -> str:
 
 
 def _finite(samples, slot, leg, found):
-    """Drop rows without a stamp or with NaN or Inf in what a row needs."""
+    """Tell which rows have a stamp and what a row needs, and which are beyond any sensor."""
     needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
     if slot in ('fix_velocity', 'heading'):
         needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
@@ -213,22 +220,28 @@ def _finite(samples, slot, leg, found):
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
+    good = stamped & finite
+    suspect = _damaged(wild, good, slot, found, min(DAMAGED * len(wild), SEVERAL))
+    return good & ~suspect, wild
+
+
+def _damaged(wild, good, slot, found, most=np.inf):
+    """Tell which rows are about clumps of wild ones, and say so: or of more than so many."""
     suspect = about_clumps(wild)
-    if suspect.any() or wild.sum() > min(DAMAGED * len(wild), SEVERAL):
+    if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
-                            'messages hold values beyond any sensor; '
-                            f'{int((suspect & stamped & finite).sum())} more about them were '
+                            'messages hold values beyond any sensor, or far from those beside '
+                            f'them; {int((suspect & good & ~wild).sum())} more about them were '
                             'dropped too'))
-    good = stamped & finite & ~suspect
-    return samples if good.all() else take(samples, good)
+    return suspect
 
 
 def _rising(samples, slot, leg, found):
-    """Drop the fewest rows that leave the stamps strictly rising."""
+    """Return which rows to keep, the most whose stamps rise strictly; None for all."""
     stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all():
-        return samples
+        return None
     keep = _longest_rising(stamp)
     same, back = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
@@ -238,7 +251,7 @@ def _rising(samples, slot, leg, found):
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not rise: '
                         f'{" and ".join(what)}, first at {_where(samples, first, leg)}; '
                         f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
-    return take(samples, keep)
+    return keep
 
 
 def _longest_rising(stamp):
