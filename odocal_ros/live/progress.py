@@ -21,7 +21,6 @@ STANDS_S = 0.5         # without a count: the vehicle stands
 REST_NS = 1_000_000_000   # a shorter pause is no standstill
 CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
-CLOCK_REACH_NS = 200_000_000     # less than half of the limit, a few ticks
 
 
 def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -137,35 +136,38 @@ class Clocks:
     """
     Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
 
-    simulated : arrivals are told by the stamps' own clock; else by one that a bag may outrun.
+    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
     """
 
     def __init__(self, simulated: bool = False) -> None:
         self._simulated = simulated
         self._imu: deque = deque(maxlen=40)
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
         self._ahead_s: dict[str, deque] = {}
 
     def feed(self, slot: str, block) -> None:
-        """Take a block; the Imu's must be fed before those that arrived with it."""
-        if slot == 'imu':
-            self._imu.append((block.received_ns, block.stamp_ns))
-        elif self._imu:
-            # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
-            received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
-            first_received, first_stamp = int(received[0]), int(stamps[0])
-            received, stamps = received - first_received, stamps - first_stamp
-            row = int(block.received_ns[-1]) - first_received
-            # one sent just after the Imu's newest has nothing behind it yet: carry on from there,
-            # at the pace of a bag that is played
-            beyond = max(0, row - int(received.max()))
-            pace = 1.0 if self._simulated else np.ptp(stamps) / max(np.ptp(received), 1)
-            # messages that queued for a node in simulated time arrive late, the Imu's more so than
-            # others': which of them belong together is not known then
-            queued = np.ptp(received * pace - stamps) > CLOCK_LIMIT * 1e9
-            if received.min() <= row and beyond <= CLOCK_REACH_NS and not queued:
-                imu_ns = beyond * pace + np.interp(row, received, stamps)
-                ahead = (int(block.stamp_ns[-1]) - first_stamp - imu_ns) * 1e-9
-                self._ahead_s.setdefault(slot, deque(maxlen=CLOCK_ROWS)).append(ahead)
+        """Take a block."""
+        if slot != 'imu':
+            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
+            return
+        self._imu.append((block.received_ns, block.stamp_ns))
+        if not self._waiting:
+            return
+        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        first_received, first_stamp = int(received[0]), int(stamps[0])
+        received, stamps = received - first_received, stamps - first_stamp
+        # messages that queued for a node in simulated time arrive late, the Imu's more so than
+        # others': which of them belong together is not known then
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_LIMIT * 1e9
+        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
+            row = row_ns - first_received
+            if row > received.max():
+                continue
+            del self._waiting[name]
+            if row >= received.min() and not queued:
+                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
+                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
         """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
