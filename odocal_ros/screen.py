@@ -6,7 +6,6 @@ start mark; the mark is an Imu stamp, so the Imu's time offset moves the others 
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from odocal_ros.glitches import (
 )
 from odocal_ros.leg import Leg
 from odocal_ros.nav.dead_reckoning import rough_scale
+from odocal_ros.nav.integral import by_step
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
@@ -294,10 +294,12 @@ def _gaps(slot, t, found):
 
 def imu_gap(t_imu, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
     """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and t_stop."""
-    t = t_imu[(t_imu >= t_from - 1e-9) & (t_imu <= t_stop + 1e-9)]
-    edges = np.concatenate([[t_from], t, [t_stop]])
-    gaps = [(b - a, a) for a, b in pairwise(edges.tolist()) if b - a > limit] \
-        if np.diff(edges).max() > limit else []
+    t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
+              np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
+    long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
+    ends = [(t_from, t[0]), *zip(t[long], t[long + 1], strict=True), (t[-1], t_stop)] \
+        if len(t) else [(t_from, t_stop)]
+    gaps = [(float(b - a), float(a)) for a, b in ends if b - a > limit]
     if not gaps:
         return ()
     length, at = max(gaps)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.nav.integral import medians
+from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import let_go
 
@@ -72,9 +72,8 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
     if t1 - t0 < LEAST * BIN:
         return None
     edges = np.arange(t0, t1, BIN)
-    cell = np.searchsorted(edges, t) - 1
-    inside = (cell >= 0) & (cell < len(edges) - 1)
-    cell = cell[inside]
+    inside = slice(*np.searchsorted(t, edges[[0, -1]], side='right'))
+    cell = np.searchsorted(edges, t[inside]) - 1
     count = np.bincount(cell, minlength=len(edges) - 1)
 
     def mean_of(column):
@@ -82,7 +81,7 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
 
     means = [mean_of(column) for column in f.T]
     let_go(f)
-    means.append(mean_of(w @ up))
+    means.append(mean_of(by_row(lambda w: w @ up, w)))
     let_go(w)
     f, turn_rate = np.stack(means[:3], -1), means[3]
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
