@@ -165,7 +165,7 @@ def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
     if len(t) < 2 or len(travel.t) < 2:
         return ()
     same = by_step(lambda w: (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1), w)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     begin, end = t[edges[::2]], t[edges[1::2]]
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)

@@ -116,6 +116,7 @@ class LegRun:
 
     def examine(self) -> bool:
         """Say all of the leg that needs no method; return whether methods can be run."""
+        let_go(*vars(self.leg.imu).values())
         if not (self._moves() and self._faces_forward() and self._turns_with_course()):
             return False
         self._prepare()
