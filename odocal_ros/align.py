@@ -196,10 +196,12 @@ def _heading_topic(inputs, level, latitude, grade, config):
 
 def _from_quaternions(t, q, variance, level, config, to_b, offset):
     """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
+    # of hours only the rows that are looked at
+    begin, end = level.standstill or (level.t - NEAR, level.t + NEAR)
+    near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
+    t, q, variance = t[near], q[near], variance[near]
     pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
-    if level.standstill:
-        pick &= (t >= level.standstill[0]) & (t <= level.standstill[1])
-    else:
+    if not level.standstill:
         away = np.where(pick, np.abs(t - level.t), np.inf)
         pick = (away <= NEAR) & (away == away.min(initial=np.inf))
     if not pick.any():

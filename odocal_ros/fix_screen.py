@@ -34,10 +34,7 @@ def usable_fixes(fix, sent, gnss):
 
     """
     no_fix = fix.status < gnss.min_status
-    nowhere = (fix.latitude == 0) & (fix.longitude == 0)
-    # NaN compares false: what is not within is lost
-    within = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi)
-    lost = nowhere | ~within | (abs(fix.height) > HEIGHT)
+    lost = ~placed(fix) | (abs(fix.height) > HEIGHT)
     lost = lost | _away(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
@@ -60,6 +57,13 @@ def usable_fixes(fix, sent, gnss):
         found += (Reason(code, f'{sent - int(use.sum())} of {sent} fixes are not used: '
                          f'{", ".join(said)}', ' '.join(do)),)
     return use, covariance, found
+
+
+def placed(fix):
+    """Tell which fixes are on the Earth, and not where both angles are zero: (n,) bool."""
+    nowhere = (fix.latitude == 0) & (fix.longitude == 0)
+    # NaN compares false: what is not within is nowhere
+    return (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
 
 
 def _away(fix, good):

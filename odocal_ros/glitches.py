@@ -23,6 +23,11 @@ SPEED_STEP = 0.3     # of the top speed, the same
 CLEAR = 20.0         # times the usual step from row to row
 CLOSE = 0.4          # s within which a glitch is over: longer, and motion itself may do it
 HOME = 0.5           # of the bound: nearer to the row before it, the glitch is over
+BESIDE = 5           # rows to either side that are still where a single row is false
+SINGLE = 10.0        # times as far from its neighbours as any of those beside it is from theirs
+ALIKE = 0.3          # of that: so near to each other are the neighbours of a false row
+SINGLE_TURN = 0.03   # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
+SINGLE_FORCE = 2.0   # m/s^2, the same
 RARE = 0.002         # of the rows: more of them are no glitches
 ROLLS = 0.1          # of the top speed: slower on the mean, a vehicle may as well stand
 MOST = 2000          # bounds looked at
@@ -111,10 +116,35 @@ def alone(t, x, least):
     return found if found.mean() <= RARE else np.zeros(len(x), bool)
 
 
+def single(x, least):
+    """
+    Tell which rows are off alone, while nothing stirs to either side: motion begins and ends.
+
+    x : (n, k).   least : off by less, a row is let be.   Returns (n,) bool, all false where so
+    many rows are that it is the sensor's nature.
+    """
+    edge = BESIDE + 1
+
+    def off(x):
+        m = len(x) - 2 * edge
+        far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
+        # a false row shows in those at it, too
+        beside = np.max([far[BESIDE + k:][:m] for d in range(2, edge) for k in (-d, d)], axis=0)
+        at = far[BESIDE:][:m]
+        apart = np.abs(x[edge + 1:][:m] - x[BESIDE:][:m])
+        return ((at > np.maximum(least, SINGLE * beside)) & (apart < ALIKE * at)).any(axis=1)
+
+    found = np.zeros(len(x), bool)
+    if len(x) > 2 * edge:
+        found[edge:-edge] = by_step(off, x, steps=2 * edge)
+    return found & (found.sum() <= max(RARE * len(x), CLUMP))
+
+
 def imu_glitches(t, w_i, f_i, imu):
     """Return which Imu rows hold a spike that no vehicle makes, by the imu settings' factors."""
-    return (alone(t, w_i, TURN_STEP / max(imu.gyro_scale, 1e-12))
-            | alone(t, f_i, FORCE_STEP / max(imu.accel_scale, 1e-12)))
+    gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
+    return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
+            | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
 
 
 def speed_glitches(t, speed):
@@ -135,7 +165,7 @@ def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
     if len(t) < 2 or len(travel.t) < 2:
         return ()
     same = by_step(lambda w: (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1), w)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     begin, end = t[edges[::2]], t[edges[1::2]]
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)
     rolled = np.abs(travel.at(end) - travel.at(begin)) / np.maximum(end - begin, 1e-6)

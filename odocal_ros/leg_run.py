@@ -22,6 +22,7 @@ from odocal_ros.leg_methods import METHODS, run_method
 from odocal_ros.leg_tracks import check_of, tracks
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
@@ -132,6 +133,7 @@ class LegRun:
 
     def examine(self) -> bool:
         """Say all of the leg that needs no method; return whether methods can be run."""
+        let_go(*vars(self.leg.imu).values())
         if not (self._moves() and self._faces_forward() and self._turns_with_course()):
             return False
         self._prepare()
@@ -211,8 +213,9 @@ class LegRun:
     def _turns_with_course(self):
         """Tell whether the gyro turns with the course of the fixes, and say how where not."""
         inputs = self.inputs
-        up_b = np.median(inputs.f_b, axis=0)
-        ratio = turn_ratio(inputs.t_imu, inputs.w_b @ (up_b / np.linalg.norm(up_b)),
+        up_b = medians(inputs.f_b)
+        up_b /= np.linalg.norm(up_b)
+        ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
                            inputs.t_fix, self.fixes_n, self.fix_sigma)
         found = gyro_reasons(ratio, self.config.imu.gyro_scale)
         self.reasons += found
@@ -226,6 +229,7 @@ class LegRun:
         if self.alignment is None:
             self.alignment, self.about_alignment = align(
                 inputs, self.spans, self.rough, self.fixes_n, self.origin, config)
+        let_go(*vars(self.leg.imu).values())
         self.reasons += imu_gap(inputs.t_imu, min(self.alignment.t, 0.0), inputs.t_stop,
                                 config.leg.max_gap)
         self.track = self.reckon(inputs.travel)

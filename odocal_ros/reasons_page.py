@@ -43,9 +43,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or a value that no sensor '
         'gives, stand alone far from their neighbours, or are fixes far from all others. They '
         'were left out.',
-        Code.ROWS_DAMAGED: 'Several messages of a topic hold values beyond any sensor: the '
-        'recording itself is damaged. Those beside them may be wrong without showing it, so the '
-        'rows about each clump were left out too.',
+        Code.ROWS_DAMAGED: 'Several messages of a topic hold values beyond any sensor, or, near '
+        'such ones, far from those beside them: the recording itself is damaged. Others there '
+        'may be wrong without showing it, so the rows about each clump were left out too.',
         Code.STAMPS_NOT_RISING: 'Stamps of one topic repeat or step back. The fewest messages '
         'were left out that leave the rest in order.',
         Code.IMU_GAP: 'The Imu is silent, or repeats one value, for longer than `leg.max_gap`. '

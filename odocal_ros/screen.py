@@ -6,7 +6,6 @@ start mark; the mark is an Imu stamp, so the Imu's time offset moves the others 
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from odocal_ros.glitches import (
 from odocal_ros.leg import Leg
 from odocal_ros.nav.dead_reckoning import rough_scale
 from odocal_ros.nav.gaps import gaps_in_rhythm
+from odocal_ros.nav.integral import by_step
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
@@ -100,7 +100,10 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
 
     def rows(slot):
         sent = getattr(leg, slot)
-        clean = _rising(_finite(sent, slot, leg, found), slot, leg, found)
+        good, wild = _finite(sent, slot, leg, found)
+        clean = sent if good.all() else take(sent, good)
+        order = _rising(clean, slot, leg, found)
+        clean = clean if order is None else take(clean, order)
         t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset[slot]
         form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
         spikes = _spikes(slot, clean, t, form, config)
@@ -108,6 +111,10 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
                                 f'{LABEL[slot]} messages stand alone far from their neighbours, '
                                 f'first at t = {t[np.argmax(spikes)]:.2f} s; dropped'))
+            if not about_clumps(wild).any():        # else what is about them is left out already
+                at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
+                wild[at[spikes]] = True
+                spikes |= _damaged(wild, good, slot, found)[at]
             clean, t = take(clean, ~spikes), t[~spikes]
         if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
             found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
@@ -198,7 +205,7 @@ def _where(samples, index, leg) -> str:
 
 
 def _finite(samples, slot, leg, found):
-    """Drop rows without a stamp or with NaN or Inf in what a row needs."""
+    """Tell which rows have a stamp and what a row needs, and which are beyond any sensor."""
     needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
     if slot in ('fix_velocity', 'heading'):
         needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
@@ -218,22 +225,28 @@ def _finite(samples, slot, leg, found):
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
+    good = stamped & finite
+    suspect = _damaged(wild, good, slot, found, min(DAMAGED * len(wild), SEVERAL))
+    return good & ~suspect, wild
+
+
+def _damaged(wild, good, slot, found, most=np.inf):
+    """Tell which rows are about clumps of wild ones, and say so: or of more than so many."""
     suspect = about_clumps(wild)
-    if suspect.any() or wild.sum() > min(DAMAGED * len(wild), SEVERAL):
+    if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
-                            'messages hold values beyond any sensor; '
-                            f'{int((suspect & stamped & finite).sum())} more about them were '
+                            'messages hold values beyond any sensor, or far from those beside '
+                            f'them; {int((suspect & good & ~wild).sum())} more about them were '
                             'dropped too'))
-    good = stamped & finite & ~suspect
-    return samples if good.all() else take(samples, good)
+    return suspect
 
 
 def _rising(samples, slot, leg, found):
-    """Drop the fewest rows that leave the stamps strictly rising."""
+    """Return which rows to keep, the most whose stamps rise strictly; None for all."""
     stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all():
-        return samples
+        return None
     keep = _longest_rising(stamp)
     same, back = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
@@ -243,7 +256,7 @@ def _rising(samples, slot, leg, found):
     found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not rise: '
                         f'{" and ".join(what)}, first at {_where(samples, first, leg)}; '
                         f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
-    return take(samples, keep)
+    return keep
 
 
 def _longest_rising(stamp):
@@ -284,10 +297,12 @@ def _gaps(slot, t, found):
 
 def imu_gap(t_imu, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
     """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and t_stop."""
-    t = t_imu[(t_imu >= t_from - 1e-9) & (t_imu <= t_stop + 1e-9)]
-    edges = np.concatenate([[t_from], t, [t_stop]])
-    gaps = [(b - a, a) for a, b in pairwise(edges.tolist()) if b - a > limit] \
-        if np.diff(edges).max() > limit else []
+    t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
+              np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
+    long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
+    ends = [(t_from, t[0]), *zip(t[long], t[long + 1], strict=True), (t[-1], t_stop)] \
+        if len(t) else [(t_from, t_stop)]
+    gaps = [(float(b - a), float(a)) for a, b in ends if b - a > limit]
     if not gaps:
         return ()
     length, at = max(gaps)

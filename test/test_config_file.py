@@ -137,6 +137,8 @@ def test_set_takes_nan_where_a_setting_may_be_unset():
     ('leg.min_distance=', BadConfig, 'is not a number'),
     ('verdict.min_legs=2.5', BadConfig, 'is not a whole number'),
     ('leg.max_gap={a: 1}', BadConfig, 'is not a number'),
+    ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: want at most 1e.09'),
+    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'want at most'),
 ])
 def test_set_says_what_is_wrong(text, error, match):
     with pytest.raises(error, match=match) as caught:

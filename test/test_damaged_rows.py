@@ -76,6 +76,20 @@ def test_several_wild_rows_are_a_caution_wherever_they_stand(made, rows, accepte
     assert (result.verdict is Verdict.ACCEPTED) == accepted
 
 
+def test_wild_rows_and_rows_off_by_little_are_a_clump_together(made):
+    """A gyro of 0.8 rad/s in one row at rest lay between two that showed: a yaw 25 sigmas off."""
+    leg = made.leg()
+    at = int(np.searchsorted(leg.imu.stamp_ns, leg.start_ns)) - 600
+
+    def wrong(column):
+        column[[at, at + 3, at + 24]] = 1e200
+        column[at + 4, 2], column[at + 5, 0] = 0.78, 0.21
+    result = calibrate(replace(leg, imu=changed(leg.imu, w_i=wrong)),
+                       settings(made, method='two_point'))
+    assert Code.ROWS_DAMAGED in everything_said(result)
+    assert result.verdict is not Verdict.ACCEPTED
+
+
 def test_what_a_clump_is():
     wild = np.zeros(1000, bool)
     assert not about_clumps(wild).any()

@@ -18,6 +18,7 @@ from odocal_ros.samples import let_go
 
 BIN = 1.0                      # s, accelerations are compared as means over it
 LEAST = 20                     # bins
+SOME = 64                      # bins worked on at a time
 SURE = np.deg2rad(10.0)        # 1 sigma of where the Imu faces, to speak of it
 GAIN = 0.5, 2.0                # of the push by what the wheels say: else it is something else
 FAR = np.deg2rad(75.0)         # off the nominal: no mounting is meant so
@@ -72,19 +73,17 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
     if t1 - t0 < LEAST * BIN:
         return None
     edges = np.arange(t0, t1, BIN)
-    cell = np.searchsorted(edges, t) - 1
-    inside = (cell >= 0) & (cell < len(edges) - 1)
-    cell = cell[inside]
-    count = np.bincount(cell, minlength=len(edges) - 1)
-
-    def mean_of(column):
-        return np.bincount(cell, column[inside], len(edges) - 1) / np.maximum(count, 1)
-
-    means = [mean_of(column) for column in f.T]
-    let_go(f)
-    means.append(mean_of(w @ up))
-    let_go(w)
-    f, turn_rate = np.stack(means[:3], -1), means[3]
+    first = np.searchsorted(t, edges, side='right')
+    count = np.diff(first)
+    means = np.empty((len(count), 4))
+    for bins in (slice(k, k + SOME) for k in range(0, len(count), SOME)):
+        rows = slice(first[bins.start], first[bins.start + len(count[bins])])
+        cell = np.repeat(np.arange(len(count[bins])), count[bins])
+        for k, column in enumerate((*f[rows].T, w[rows] @ up)):
+            means[bins, k] = np.bincount(cell, column, len(count[bins]))
+        let_go(f, w)
+    means /= np.maximum(count, 1)[:, None]
+    f, turn_rate = means[:, :3].copy(), means[:, 3].copy()
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
     middle = (edges[:-1] + edges[1:]) / 2
     onward = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \

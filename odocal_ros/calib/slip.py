@@ -12,7 +12,7 @@ import numpy as np
 from odocal_ros.calib.result import Source
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.earth import gravity
-from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.integral import by_row, integral_at
 from odocal_ros.reasons import Code, Reason
 
 WINDOW = 4.0       # s, longer than a spin, shorter than a hill
@@ -71,7 +71,7 @@ def find_slips(t_imu, f_b, track, f, latitude, quantum):
 
 def acceleration(grid, t_imu, f_b, track, forward, latitude):
     """Return the mean acceleration along the forward axis from each grid time to the next."""
-    along = f_b @ forward
+    along = by_row(lambda f_b: f_b @ forward, f_b)
     force = np.diff(integral_at(grid, t_imu, along)) / STEP
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
     return force - gravity(latitude, 0.0) * rise

@@ -22,7 +22,6 @@ STANDS_S = 0.5         # without a count: the vehicle stands
 REST_NS = 1_000_000_000   # a shorter pause is no standstill
 CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
-CLOCK_REACH_NS = 200_000_000     # less than half of the limit, a few ticks
 
 
 def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -116,30 +115,41 @@ class FixPath:
 
 
 class Clocks:
-    """Compares the stamps of rows that arrived together: whose clock differs from the Imu's."""
+    """
+    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
 
-    def __init__(self) -> None:
+    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
+    """
+
+    def __init__(self, simulated: bool = False) -> None:
+        self._simulated = simulated
         self._imu: deque = deque(maxlen=40)
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
         self._ahead_s: dict[str, deque] = {}
 
     def feed(self, slot: str, block) -> None:
-        """Take a block; the Imu's must be fed before those that arrived with it."""
-        if slot == 'imu':
-            self._imu.append((block.received_ns, block.stamp_ns))
-        elif self._imu:
-            received = np.concatenate([r for r, _ in self._imu])
-            row = int(block.received_ns[-1])
-            # one sent just after the Imu's newest has nothing behind it yet: carry on from there,
-            # at the pace of a bag that is played
-            beyond = max(0, row - int(received.max()))
-            if received.min() <= row and beyond <= CLOCK_REACH_NS:
-                stamps = np.concatenate([s for _, s in self._imu])
-                # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
-                pace = np.ptp(stamps) / max(np.ptp(received), 1)
-                imu_ns = beyond * pace + np.interp(row - received[0], received - received[0],
-                                                   stamps - stamps[0])
-                ahead = (int(block.stamp_ns[-1]) - int(stamps[0]) - imu_ns) * 1e-9
-                self._ahead_s.setdefault(slot, deque(maxlen=CLOCK_ROWS)).append(ahead)
+        """Take a block."""
+        if slot != 'imu':
+            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
+            return
+        self._imu.append((block.received_ns, block.stamp_ns))
+        if not self._waiting:
+            return
+        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        first_received, first_stamp = int(received[0]), int(stamps[0])
+        received, stamps = received - first_received, stamps - first_stamp
+        # messages that queued for a node in simulated time arrive late, the Imu's more so than
+        # others': which of them belong together is not known then
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_LIMIT * 1e9
+        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
+            row = row_ns - first_received
+            if row > received.max():
+                continue
+            del self._waiting[name]
+            if row >= received.min() and not queued:
+                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
+                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
         """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
@@ -148,8 +158,10 @@ class Clocks:
                    'fix_velocity': config.gnss.time_offset}
         result = []
         for slot, ahead in self._ahead_s.items():
-            # the freshest of the last rows: latency on the way makes a row look older, never newer
-            value = max(ahead) + offsets.get(slot, 0.0) - config.imu.time_offset
+            offset = offsets.get(slot, 0.0) - config.imu.time_offset
+            # latency on the way makes a row look older: behind are those of whom the freshest is;
+            # that of an Imu's row makes others look newer: ahead are those of whom most are
+            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
             if abs(value) > CLOCK_LIMIT:
                 result.append((slot, value))
         return result
@@ -158,8 +170,8 @@ class Clocks:
 class Progress:
     """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
 
-    def __init__(self) -> None:
-        self.clocks = Clocks()
+    def __init__(self, simulated: bool = False) -> None:
+        self.clocks = Clocks(simulated)
         self._travel: dict[str, Travel] = {}
         self._path = FixPath()
         self._zero = 0.0

@@ -31,15 +31,19 @@ class Recording:
     def __init__(self, node: Node, config: Config,
                  remember: Callable[[Input, list[bytes], list[int]], None]) -> None:
         self.inputs = Inputs(node, config)
-        self.recorder, self.progress = LegRecorder(), Progress()
+        self.recorder = LegRecorder()
         self._remember = remember
         self.tap: Callable[[str, Samples], None] | None = None  # hears every block as well
         self._clock = node.get_clock()
+        self.progress = self._no_progress()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clock_jumped = False
         self._jumps = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(seconds=-BACKWARD_S)),
             post_callback=self._note_jump)
+
+    def _no_progress(self) -> Progress:
+        return Progress(self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def pump(self, config: Config, found_scale: float) -> None:
         """Decode what has come since the last call, in blocks."""
@@ -105,7 +109,7 @@ class Recording:
         """Drop everything, as after a jump of time."""
         self._clock_jumped = False
         self.recorder.clear()
-        self.progress = Progress()
+        self.progress = self._no_progress()
         for source in self.inputs.by_slot.values():
             source.take()
             source.health.forget()

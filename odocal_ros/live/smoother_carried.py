@@ -5,7 +5,7 @@ What is added to a leg moves what was there only a little, so that few passes do
 noise levels and slips are taken over from the look before.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, Priors, State
-from odocal_ros.nav.strapdown import rotation_increments
 
 SPEED_WINDOW = 0.4          # s each side, over which a speed is taken
 ALIKE = 1e-6                # s, keyframes that are the same
@@ -54,8 +53,7 @@ def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
     k -= grid - t[k - 1] < t[k] - grid
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
     key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
-    return ImuRows(t, view.f_b[first:last + 1],
-                   rotation_increments(t, view.w_b[first:last + 1]).T, key)
+    return ImuRows(t, view.f_b[first:last + 1], view.w_b[first:last + 1], key)
 
 
 def carried(last: Footing, problem: Problem) -> Footing | None:
@@ -81,7 +79,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     """Return a state reckoned on by gyro and odometer over the keyframes that it lacks."""
     imu, leg, n = problem.imu, problem.leg, len(state.t)
     key = imu.key[n - 1:]
-    rows = ImuRows(imu.t[key[0]:], imu.f_b[key[0]:], imu.turn[key[0]:], key - key[0])
+    rows = replace(imu, key=key)
     K, c = len(key) - 1, state.constants
     on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
           for name, value in vars(state).items() if name != 'constants'}

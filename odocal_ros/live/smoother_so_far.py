@@ -241,4 +241,4 @@ def _of_cells(view, imu) -> float:
     A turn by theta within a step shortens the chord of its middle by theta^2 / 12.
     """
     way = np.abs(np.diff(view.travel.at(imu.t)))
-    return float(way @ (imu.turn**2).sum(axis=1) / (12 * max(way.sum(), 1e-9)))
+    return float(way @ (imu.turns()**2).sum(axis=1) / (12 * max(way.sum(), 1e-9)))

@@ -78,7 +78,7 @@ class Input:
         self._deserialize: Callable | None = None
         self._subscription: Subscription | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        # in sim time a message is stamped with the node clock as it arrives: no queueing then
+        # in sim time a message is stamped with the node clock as it arrives
         self.gate = Gate(node.get_clock().ros_time_is_active)  # type: ignore[attr-defined]
 
     def check(self, config: Config) -> None:
@@ -159,24 +159,28 @@ class Input:
         return reader.form is not None and reader.form.quantity == 'increment'
 
     def _receive(self, raw: bytes, info: dict) -> None:
-        """Remember one message that the executor brought."""
+        """Remember one message."""
         if self.gate.is_open:
             info['source_timestamp'] = self._node.get_clock().now().nanoseconds
         self._pending.append((raw, info))
 
     def _fetch(self, subscription: Subscription) -> None:
-        """Take what waits in the middleware's queue, as the executor would."""
+        """
+        Take what waits in the middleware's queue, as the executor would.
+
+        The executor takes one at a time of each topic, so that where it lags the Imu lags most.
+        """
         handle, kind = subscription.handle, subscription.msg_type
         with handle:
             for _ in range(DEPTH[self.slot]):
                 message_and_info = handle.take_message(kind, True)
                 if message_and_info is None:
                     return
-                self._pending.append(message_and_info)
+                self._receive(*message_and_info)
 
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages that came since the last call, and when they were sent, ns."""
-        if self._subscription is not None and not self.gate.is_open:
+        if self._subscription is not None:
             self._fetch(self._subscription)
         pending, self._pending = self._pending, deque()
         if pending:

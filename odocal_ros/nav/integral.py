@@ -25,13 +25,13 @@ def by_row(function, *columns):
     return np.concatenate(parts) if parts else function(*columns)
 
 
-def by_step(function, *columns):
-    """Return what a function, (m, ...) to (m - 1,), makes of neighbouring rows: (n - 1,)."""
+def by_step(function, *columns, steps=1):
+    """Return what a function of rows side by side, (m, ...) to (m - steps,), makes of them all."""
     n = len(columns[0])
-    if n < 2:
+    if n < 1 + steps:
         return function(*columns)
-    return np.concatenate([function(*(x[rows.start:rows.stop + 1] for x in columns))
-                           for rows in chunks(n - 1, *columns)])
+    return np.concatenate([function(*(x[rows.start:rows.stop + steps] for x in columns))
+                           for rows in chunks(n - steps, *columns)])
 
 
 def medians(x):

@@ -16,9 +16,11 @@ EVEN = 2.0       # ratio of neighbouring intervals up to which a cubic is laid t
 TINY = 1e-9      # s, of the stamps: keeps the slope of equal stamps finite
 
 
-def rotation_increments(t, w_b):
+def rotation_increments(t, w_b, begin=0, end=None):
     """
     Return the rotation vectors of b between samples: (n,), (n, 3) to (3, n - 1) rad.
+
+    begin, end : of which intervals, to the last bit as if of all; by default of all.
 
     Rate as a cubic through four samples, with the coning term of the same order
     (Bortz: phi = int w + 1/2 int alpha x w); at the ends, and where stamps are uneven by more
@@ -26,10 +28,11 @@ def rotation_increments(t, w_b):
     falls with the fourth power of the step, two-sample with the second.
     """
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
-    n = max(len(t) - 1, 0)
-    phi = np.empty((3, n))
-    for first in range(0, n, CHUNK):
-        phi[:, first:first + CHUNK] = _increments(t, w_b, first, min(first + CHUNK, n))
+    end = max(len(t) - 1, 0) if end is None else end
+    phi = np.empty((3, end - begin))
+    for first in range(begin, end, CHUNK):
+        last = min(first + CHUNK, end)
+        phi[:, first - begin:last - begin] = _increments(t, w_b, first, last)
         let_go(w_b)
     return phi
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.sanity import G
+from odocal_ros.fix_screen import placed
 from odocal_ros.glitches import beyond, oriented
 from odocal_ros.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 
@@ -87,8 +88,7 @@ def fixes(samples: FixSamples) -> dict:
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
         & ~beyond('covariance_n', covariance)
     sigma = np.sqrt(covariance[known, :2].max(axis=1)) if known.any() else np.empty(0)
-    place = ~beyond('latitude', samples.latitude) & ~beyond('longitude', samples.longitude) \
-        & ((samples.latitude != 0) | (samples.longitude != 0))
+    place = placed(samples)
     heights = samples.height[place & ~beyond('height', samples.height)]
     values, counts = np.unique(samples.status, return_counts=True)
     return {

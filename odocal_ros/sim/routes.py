@@ -12,6 +12,8 @@ BLEND = 1.0        # s in which an acceleration sets in
 TURN_BLEND = 1.5   # s in which a turn rate sets in
 SIDE_LIMIT = 3.0   # m/s^2 to the side in a turn
 TOWN_LIMIT = math.radians(110.0)   # rad off the first heading, so that a town drive gets away
+YARD_MOVE = 40.0   # s, longer than any move in a yard with the stop after it
+TOWN_ENOUGH = 135.0   # s of a town drive that hold a cycle, whatever is drawn
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def town(duration: float, rng) -> Route:
     6 s or more, 6 to 12 s down, 4 to 15 s still. Turns keep the heading within 110 deg of the
     first, so that the end lies well away from the start.
     """
-    left = _rest('town', duration, 20 + 15)
+    left = _rest('town', duration, 20 + 15, enough=TOWN_ENOUGH)
     stretches, off = [(hold(20), hold(20))], 0.0
     while left >= 90.0 or not stretches[1:]:
         speed, rate, off = _town_cycle(rng, off)
@@ -67,7 +69,7 @@ def town(duration: float, rng) -> Route:
         left -= length
     if not stretches[1:]:
         raise BadUsage(f'scenario town: --duration {duration:g} s holds no cycle of stop and go; '
-                       'give 135 s or more')
+                       f'give {TOWN_ENOUGH:g} s or more')
     stretches.append((hold(15 + left), hold(15 + left)))
     return _route(stretches)
 
@@ -106,9 +108,9 @@ def yard(duration: float, rng) -> Route:
 
     In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
     """
-    left = _rest('yard', duration, 20 + 15)
+    left = _rest('yard', duration, 20 + 15, least=YARD_MOVE)
     stretches = [(hold(20), hold(20))]
-    while left >= 40:
+    while left >= YARD_MOVE:
         top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
         up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
             (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4)))
@@ -146,10 +148,11 @@ def _tenth(seconds):
     return round(float(seconds), 1)
 
 
-def _rest(name, duration, fixed):
-    if not math.isfinite(duration) or duration < fixed + 10:
+def _rest(name, duration, fixed, least=10.0, enough=None):
+    """Return what is left beside the fixed parts, s; too little is told with what is enough."""
+    if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
-                       f'give {fixed + 10:g} s or more')
+                       f'give {enough or fixed + least:g} s or more')
     return duration - fixed
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import shlex
+import warnings
 
 import numpy as np
 import pytest
@@ -268,6 +269,17 @@ def test_fixes_that_are_none(tmp_path, capsys):
     assert [f['text'] for f in told['findings'] if f['code'] == 'NO_FIX'] == [
         'no topic for the fixes']
     assert len(told['standstills']) == 2            # seen without fixes too
+
+
+def test_fixes_off_the_earth(tmp_path, capsys):
+    fixes = [row for row in drive() if row[0] == '/fix']
+    for (_, _, message), latitude in zip(fixes, (1e300, -1e308, np.inf, 91.0), strict=False):
+        message.latitude = latitude
+    rest = [row for row in drive() if row[0] != '/fix']
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        told, _ = inspect(ros_bags.write(tmp_path / 'bag', fixes + rest), capsys)
+    assert topic(told, '/fix')['fix']['positions'] == 750 - 4
 
 
 def test_orientation_as_heading(tmp_path, capsys):

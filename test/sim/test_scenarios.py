@@ -1,6 +1,8 @@
 """Named drives: what they promise of length, stops, turns and marks."""
 
+from contextlib import suppress
 from dataclasses import replace
+import re
 
 import numpy as np
 import pytest
@@ -177,3 +179,15 @@ def test_a_yard_is_slow_and_winding_and_goes_backwards_too(seed):
     assert np.degrees(np.abs(state.yaw_rate)).max() > 15
     moves = ~still
     assert np.count_nonzero(moves[1:] & ~moves[:-1]) > 20
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_a_drive_too_short_is_told_what_is_enough(name):
+    with pytest.raises(BadUsage, match='too short') as told:
+        states(name, duration=20.0)
+    enough = float(re.search(r'give (\d+) s', str(told.value))[1])
+    for seed in range(5):
+        assert abs(states(name, duration=enough, seed=seed)[0].distance) > 1
+        for duration in np.linspace(20.0, enough, 12)[1:-1]:
+            with suppress(BadUsage):
+                assert abs(states(name, duration=duration, seed=seed)[0].distance) > 1

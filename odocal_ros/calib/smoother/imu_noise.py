@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.nav.integral import by_step
+from odocal_ros.nav.integral import by_step, chunks
 
 LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
 # noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
@@ -19,10 +19,9 @@ def sensor_noise(grade) -> dict[str, float]:
 
 def at_rest(imu, leg, still) -> dict:
     """Return white noise levels of gyro and accelerometer as standstills show them."""
-    turn = np.add.reduceat(imu.turn, imu.key[:-1])
-    force = np.concatenate([
-        np.add.reduceat((rows.f_b[:-1] + rows.f_b[1:]) / 2 * np.diff(rows.t)[:, None],
-                        rows.key[:-1]) for _, _, rows in imu.parts()])
+    turn = imu.turned()
+    force = imu.over_intervals(lambda rows: np.add.reduceat(
+        (rows.f_b[:-1] + rows.f_b[1:]) / 2 * np.diff(rows.t)[:, None], rows.key[:-1]))
     T = np.diff(imu.t[imu.key])[:, None]
     inside = still[:-1] & still[1:]
     rest = np.flatnonzero(inside)
@@ -52,10 +51,13 @@ def shaken(imu) -> dict:
     def jumps(x):
         return (np.diff(x, axis=0)**2).sum(axis=1)
 
-    dt = np.diff(imu.t)
-    out = {}
-    for name, jump in (
-            ('gyro', by_step(lambda turn, dt: jumps(turn / dt[:, None]), imu.turn, dt)),
-            ('accel', by_step(jumps, imu.f_b))):
-        out[name] = float(np.median(jump) / 2.366 / 2 * np.median(dt))     # of chi2 with 3
-    return out
+    def of_gyro():
+        steps = chunks(len(imu.t) - 2)
+        return np.concatenate([jumps(
+            imu.turns(some.start, some.stop + 1)
+            / np.diff(imu.t[some.start:some.stop + 2])[:, None]) for some in steps])
+
+    usual = float(np.median(np.diff(imu.t), overwrite_input=True))
+    return {name: float(np.median(jump(), overwrite_input=True) / 2.366 / 2 * usual)
+            for name, jump in (('gyro', of_gyro),             # 2.366: of chi2 with 3
+                               ('accel', lambda: by_step(jumps, imu.f_b)))}

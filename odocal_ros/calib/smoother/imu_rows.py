@@ -32,12 +32,26 @@ def keyframes(t, t_begin, t_end, spacing):
 
 
 @dataclass(frozen=True, eq=False)
-class ImuRows:
-    """Imu samples of the leg with what never changes from one pass to the next."""
+class SomeRows:
+    """Imu samples between some keyframes, first and last with them."""
 
     t: Floats           # (n,)
     f_b: Floats         # (n, 3)
     turn: Floats        # (n - 1, 3) rotation vectors between samples, bias and all
+    key: NDArray[np.int64]   # (k + 1,) samples that are keyframes
+
+
+@dataclass(frozen=True, eq=False)
+class ImuRows:
+    """
+    Imu samples of the leg.
+
+    Rotation vectors are made of the turn rates anew in each pass: those of hours are 0.2 GB.
+    """
+
+    t: Floats           # (n,)
+    f_b: Floats         # (n, 3)
+    w_b: Floats         # (n, 3)
     key: NDArray[np.int64]   # (K + 1,) samples that are keyframes
 
     @classmethod
@@ -46,22 +60,34 @@ class ImuRows:
         key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
         rows = slice(key[0], key[-1] + 1)
         t = leg.t_imu[rows]
-        return cls(t, leg.f_b[rows], rotation_increments(t, leg.w_b[rows]).T, key - key[0])
+        return cls(t, leg.f_b[rows], leg.w_b[rows], key - key[0])
 
     def parts(self):
         """Yield first and last of the keyframes of some intervals, and their rows."""
         K = len(self.key) - 1
-        per = max(1, int(CHUNK * K / max(len(self.t), 1)))
+        per = max(1, int(CHUNK * K / (self.key[-1] - self.key[0] + 1)))
         for first in range(0, K, per):
             last = min(first + per, K)
             yield first, last, self.between(first, last)
             let_go(self.f_b)
 
-    def between(self, first, last):
-        """Return the rows from one keyframe to another, both with them."""
+    def between(self, first, last) -> SomeRows:
+        """Return the rows from one keyframe to another."""
         a, b = self.key[first], self.key[last]
-        return ImuRows(self.t[a:b + 1], self.f_b[a:b + 1], self.turn[a:b],
-                       self.key[first:last + 1] - a)
+        return SomeRows(self.t[a:b + 1], self.f_b[a:b + 1], self.turns(a, b),
+                        self.key[first:last + 1] - a)
+
+    def turns(self, begin=0, end=None):
+        """Return the rotation vectors of some steps, bias and all: (m, 3)."""
+        return rotation_increments(self.t, self.w_b, begin, end).T
+
+    def over_intervals(self, function):
+        """Return what a function of SomeRows gives for each interval: (K, ...)."""
+        return np.concatenate([function(rows) for _, _, rows in self.parts()])
+
+    def turned(self):
+        """Return the sum of the rotation vectors over each interval: (K, 3)."""
+        return self.over_intervals(lambda rows: np.add.reduceat(rows.turn, rows.key[:-1]))
 
 
 def mended(imu, constants):

@@ -106,7 +106,8 @@ class Part:
 
     def all_told(self, near):
         """Return that of all intervals: (K, 3, 2n + M)."""
-        return np.concatenate([self.to_told(block) for _, block in near.blocks()])
+        # copies: a view of a few rows would hold the whole block
+        return np.concatenate([self.to_told(block).copy() for _, block in near.blocks()])
 
 
 class Total:

@@ -9,7 +9,9 @@ there an ordinary road's noise is believed, whatever the residuals of the single
 import numpy as np
 
 from odocal_ros.calib.smoother.noise import TURNING
+from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.start import rest_bias
+from odocal_ros.nav.integral import chunks
 from odocal_ros.reasons import Code, Reason
 
 TESTED = 2e-4                   # m/sqrt(s), least that is believed where there are turns
@@ -27,8 +29,11 @@ def turned(leg, imu) -> float:
     """Return the angle driven in turns, all counted positive, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
-    turn = np.add.reduceat(imu.turn, imu.key[:-1]) - rest_bias(leg, imu)[0] * T[:, None]
-    up = imu.f_b.mean(axis=0)
+    turn = imu.turned() - rest_bias(leg, imu)[0] * T[:, None]
+    total = Total()
+    for some in chunks(len(imu.t), imu.f_b):
+        total.add(imu.f_b[some])
+    up = total.sum / len(imu.t)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
     way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
     return float(angle[(angle > TURNING * T) & (way > MOVING * T)].sum())

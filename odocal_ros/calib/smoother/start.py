@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.check import pieces, steady
+from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.state import LN_K, M, PITCH, State, YAW
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
+from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.rotations import skew
 
 LIVELY = 1.0          # m/s^2 that an acceleration over 1 s may be of
@@ -45,12 +47,15 @@ def standing(leg, t):
 
 def rest_bias(leg, imu):
     """Return the mean turn rate of all standstills, (3,), and how long they last, s."""
-    dt = np.diff(imu.t)
-    still = standing(leg, imu.t[:-1]) & standing(leg, imu.t[1:])
-    length = float(dt[still].sum())
+    inside = standing(leg, imu.t)
+    still = inside[:-1] & inside[1:]
+    length = float(np.diff(imu.t)[still].sum())
     if length < 1.0:
         return np.zeros(3), 0.0
-    return imu.turn[still].sum(axis=0) / length, length
+    turned = Total()
+    for some in chunks(len(still)):
+        turned.add(imu.turns(some.start, some.stop)[still[some]])
+    return turned.sum / length, length
 
 
 def first_state(leg, imu, priors, yaw=None) -> Start:
