@@ -20,6 +20,7 @@ EXCURSION = 30.0     # s after which a counter that comes back is no longer take
 MOST_JUMPS = 200     # beyond it the counter is not mended, but judged by the check
 GAP = 2.5            # median intervals: a message or more is missing
 BESIDE = 5           # steps beside a jump or a gap that tell the speed there
+MORE = 1.5           # times what rows tell: as long a way at speeds sent as zero is a dead band's
 LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
 
 
@@ -126,7 +127,37 @@ def doubted(way: Travel, value, form):
     # speeds within a gap: anything between those beside it, and more the longer it is
     spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
         np.abs(before), np.abs(after)) / np.sqrt(3)
-    return way, way.t[odd], spread * missing
+    lost, sigma = way.t[odd], spread * missing
+    if form.quantity == 'rate':
+        hidden = np.copysign(_hidden(way, value), step)
+        at = np.flatnonzero(hidden)
+        way = replace(way, s=way.s + np.concatenate([[0.0], np.cumsum(hidden)]))
+        lost, sigma = np.r_[lost, way.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
+    return way, lost, sigma
+
+
+def _hidden(way, value):
+    """
+    Return how far the wheel rolls in each step at speeds that are sent as zero: (n - 1,).
+
+    In a dead band the speed goes on to zero, or comes from there, as it changed beside: it rolls
+    by v^2 / 2a, of which the mean of the two rows has half a step. A robot in a yard that stops
+    every ten metres loses per cent by it.
+    """
+    hidden, size = np.zeros(len(value) - 1), np.abs(value)
+    least = 2 * way.coarse.step if way.coarse else 0.0
+    for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
+        stops = size[edge + 1] == 0
+        rows = np.arange(edge, edge - BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
+                                                                          + BESIDE)
+        rows = rows[(rows >= 0) & (rows < len(size))]
+        v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
+        took = abs(way.t[rows[-1]] - way.t[rows[0]])
+        if v > least and change > 0 and took > 0:
+            told = v * (way.t[edge + 1] - way.t[edge]) / 2
+            whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
+            hidden[edge] = whole - told if whole > MORE * told else 0.0
+    return hidden
 
 
 def _stall(step, j):
