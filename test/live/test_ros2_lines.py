@@ -11,6 +11,7 @@ from pages import all_commands
 from player import messages_of, part, Player
 import pytest
 from test_shown_names import has_field, INPUT_TYPES
+import yaml
 
 from odocal_ros.live.definitions import message_class
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -31,7 +32,7 @@ def of(*start):
 @pytest.fixture(scope='module')
 def driven(domain, tmp_path_factory):
     """Start the node as the README does and drive a leg with the services as written there."""
-    run, = (words for words in of('run') if words[1] == 'calibrator')
+    run = next(words for words in of('run') if words[1] == 'calibrator')     # the README's
     ros_args = run[run.index('--ros-args') + 1:]
     node = NodeProcess(*ros_args, '-p', f'output.directory:={tmp_path_factory.mktemp("out")}')
     client = Client()
@@ -71,8 +72,8 @@ def ask(node, name, kind):
 def test_every_line_is_of_a_kind_that_is_tried_here():
     assert {tuple(words[1:3]) if words[1] != 'run' and words[1] != 'launch' else (words[1],)
             for _, words in LINES} == {('run',), ('launch',), ('service', 'call'),
-                                       ('topic', 'echo'), ('param', 'get'), ('param', 'dump'),
-                                       ('bag', 'record')}
+                                       ('topic', 'echo'), ('param', 'get'), ('param', 'set'),
+                                       ('param', 'dump'), ('bag', 'record')}
 
 
 def test_run_names_an_entry_point_of_the_package():
@@ -131,6 +132,13 @@ def test_parameters_are_there_and_hold_the_result(driven):
     off = values['result.scale_factor'] - driven.truth
     assert abs(off) < 4 * values['result.scale_factor_sigma']
     assert not math.isnan(off)
+
+
+def test_what_is_set_is_taken(driven):
+    for name, parameter, value in of('param', 'set'):
+        assert name == '/calibrator'
+        assert driven.client.set(**{parameter: yaml.safe_load(value)}).successful
+        assert driven.client.get(parameter) == [yaml.safe_load(value)]
 
 
 def test_a_dump_lists_the_settings_and_the_result(driven):

@@ -161,7 +161,7 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
     # an Imu whose axes are off by half a degree: without turns no pitch against the plane of them
-    assert 'the result: scale by smoother, yaw unknown, pitch by two_point' in out
+    assert 'the result: scale by smoother, yaw and pitch unknown' in out
     said = ' '.join(out.split())
     assert 'YAW_NOT_DETERMINED: the drive tells the yaw mounting to' in said
     assert 'Drive with stops, starts and turns' in said
