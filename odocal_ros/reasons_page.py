@@ -139,7 +139,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'angle. The only heading here is the course over ground, or one less certain than the '
         'yaw is asked to be. The scale is not touched by it.',
         Code.GYROCOMPASS_REFUSED: 'The heading was to come from the turning of the Earth, but the '
-        'gyro bias is too large or the rest too short for it.',
+        'gyro bias is too large or the rest too short for it, or what the gyro shows at rest is '
+        'not that turning: its grade is set too good.',
         Code.HEADING_UNAVAILABLE: 'The heading source that was asked for gave nothing usable; the '
         'course over ground was taken.',
         Code.PITCH_NOT_DETERMINED: 'The fixes give no height, or none good enough: the pitch is '
