@@ -5,21 +5,16 @@ ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and the READ
 made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
 """
 
-from dataclasses import dataclass, fields, is_dataclass, replace
-import difflib
-from functools import cache
+from dataclasses import dataclass
 import math
-from typing import Any, TypeVar
 
-from odocal_ros.errors import BadConfig
-from odocal_ros.setting import Setting, setting
+from odocal_ros.setting import setting, settings_of, with_settings  # noqa: F401  its other half
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
 FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
            'report')
 NAN = math.nan
-AnyConfig = TypeVar('AnyConfig', bound=Any)     # Config, or that of another node
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,22 +256,6 @@ class Config:
     diagnostic_updater: UpdaterConfig = UpdaterConfig()
 
 
-def _settings(owner, prefix=''):
-    for f in fields(owner):
-        if is_dataclass(f.default):
-            yield from _settings(f.default, f'{prefix}{f.name}.')
-        else:
-            m = f.metadata
-            yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
-                          m['choices'], m['about'], m['ro'], m['frame'])
-
-
-@cache
-def settings_of(kind: type) -> dict[str, Setting]:
-    """Return the settings of a dataclass of settings by dotted name."""
-    return {s.name: s for s in _settings(kind())}
-
-
 SETTINGS = settings_of(Config)
 
 
@@ -290,27 +269,3 @@ def value_of(config: Config, name: str):
 def flat(config: Config) -> dict:
     """Return every setting by its dotted name."""
     return {name: value_of(config, name) for name in SETTINGS}
-
-
-def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
-    """
-    Return config with settings changed by dotted name, each checked.
-
-    Raises
-    ------
-    BadConfig
-        Unknown name (the nearest ones are told), wrong type, out of range.
-
-    """
-    groups: dict[str, dict] = {}
-    settings = settings_of(type(config))
-    for name, value in changes.items():
-        if name not in settings:
-            near = difflib.get_close_matches(name, settings, 3, 0.5)
-            hint = f'; did you mean {" or ".join(near)}?' if near else ''
-            raise BadConfig(f'no setting {name!r}{hint}')
-        group, _, leaf = name.rpartition('.')
-        groups.setdefault(group, {})[leaf] = settings[name].checked(value)
-    top = groups.pop('', {})
-    nested = {g: replace(getattr(config, g), **values) for g, values in groups.items()}
-    return replace(config, **top, **nested)

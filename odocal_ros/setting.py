@@ -1,13 +1,16 @@
 """One setting: how it is declared in a dataclass, and how a value for it is checked."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+import difflib
+from functools import cache
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.outside import is_frame, one_line
 
 LARGEST = 1e9      # no setting in SI units means a number beyond it; sums with it stay finite
+AnyConfig = TypeVar('AnyConfig', bound=Any)     # a dataclass of settings and groups of them
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
 
@@ -88,3 +91,43 @@ class Setting:
         if self.frame and not is_frame(value) and value != self.default:
             raise BadConfig(f'{self.name}: {value!r} is no frame name; want letters, digits and '
                             '_ . / -, no / at its beginning')
+
+
+def _settings(owner, prefix=''):
+    for f in fields(owner):
+        if is_dataclass(f.default):
+            yield from _settings(f.default, f'{prefix}{f.name}.')
+        else:
+            m = f.metadata
+            yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
+                          m['choices'], m['about'], m['ro'], m['frame'])
+
+
+@cache
+def settings_of(kind: type) -> dict[str, Setting]:
+    """Return the settings of a dataclass of settings by dotted name."""
+    return {s.name: s for s in _settings(kind())}
+
+
+def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
+    """
+    Return config with settings changed by dotted name, each checked.
+
+    Raises
+    ------
+    BadConfig
+        Unknown name (the nearest ones are told), wrong type, out of range.
+
+    """
+    groups: dict[str, dict] = {}
+    settings = settings_of(type(config))
+    for name, value in changes.items():
+        if name not in settings:
+            near = difflib.get_close_matches(name, settings, 3, 0.5)
+            hint = f'; did you mean {" or ".join(near)}?' if near else ''
+            raise BadConfig(f'no setting {name!r}{hint}')
+        group, _, leaf = name.rpartition('.')
+        groups.setdefault(group, {})[leaf] = settings[name].checked(value)
+    top = groups.pop('', {})
+    nested = {g: replace(getattr(config, g), **values) for g, values in groups.items()}
+    return replace(config, **top, **nested)

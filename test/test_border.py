@@ -101,7 +101,7 @@ def test_parts_that_must_not_see_each_other_do_not(part):
 
 def test_the_pure_parts_ask_no_clock_and_open_nothing():
     pure = [p for p in _modules() if _part(p) in (
-        'nav', 'calib', 'pipeline', 'align', 'screen', 'apply', 'parts', 'automatic',
+        'nav', 'calib', 'pipeline', 'align', 'screen', 'row_screen', 'apply', 'parts', 'automatic',
         'odometer_steps')]
     assert len(pure) > 10
     for path in pure:

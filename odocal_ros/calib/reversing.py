@@ -9,7 +9,7 @@ that only once the stretch is long beside their noise; a few metres are enough f
 import numpy as np
 
 from odocal_ros.calib.sanity import G
-from odocal_ros.nav.integral import Integral, integral_at, interpolated, pieces
+from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.reasons import Code, Reason
 
 STEP = 0.1          # s, grid
@@ -143,17 +143,9 @@ class _Forces:
     def __init__(self, t, t_imu, w_b, f_b):
         self.turned = integral_at(t, t_imu, w_b)
         self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-HALF, 0.0))
-        before, here, after = (_way(t + d, t_imu, f_b[:, 0]) for d in (-HALF, 0.0, HALF))
+        before, here, after = (twice_integral_at(t + d, t_imu, f_b[:, 0])
+                               for d in (-HALF, 0.0, HALF))
         self.push = (before - 2 * here + after) / HALF**2
-
-
-def _way(times, t, x):
-    """Return the integral of the integral of x at rising times."""
-    speed, way, out = Integral(), Integral(), np.empty(len(times))
-    for where, rows in pieces(times, t, x):
-        interpolated(times[where], t[rows], way.over(t[rows], speed.over(t[rows], x[rows])),
-                     out[where])
-    return out
 
 
 def _ratio(t, push, force, a, b):

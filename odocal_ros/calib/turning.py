@@ -4,7 +4,7 @@ import numpy as np
 
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.nav.angles import arctan2
-from odocal_ros.nav.integral import Integral, interpolated, pieces
+from odocal_ros.nav.integral import twice_integral_at
 from odocal_ros.reasons import Code, Reason
 
 TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
@@ -37,7 +37,7 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     course = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     # the mean angle over each chord; what a bias adds goes with the time
     ends = t_fix[knots]
-    gyro = np.diff(_twice(ends, t_imu, w_up)) / np.diff(ends)
+    gyro = np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends)
     drift = np.stack([np.ones_like(t), t], -1)
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
@@ -46,15 +46,6 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
     alike = abs(slope) * np.sqrt(power / (course @ course))
     return 1 / slope if alike > ALIKE else None
-
-
-def _twice(times, t, x):
-    """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
-    once, twice, out = Integral(), Integral(), np.empty(len(times))
-    for where, rows in pieces(times, t, x):
-        interpolated(times[where], t[rows], twice.over(t[rows], once.over(t[rows], x[rows])),
-                     out[where])
-    return out
 
 
 def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:

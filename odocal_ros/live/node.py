@@ -8,22 +8,18 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import ParameterException
-from rclpy.node import Node
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from odocal_ros.errors import BadConfig, OdocalError
+from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.plain_log import PlainLog
-from odocal_ros.live.process import complain, run
+from odocal_ros.live.process import complain, run, SettledNode
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
-from odocal_ros.outside import said_by
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
@@ -45,7 +41,7 @@ settings     parameters, all in config/calibrator.yaml with what they mean:
 SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
 
 
-class Calibrator(Node):
+class Calibrator(SettledNode):
     """
     Calibrates an odometer over legs that the operator marks by service.
 
@@ -57,15 +53,7 @@ class Calibrator(Node):
     at_work = False
 
     def __init__(self, node_name: str = 'calibrator', **kwargs) -> None:
-        try:
-            super().__init__(node_name, **kwargs)
-            try:
-                self._build()
-            except Exception:
-                self.destroy_node()
-                raise
-        except (ParameterException, InvalidQosOverridesError) as error:
-            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
+        super().__init__(node_name, **kwargs)
 
     def _build(self) -> None:
         self.config = params.declare(self)

@@ -8,9 +8,6 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.exceptions import ParameterException
-from rclpy.node import Node
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 
 from odocal_ros.apply.odometry import Odometry, Pose
 from odocal_ros.apply.vehicle import vehicle_of
@@ -19,9 +16,8 @@ from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.inputs import IMU
 from odocal_ros.live.plain_log import PlainLog
-from odocal_ros.live.process import run
+from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
-from odocal_ros.outside import said_by
 from odocal_ros.samples import take
 
 TICK_S, LOOK_S = 0.01, 1.0
@@ -41,19 +37,11 @@ publishes    odometry (nav_msgs/Odometry), odometry/twist
 settings     parameters, all in config/odometry.yaml with what they mean"""
 
 
-class OdometryNode(Node):
+class OdometryNode(SettledNode):
     """Joins the inputs of the calibrator to ``Odometry`` and its poses to two topics."""
 
     def __init__(self, node_name: str = 'odometry', **kwargs) -> None:
-        try:
-            super().__init__(node_name, **kwargs)
-            try:
-                self._build()
-            except Exception:
-                self.destroy_node()
-                raise
-        except (ParameterException, InvalidQosOverridesError) as error:
-            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
+        super().__init__(node_name, **kwargs)
 
     def _build(self) -> None:
         self.config = params.declare(self, ApplyConfig)

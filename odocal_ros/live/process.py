@@ -7,12 +7,32 @@ import sys
 import tempfile
 
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
 
-from odocal_ros.errors import OdocalError
+from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.outside import one_line, said_by
+
+
+class SettledNode(Node):
+    """A node that builds itself of its parameters, or says in one line which is wrong."""
+
+    def __init__(self, node_name: str, **kwargs) -> None:
+        try:
+            super().__init__(node_name, **kwargs)
+            try:
+                self._build()
+            except Exception:
+                self.destroy_node()
+                raise
+        except (ParameterException, InvalidQosOverridesError) as error:
+            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
+
+    def _build(self) -> None:
+        raise NotImplementedError
 
 
 def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:

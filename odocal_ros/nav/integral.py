@@ -91,3 +91,12 @@ def interpolated(times, t, x, out):
         return
     for k in range(x.shape[1]):
         out[:, k] = np.interp(times, t, x[:, k])
+
+
+def twice_integral_at(times, t, x):
+    """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
+    once, twice, out = Integral(), Integral(), np.empty(len(times))
+    for where, rows in pieces(times, t, x):
+        interpolated(times[where], t[rows], twice.over(t[rows], once.over(t[rows], x[rows])),
+                     out[where])
+    return out
