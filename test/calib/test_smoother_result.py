@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+import re
 
 from drives import changed
 import numpy as np
@@ -124,6 +125,9 @@ def test_an_even_drive_straight_on_tells_no_yaw():
     method = smooth(middle, config)
     assert method.estimates['yaw_mounting_angle'].value is None
     assert Code.YAW_NOT_DETERMINED in codes(method)
+    text, = (r.text for r in method.reasons if r.code is Code.YAW_NOT_DETERMINED)
+    told, wanted = (float(x) for x in re.findall(r'([\d.]+) deg', text))
+    assert told >= wanted > 0.0
     scale = method.estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3.3 * scale.sigma
 

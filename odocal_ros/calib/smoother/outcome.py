@@ -178,7 +178,8 @@ def _widened(source, widen):
 
 
 def _undetermined(sigma, limit, config, yaw):
-    reasons = []
+    # of a model that does not hold more is wanted: said, or 0.4 deg would seem to be enough
+    reasons, wanted = [], f', {np.rad2deg(limit):.2g} deg are wanted'
     if sigma[LN_K] > SCALE_LIMIT:
         reasons.append(Reason(Code.SCALE_NOT_DETERMINED, f'the scale would be good to '
                               f'{100 * sigma[LN_K]:.0f} % only'))
@@ -186,8 +187,8 @@ def _undetermined(sigma, limit, config, yaw):
     off = abs(float(wrap(yaw - nominal)))
     if sigma[YAW] > limit:
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'the drive tells the yaw mounting to '
-                              f'{np.rad2deg(sigma[YAW]):.1f} deg only: too little acceleration '
-                              'and too few turns'))
+                              f'{np.rad2deg(sigma[YAW]):.1f} deg only{wanted}: too little '
+                              'acceleration and too few turns'))
     elif off > BACKWARDS:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'the odometer runs against the Imu: '
                               'positive counts mean backwards, or the Imu faces backwards (yaw '
@@ -198,8 +199,9 @@ def _undetermined(sigma, limit, config, yaw):
                               'nominal one'))
     if sigma[PITCH] > limit:
         reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'the drive tells the pitch mounting to '
-                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only', 'Drive longer, with '
-                              'stops and starts; good ellipsoidal heights help too.'))
+                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only{wanted}',
+                              'Drive longer, with stops and starts; good ellipsoidal heights help '
+                              'too.'))
     return reasons
 
 
