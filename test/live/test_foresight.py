@@ -281,6 +281,7 @@ def finished(worker):
     worker.submit(lambda: None, lambda *_: done.append(True))
     deadline = time.monotonic() + 20.0
     while not done and time.monotonic() < deadline:
+        time.sleep(0.001)       # a loop without a rest keeps the interpreter from the worker
         worker.poll()
     assert done
 
