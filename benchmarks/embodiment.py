@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from odocal_ros.align import align
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, standing_at
-from odocal_ros.calib.wheels.embodiment import embodiment, FOUND, RADIUS
-from odocal_ros.calib.wheels.planar import planar_leg
-from odocal_ros.config import Config, with_settings
-from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon, forward_b
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.screen import screen
+from odocal_ros.patent.embodiment import embodiment, FOUND, RADIUS
+from odocal_ros.patent.planar import planar_leg
+from odocal_ros.pipeline.align import align
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config, with_settings
 
 REAL = Path(__file__).parents[2] / 'shared/data/comma2k19_rav4/bag'
 REAL_RADIUS, REAL_PITCH = 0.35, math.radians(3.75)      # m; rad, truth.yaml
@@ -49,8 +49,8 @@ def simulated(fix_noise, seed):
 def recorded(path):
     """Return leg, settings and pitch of the real drive."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.leg import LegRecorder
-    from odocal_ros.messages import make_reader
+    from odocal_ros.data.leg import LegRecorder
+    from odocal_ros.messages.decode import make_reader
     from odocal_ros.offline.legs import find_legs
     config = with_settings(Config(), {
         'odometer.left': 'rear_left', 'odometer.right': 'rear_right'})

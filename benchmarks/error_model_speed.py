@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from odocal_ros.nav.error_model import planned_path, propagate, transition
+from odocal_ros.paper.error_model import planned_path, propagate, transition
 
 HOUR, RATE = 3600, 50
 

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.config import Config, with_settings
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 CELLS = {'one counter, flat': {}, 'two wheels, flat': {'two_wheels': True},

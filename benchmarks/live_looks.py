@@ -16,14 +16,14 @@ import time
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from odocal_ros.config import Config, with_settings  # noqa: E402
+from odocal_ros.data.samples import take  # noqa: E402
 from odocal_ros.errors import OdocalError  # noqa: E402
-from odocal_ros.live.foresight import outlook_of  # noqa: E402
-from odocal_ros.live.sketch import Sketch  # noqa: E402
-from odocal_ros.live.smoother_so_far import SmootherSoFar  # noqa: E402
-from odocal_ros.live.watch import EVERY_NS, SHARE  # noqa: E402
-from odocal_ros.pipeline import calibrate  # noqa: E402
-from odocal_ros.samples import take  # noqa: E402
+from odocal_ros.foresee.foresight import forecast_of  # noqa: E402
+from odocal_ros.foresee.smoother_so_far import SmootherSoFar  # noqa: E402
+from odocal_ros.foresee.thinned_leg import ThinnedLeg  # noqa: E402
+from odocal_ros.live.running_estimate import EVERY_NS, SHARE  # noqa: E402
+from odocal_ros.pipeline.calibrate import calibrate  # noqa: E402
+from odocal_ros.settings.config import Config, with_settings  # noqa: E402
 from odocal_ros.sim.scenarios import SimOptions, simulate  # noqa: E402
 
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
@@ -31,23 +31,23 @@ LINES = 40       # printed of a leg
 
 
 def look(leg, config, state, before_ns, now_ns):
-    """Take a look at what has come between two stamps: outlook or None, s of CPU, s once."""
-    sketch, smoother = state
+    """Take a look at what has come between two stamps: forecast or None, s of CPU, s once."""
+    thinned, smoother = state
     begin = time.thread_time()
     for slot in ('imu', 'odometer', 'fix'):
         rows = getattr(leg, slot)
-        sketch.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
+        thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
     try:
-        seen = outlook_of(sketch.leg(leg.start_ns), sketch.fix_rate(), config, smoother=smoother)
+        seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config, smoother=smoother)
     except OdocalError:
         seen = None
     return seen, time.thread_time() - begin, smoother.once_s
 
 
 def show(leg, config, seconds):
-    """Print all looks at a leg; return the last outlook."""
+    """Print all looks at a leg; return the last forecast."""
     print('   leg s   look s CPU   of that once   next after s   scale sigma ppm   yaw sigma deg')
-    state = Sketch(leg.form), SmootherSoFar()
+    state = ThinnedLeg(leg.form), SmootherSoFar()
     before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + EVERY_NS, [], 0.0, -1.0
     while before_ns < leg.stop_ns:
         seen, cost, once = look(leg, config, state, before_ns, now_ns)

@@ -8,7 +8,7 @@ after the other,
 
 replay   ``odocal replay`` of the whole drive
 node     with all of the node's modules, what the node does with each message between the wire and
-         the result, at once and not in real time: recorder, sketch, --looks running estimates
+         the result, at once and not in real time: recorder, thinned, --looks running estimates
          evenly through the leg, and then the computing. Imu rows are laid between those of the bag
          until they come at --imu Hz. What DDS and the journal hold (the journal: seconds) is left
          out.
@@ -41,7 +41,7 @@ def finer(block, before, times):
     """Return an Imu block with rows laid between those of it, and its last row."""
     import numpy as np
 
-    from odocal_ros.samples import join, take
+    from odocal_ros.data.samples import join, take
     if before is not None:
         block = join([before, block])
     n = len(block.stamp_ns)
@@ -64,17 +64,17 @@ def finer(block, before, times):
 def node(bag_path, hours, imu_hz, looks) -> None:
     """Do what the node does of a leg, and print the peaks."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.config import Config
-    from odocal_ros.leg import LegRecorder
-    from odocal_ros.live.foresight import outlook_of
+    from odocal_ros.data.leg import LegRecorder
+    from odocal_ros.data.samples import take
+    from odocal_ros.foresee.foresight import forecast_of
+    from odocal_ros.foresee.smoother_so_far import SmootherSoFar
+    from odocal_ros.foresee.thinned_leg import ThinnedLeg
     from odocal_ros.live.jobs import compute
     import odocal_ros.live.node  # noqa: F401 all that a node holds
-    from odocal_ros.live.sketch import Sketch
-    from odocal_ros.live.smoother_so_far import SmootherSoFar
-    from odocal_ros.messages import make_reader
-    from odocal_ros.samples import take
+    from odocal_ros.messages.decode import make_reader
+    from odocal_ros.settings.config import Config
     print(f'node, modules loaded: {peak_mib():.0f} MiB', flush=True)
-    config, recorder, sketch, smoother = Config(), LegRecorder(), Sketch(), SmootherSoFar()
+    config, recorder, thinned, smoother = Config(), LegRecorder(), ThinnedLeg(), SmootherSoFar()
     last, begin, done = {}, [], []
 
     class Full(Exception):
@@ -82,7 +82,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
 
     def feed(slot, block):
         recorder.feed(slot, block)
-        sketch.feed(slot, block)
+        thinned.feed(slot, block)
 
     def take_in(slot, block):
         for first in range(0, len(block.stamp_ns), 1000):     # no larger than what is polled
@@ -93,7 +93,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
             some, last[slot] = finer(some, last.get(slot), round(imu_hz / BASE_HZ))
             for k in range(0, len(some.stamp_ns), POLL):
                 recorder.feed(slot, take(some, slice(k, k + POLL)))
-            sketch.feed(slot, some)
+            thinned.feed(slot, some)
         if slot == 'imu':
             newest = int(block.stamp_ns[-1])
             look_at(newest)
@@ -104,7 +104,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
         gone = (newest - begin[0]) * 1e-9
         if looks and gone > (len(done) + 1) * hours * 3600 / looks * 0.999:
             done.append(gone)
-            outlook_of(sketch.leg(begin[0]), sketch.fix_rate(), config, lambda: True, smoother)
+            forecast_of(thinned.leg(begin[0]), thinned.fix_rate(), config, lambda: True, smoother)
             print(f'node, {gone / 3600:.1f} h recorded, estimate running: {peak_mib():.0f} MiB '
                   f'(goal {NODE_GOAL})', flush=True)
         if gone > hours * 3600:

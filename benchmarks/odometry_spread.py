@@ -15,12 +15,12 @@ import numpy as np
 
 from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.vehicle import vehicle_of
-from odocal_ros.apply_config import ApplyConfig
 from odocal_ros.calib.result import Estimate
-from odocal_ros.config import with_settings
+from odocal_ros.data.samples import take
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.samples import take
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -103,7 +103,7 @@ def main():
 
 
 def _grade(name):
-    from odocal_ros.grades import GRADES
+    from odocal_ros.settings.grades import GRADES
     return GRADES[name]
 
 

@@ -69,7 +69,7 @@ GOAL_STRESS = 87.0
 
 def simulated(seed, **options):
     """Return a drive with a heading drawn, and what an operator sets."""
-    from odocal_ros.config import Config, with_settings
+    from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.noise import stream
     from odocal_ros.sim.scenarios import SimOptions, simulate
     from odocal_ros.sim.truth import settings
@@ -93,7 +93,7 @@ def simulated(seed, **options):
 def true_levels(problem, drive):
     """Return the noise levels of the simulation."""
     from odocal_ros.calib.smoother.noise import INTERVAL
-    from odocal_ros.grades import GRADES as FIGURES
+    from odocal_ros.settings.grades import GRADES as FIGURES
     o, grade = drive.options, FIGURES[drive.options.imu_grade]
     road = dict.fromkeys(INTERVAL[4:], 0.0)
     road |= dict.fromkeys(('along', 'along_hard'), o.speed_noise**2 / o.odometer_rate)

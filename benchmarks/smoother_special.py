@@ -9,8 +9,8 @@ from smoother_legs import leg_of, truth
 from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.config import with_settings
 from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.settings.config import with_settings
 
 FIRST_SEED = 55_000_000
 DULL = (({'scenario': 'straight', 'imu_grade': 'industrial'}, 'yaw bound of method.md 0.105 deg'),
@@ -131,7 +131,7 @@ def _in_motion(drive, config):
 
 def _cut(leg, start):
     """Return a leg without what came before: a recorder that was switched on in motion."""
-    from odocal_ros.samples import take
+    from odocal_ros.data.samples import take
     return replace(leg, **{name: take(getattr(leg, name), getattr(leg, name).stamp_ns >= start)
                            for name in ('imu', 'odometer', 'fix')})
 

@@ -29,10 +29,10 @@ CELLS = {
 def run(name, options, seed):
     """Print one line of figures."""
     from odocal_ros.calib.smoother import smooth, smoother_leg
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.leg_run import LegRun
     from odocal_ros.nav.standstill import standstills
-    from odocal_ros.screen import screen
+    from odocal_ros.pipeline.leg_run import LegRun
+    from odocal_ros.screening.screen import screen
+    from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
     from odocal_ros.sim.truth import settings
 

@@ -69,9 +69,9 @@ class Cell:
 
     def leg(self, seed: int):
         """Return one drive's leg, all errors drawn from a seed."""
-        from odocal_ros.leg import LegRecorder
+        from odocal_ros.data.leg import LegRecorder
+        from odocal_ros.data.samples import OdometerSamples
         from odocal_ros.nav.earth import radii
-        from odocal_ros.samples import OdometerSamples
         from odocal_ros.sim import sensors
         from odocal_ros.sim.noise import stream
         options = dataclasses.replace(self.options, seed=seed)
@@ -95,7 +95,7 @@ class Cell:
 
     def config(self, seed: int):
         """Return what the operator of such a drive sets, and the error of the heading, rad."""
-        from odocal_ros.config import Config, with_settings
+        from odocal_ros.settings.config import Config, with_settings
         from odocal_ros.sim.noise import stream
         settings = {'imu.grade': self.options.imu_grade,
                     'odometer.nominal_scale': self.options.nominal_scale}
@@ -112,7 +112,7 @@ class Cell:
 
     def drive(self, seed: int) -> dict:
         """Calibrate one drive; return errors and stated sigmas (scale: relative; rad)."""
-        from odocal_ros.pipeline import calibrate
+        from odocal_ros.pipeline.calibrate import calibrate
         config, heading_error = self.config(seed)
         result = calibrate(self.leg(seed), config)
         method = result.methods['two_point']

@@ -16,8 +16,8 @@ from time import perf_counter
 
 import numpy as np
 
-from odocal_ros.config import Config, with_settings
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim import sensors
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

@@ -13,11 +13,11 @@ import time
 
 import numpy as np
 
-from odocal_ros.calib.wheels.criteria import score
-from odocal_ros.calib.wheels.planar import course_pieces, PlanarLeg
-from odocal_ros.calib.wheels.ranges import ranges_of
-from odocal_ros.calib.wheels.search import search
-from odocal_ros.config import WheelsConfig
+from odocal_ros.patent.criteria import score
+from odocal_ros.patent.planar import course_pieces, PlanarLeg
+from odocal_ros.patent.ranges import ranges_of
+from odocal_ros.patent.search import search
+from odocal_ros.settings.config import WheelsConfig
 
 RATE, FIX_EVERY, TRACK = 50, 10, 1.6     # Hz, epochs, m
 SIGMA = 1.5                              # m

@@ -57,8 +57,8 @@ def drive(number: int, k: int) -> dict:
     from wheel_legs import true_heading_error, wheel_leg
 
     from odocal_ros.calib.wheels.result import fit_wheels
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.grades import GRADES
+    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.grades import GRADES
     from odocal_ros.sim.noise import stream
     from odocal_ros.sim.options import DEFAULTS
     from odocal_ros.sim.scenarios import SimOptions, simulate

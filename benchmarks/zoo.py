@@ -65,7 +65,7 @@ def grade_of(k):
 
 def configured(drive):
     """Return the settings that the vehicle's operator has."""
-    from odocal_ros.config import Config, with_settings
+    from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.truth import settings
     return with_settings(Config(), {f'{group}.{key}': tuple(v) if isinstance(v, list) else v
                                     for group, keys in settings(drive).items()
@@ -74,7 +74,7 @@ def configured(drive):
 
 def run_drive(seed, duration=None):
     """Draw, drive, calibrate; return a row."""
-    from odocal_ros.pipeline import calibrate, combine
+    from odocal_ros.pipeline.calibrate import calibrate, combine
     from odocal_ros.sim.scenarios import simulate
     e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
     run, kind, grade = RUNS[e], kind_of(k), grade_of(k)

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from odocal_ros.config import Config, with_settings
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}

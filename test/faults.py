@@ -4,9 +4,9 @@ import ctypes
 import errno
 import os
 
-from odocal_ros import whole
 from odocal_ros.bagio import segments
 from odocal_ros.output import folder
+from odocal_ros.outside import whole
 
 
 class Refusing:

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.samples import OdometerSamples
+from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.sim import options, routes, scenarios
 from odocal_ros.sim.profile import hold, ramp, turn
 

@@ -21,11 +21,11 @@ from drives import (
 import numpy as np
 import pytest
 
+from odocal_ros.data.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
 from odocal_ros.nav.angles import yaw_from_heading
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
-from odocal_ros.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import Motion, Start
 from odocal_ros.sim.options import resolved, SimOptions

@@ -55,8 +55,8 @@ def _own_parts(path):
 
 
 @pytest.mark.parametrize('module', [
-    'odocal_ros.pipeline', 'odocal_ros.calib.two_point', 'odocal_ros.nav.strapdown',
-    'odocal_ros.leg', 'odocal_ros.messages', 'odocal_ros.config_file', 'odocal_ros.output.files',
+    'odocal_ros.pipeline.calibrate', 'odocal_ros.calib.two_point', 'odocal_ros.nav.strapdown',
+    'odocal_ros.data.leg', 'odocal_ros.messages.decode', 'odocal_ros.settings.config_file', 'odocal_ros.output.files',
     'odocal_ros.output.summary', 'odocal_ros.bagio.read', 'odocal_ros.offline.replay',
     'odocal_ros.apply.odometry'])
 def test_imports_at_the_top_stay_light(module):

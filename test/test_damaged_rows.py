@@ -7,9 +7,9 @@ from drives import changed, drive, everything_said, settings
 import numpy as np
 import pytest
 
-from odocal_ros.glitches import about_clumps
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.screening.glitches import about_clumps
 
 
 @pytest.fixture(scope='module')

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.odometer import travel
-from odocal_ros.odometer_care import doubted
-from odocal_ros.samples import OdometerForm
+from odocal_ros.screening.odometer_care import doubted
 
 RATE = OdometerForm('rate', 0, '1')
 T = np.arange(0.0, 300.0, 0.05)

@@ -11,9 +11,9 @@ import pytest
 
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
-from odocal_ros.config_file import read_config_file
 from odocal_ros.offline import cli
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config_file import read_config_file
 
 # what begins otherwise than with odocal or ros2, and what runs it instead of this file
 ELSEWHERE = {

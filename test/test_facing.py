@@ -6,12 +6,12 @@ from drives import changed, drive, everything_said, rejecting, settings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.facing import axes_reasons, Facing, facing, toward
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screen import screen
+from odocal_ros.screening.facing import axes_reasons, Facing, facing, toward
+from odocal_ros.screening.screen import screen
 
 DEG = np.pi / 180
 

@@ -4,7 +4,7 @@ import re
 
 import shown
 
-from odocal_ros.config import SETTINGS
+from odocal_ros.settings.config import SETTINGS
 
 # from rviz_default_plugins/plugins_description.xml of Jazzy, those that could be meant here
 RVIZ = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_common/Selection', 'rviz_common/Time',

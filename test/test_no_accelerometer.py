@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from odocal_ros.bagio import encode
-from odocal_ros.config import Config
-from odocal_ros.messages import IMU, make_reader
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.messages.decode import IMU, make_reader
+from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import Config
 
 TOWN = {'scenario': 'town', 'duration': 300.0, 'slope': 0.03}
 ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')

@@ -6,9 +6,9 @@ from drives import changed, drive, everything_said, settings
 import numpy as np
 import pytest
 
-from odocal_ros import leg_methods
 from odocal_ros.calib.failed import traces
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.pipeline import methods as leg_methods
+from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 
 

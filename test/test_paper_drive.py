@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.sim.motion import attitude
 
 ARC_MINUTE = float(np.deg2rad(1 / 60))
@@ -32,7 +32,7 @@ def config(paper):
 @pytest.fixture(scope='module')
 def own(paper, config):
     """Return the alignment that the leg itself gives, with the true attitude in it."""
-    from odocal_ros import leg_run
+    from odocal_ros.pipeline import leg_run
     kept = []
     align = leg_run.align
     leg_run.align = lambda *args: kept.append(align(*args)) or kept[-1]

@@ -6,12 +6,12 @@ import shlex
 from pages import commands, PAGES, ROOT
 import pytest
 
-from odocal_ros import settings_page
-from odocal_ros.apply_config import ApplyConfig
-from odocal_ros.config import SETTINGS, settings_of
 from odocal_ros.offline import cli
 from odocal_ros.reasons import Code
-from odocal_ros.reasons_page import MEANINGS
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.config import SETTINGS, settings_of
+from tools import settings_page
+from tools.reasons_page import MEANINGS
 
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
 
@@ -19,7 +19,7 @@ README = (ROOT / 'README.md').read_text(encoding='utf-8')
 @pytest.mark.parametrize('path', [*settings_page.pages()], ids=lambda path: path.name)
 def test_pages_made_from_the_code_are_fresh(path):
     assert path.read_text(encoding='utf-8') == settings_page.pages()[path], (
-        'stale: run python -m odocal_ros.settings_page --write')
+        'stale: run python -m tools.settings_page --write')
 
 
 def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
@@ -43,7 +43,7 @@ def test_a_stale_page_is_told_and_mended(tmp_path, monkeypatch, capsys):
 
 def test_each_reason_is_explained_once_in_the_order_of_the_enum():
     explained = [code for codes in MEANINGS.values() for code in codes]
-    assert explained == list(Code), 'say what the code means in odocal_ros/reasons_page.py'
+    assert explained == list(Code), 'say what the code means in tools/reasons_page.py'
     assert all(text.endswith('.') for codes in MEANINGS.values() for text in codes.values())
 
 
@@ -100,7 +100,7 @@ def test_settings_and_reasons_named_in_the_text_exist():
 def test_the_node_offers_what_the_readme_lists():
     pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
     from odocal_ros.live import node, topic_input
-    from odocal_ros.live.outlets import PLOTTED
+    from odocal_ros.live.publishing import PLOTTED
     topics = {'status', 'hint', 'scale_factor', 'yaw_mounting_angle'}     # and `_sigma`
     assert topics | {f'{name}_sigma' for name in topics} >= set(PLOTTED)
     services = set(re.findall(r'`~/(\w+)`', README)) - topics

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from reversing_drives import made, there_and_back, three_point_turn, without_direction
 
-from odocal_ros.calib.reversing import doubled, reversed_starts
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Verdict
-from odocal_ros.screen import screen
+from odocal_ros.screening.reversing import doubled, reversed_starts
+from odocal_ros.screening.screen import screen
 
 # m/s and s at that speed: 3 m, 10 m and 72 m backwards
 ROUTES = {'3 m': there_and_back(0.8, 0.0), '10 m': there_and_back(1.5, 3.0),

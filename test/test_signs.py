@@ -10,7 +10,7 @@ import pytest
 
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.rotations import matrix_from_quat, rpy_from_matrix
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
 
 PAGE = (Path(__file__).resolve().parent.parent / 'docs' / 'conventions.md').read_text()
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk',

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.reasons import Code
-from odocal_ros.samples import OdometerForm, take
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
 
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'seed': 4}
 

@@ -16,7 +16,6 @@ from odocal_ros.apply.start import begin, Start
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
-from odocal_ros.grades import grade_of
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_from_matrix,
@@ -25,6 +24,7 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.standstill import TURN
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.settings.grades import grade_of
 
 LOOK = 1.0           # s between corrections
 SPEED_OVER = 0.2     # s that a speed is taken over

@@ -1,7 +1,7 @@
 """
 The travel of one wheel as its rows come: rollover undone, resets bridged, what is lost doubted.
 
-A leg is judged as a whole (``nav/odometer.py``, ``odometer_care.py``); a stream has only its past,
+A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``); a stream has only its past,
 and a scale that is known: what no vehicle does in the time is no travel.
 """
 
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.samples import OdometerForm
+from odocal_ros.data.samples import OdometerForm
 
 SPEED_TIME = 0.5               # s over which the speed beside a row is taken
 QUICK, SHORT = 5.0, 0.25       # m/s that a speed may change by, s that a burst of stamps may hide

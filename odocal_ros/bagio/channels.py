@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from odocal_ros.bagio.limits import LATEST_NS
+from odocal_ros.outside.limits import LATEST_NS
 
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
 

@@ -16,9 +16,9 @@ import zlib
 import numpy as np
 
 from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.limits import zstd_module
 from odocal_ros.bagio.mcap_records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, SCHEMA
-from odocal_ros.whole import whole_file, WholeFile
+from odocal_ros.outside.limits import zstd_module
+from odocal_ros.outside.whole import whole_file, WholeFile
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 1, 7, 8, 11, 15
 LEVEL = 1                     # of zstd: a third of the size at a hundredth of a core

@@ -9,7 +9,6 @@ import zlib
 
 from odocal_ros.bagio.channels import Channel, FORMATS, Message, Recording
 from odocal_ros.bagio.file_bytes import FileBytes
-from odocal_ros.bagio.limits import Allowance, Damaged, LATEST_NS, LimitReached
 from odocal_ros.bagio.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -29,6 +28,7 @@ from odocal_ros.bagio.mcap_records import (
     statistics_of,
     text_at,
 )
+from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS, LimitReached
 
 CHUNK_DAMAGED, INDEX_DAMAGED = 'a damaged chunk', 'a damaged index'
 Entry = tuple[int, int, bytes]     # time, channel, message

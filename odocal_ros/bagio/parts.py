@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.bagio.channels import Channel, Recording
-from odocal_ros.bagio.limits import Allowance, Damaged, LimitReached
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.rosbag1_file import Rosbag1File
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag
+from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
 BLOCK = 20_000         # messages taken at a time, and
 BLOCK_BYTES = 2**24    # bytes of them

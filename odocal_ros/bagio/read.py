@@ -9,12 +9,12 @@ from operator import itemgetter
 from pathlib import Path
 import tempfile
 
-from odocal_ros.bagio.limits import is_file
 from odocal_ros.bagio.parts import Batch, group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
-from odocal_ros.messages import Reader
+from odocal_ros.messages.decode import Reader
+from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
 
 MISSING = 0.5   # s, less is not worth a word

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.bagio.channels import Channel, Recording
-from odocal_ros.bagio.limits import Allowance, LATEST_NS, LimitReached
 from odocal_ros.errors import BadBag, OdocalError
+from odocal_ros.outside.limits import Allowance, LATEST_NS, LimitReached
 
 PACKINGS = {'none': '', 'bz2': 'bz2', 'lz4': 'lz4'}
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
-from odocal_ros.whole import disk, write_text
+from odocal_ros.outside.whole import disk, write_text
 
 TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
 

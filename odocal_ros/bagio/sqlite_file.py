@@ -7,8 +7,8 @@ import struct
 from urllib.parse import quote
 
 from odocal_ros.bagio.channels import Channel, FORMATS, Message, possible, Recording
-from odocal_ros.bagio.limits import Damaged, factor
 from odocal_ros.bagio.sqlite_leaves import Leaves
+from odocal_ros.outside.limits import Damaged, factor
 
 STEPS = 10_000            # of sqlite's machine between two looks at how many it took
 MOST_STEPS = 20_000_000   # for any file, and

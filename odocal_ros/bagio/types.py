@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from odocal_ros.bagio.definitions import parsed, within
-from odocal_ros.bagio.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 from odocal_ros.errors import BadData
+from odocal_ros.outside.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 
 DEPTH = 50       # of messages in messages
 

@@ -6,10 +6,10 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.facing import LEAST, pushes
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import LEAST, pushes
 
 SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
 NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it

@@ -6,7 +6,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
 from odocal_ros.output.summary import sentence
-from odocal_ros.outside import said_by
+from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import Verdict
 
 MOST_REASONS = 3

@@ -1,15 +1,15 @@
 """Legs that begin and end by themselves in the node, where ``leg.automatic`` asks for it."""
 
-from odocal_ros.automatic import LegSearch
 from odocal_ros.live.filing import latest_of
-from odocal_ros.live.leg_way import LegWay
-from odocal_ros.live.outputs import iso
+from odocal_ros.live.leg_completion import LegCompletion
+from odocal_ros.live.result_files import iso
 from odocal_ros.live.session import State
 from odocal_ros.output.stored import Stored
+from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code
 
 
-class AutomaticWay(LegWay):
+class AutomaticWay(LegCompletion):
     """
     The way of legs that nobody marks: ``LegSearch`` says where, from the samples alone.
 

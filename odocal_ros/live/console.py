@@ -1,6 +1,6 @@
 """What the node says on its console by itself: what it waits for, that it is ready, what fails."""
 
-from odocal_ros.live.situation import Situation
+from odocal_ros.live.session_view import SessionView
 
 FIRST_NS = 5_000_000_000       # of waiting, before it is said
 SELDOM_NS = 60_000_000_000     # and then
@@ -10,7 +10,7 @@ class Console:
     """
     Turns what changes into lines of the log; what stays is repeated seldom.
 
-    ``tell`` is given every situation, with the time of a clock that never stands.
+    ``tell`` is given every view, with the time of a clock that never stands.
     """
 
     def __init__(self, log) -> None:
@@ -22,7 +22,7 @@ class Console:
         self._pause_ns = FIRST_NS
         self._leg: tuple = ()        # the leg whose faults are said, and which
 
-    def tell(self, now: Situation, steady_ns: int) -> None:
+    def tell(self, now: SessionView, steady_ns: int) -> None:
         """Say what is new."""
         self._faults(now)
         for text in set(now.doubled) - self._doubled:
@@ -33,7 +33,7 @@ class Console:
         else:
             self._complete(now)
 
-    def _missing(self, now: Situation, steady_ns: int) -> None:
+    def _missing(self, now: SessionView, steady_ns: int) -> None:
         if not self._due_ns:     # what has been there and falls silent is said at once
             self._due_ns = steady_ns + (0 if self._ready else FIRST_NS)
         if steady_ns >= self._due_ns:
@@ -42,7 +42,7 @@ class Console:
             self._pause_ns = min(2 * self._pause_ns, SELDOM_NS)
             self._due_ns = steady_ns + self._pause_ns
 
-    def _complete(self, now: Situation) -> None:
+    def _complete(self, now: SessionView) -> None:
         self._due_ns, self._pause_ns = 0, FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
@@ -53,7 +53,7 @@ class Console:
             self._log.info('all inputs are there again')
         self._ready, self._silence = True, False
 
-    def _faults(self, now: Situation) -> None:
+    def _faults(self, now: SessionView) -> None:
         """Say what is wrong with the leg that is recorded, each once."""
         leg_id = now.session.leg_id
         if not self._leg or self._leg[0] != leg_id:

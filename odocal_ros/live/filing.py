@@ -7,12 +7,12 @@ from pathlib import Path
 from rclpy.task import Future
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.config import Config
-from odocal_ros.live import answers, outputs
-from odocal_ros.live.shelf import LATEST, Shelf
+from odocal_ros.live import answers, result_files as outputs
+from odocal_ros.live.result_folders import LATEST, ResultFolders
 from odocal_ros.live.worker import Worker
 from odocal_ros.output.stored import Stored
 from odocal_ros.output.worse import stored_in
+from odocal_ros.settings.config import Config
 
 
 class Filing:
@@ -26,7 +26,7 @@ class Filing:
         self.saved = self.trouble = ''
         self._node = node
         self._worker, self._log, self._show = worker, log, show
-        self._shelf = Shelf()
+        self._folders = ResultFolders()
         self._warned: Calibration | None = None    # the operator was told that latest stays
         self._under_way = 0
         self._artist = Worker()        # a leg that ends meanwhile need not wait for a report
@@ -61,7 +61,7 @@ class Filing:
         self._worker.submit(partial(
             self._write, calibration, config, [{'bag': '', 'sha256': None, 'node': self._node,
                                                'topics': topics}],
-            imu_frame, now_ns, self._shelf, asked and calibration is self._warned), then)
+            imu_frame, now_ns, self._folders, asked and calibration is self._warned), then)
         return future
 
     @property
@@ -99,7 +99,7 @@ class Filing:
                 self._log.warning(f'latest still shows a dropped leg: {answers.one_line(error)}')
             self._show()
 
-        self._worker.submit(partial(self._shelf.withdraw, outputs.marks(left)), then)
+        self._worker.submit(partial(self._folders.withdraw, outputs.marks(left)), then)
 
 
 def latest_of(config: Config, node: str) -> Stored | None:

@@ -1,9 +1,9 @@
 """What to do next, in metres, seconds and manoeuvres: one text for status and answers."""
 
 from odocal_ros.calib.choice import ABOUT, deciding
-from odocal_ros.live import quantities
+from odocal_ros.foresee import quantities
 from odocal_ros.live.session import State
-from odocal_ros.live.situation import Situation
+from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code, Verdict
 
 REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
@@ -14,7 +14,7 @@ STRAIGHT = 'go straight on at speed until left and right wheel are told apart'
 TURNS = 'turn by about 90 deg in all, or more, for the track width'
 
 
-def hint(now: Situation) -> str:
+def hint(now: SessionView) -> str:
     """Return what is missing, or what to do next."""
     session, state = now.session, now.session.state
     if state is State.COMPUTING:
@@ -39,7 +39,7 @@ def hint(now: Situation) -> str:
     return after_result(now)
 
 
-def action_first(now: Situation) -> str:
+def action_first(now: SessionView) -> str:
     """Return the hint for one line to watch: in a leg what to do stands before what is known."""
     fine = not (now.lost_cause or now.missing or now.clocks)
     if now.session.state is State.RECORDING and fine:
@@ -55,11 +55,11 @@ def clocks_differ(clocks: list[tuple[str, float]]) -> str:
     return f'CLOCKS_DIFFER: {seen}. {Code.CLOCKS_DIFFER.remedy}'
 
 
-def quantities_ok(now: Situation) -> dict[str, str]:
+def quantities_ok(now: SessionView) -> dict[str, str]:
     """Return which quantities are good enough: of the leg that is recorded, else of the result."""
     session = now.session
     if session.state is State.RECORDING:
-        return quantities.of_outlook(now.outlook, now.config, now.two_wheels, now.lost_cause)
+        return quantities.of_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
     if session.state is State.COMPUTING:
         return quantities.nothing_known()
     if session.calibration is not None:
@@ -70,21 +70,21 @@ def quantities_ok(now: Situation) -> dict[str, str]:
     return quantities.nothing_known()
 
 
-def metres_to_go(now: Situation) -> float:
+def metres_to_go(now: SessionView) -> float:
     """Return the metres that the leg still lacks to leg.min_distance, 0 outside of one."""
     if now.session.state is not State.RECORDING:
         return 0.0
     return max(0.0, now.session.config.leg.min_distance - now.distance_m)
 
 
-def seconds_to_stand(now: Situation) -> float:
+def seconds_to_stand(now: SessionView) -> float:
     """Return the seconds of standstill still wanted: before the start, or at the end of a leg."""
     if now.session.state is State.RECORDING or not now.session.busy:
         return max(0.0, REST_S - now.still_s)
     return 0.0
 
 
-def manoeuvres(now: Situation) -> list[str]:
+def manoeuvres(now: SessionView) -> list[str]:
     """Return what the leg still lacks in driving, besides metres and standstill."""
     if now.session.state is not State.RECORDING:
         return []
@@ -93,13 +93,13 @@ def manoeuvres(now: Situation) -> list[str]:
         wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
     if now.two_wheels and 'wheels' in deciding(now.session.config.method):
         wants += _of_two_wheels(now)
-    return wants + (now.outlook.lacks if now.outlook else [])
+    return wants + (now.forecast.lacks if now.forecast else [])
 
 
 def _of_two_wheels(now):
     """Return what the wheels need; before the first look only what any drive needs."""
     config = now.session.config
-    wheels = None if now.outlook is None else now.outlook.wheels
+    wheels = None if now.forecast is None else now.forecast.wheels
     asked = quantities.QUANTITIES['left_right'].limit(config)
     wants = []
     if wheels is not None and not (wheels.left_right is not None and wheels.left_right <= asked):
@@ -115,7 +115,7 @@ def _before_start(still_s: float) -> str:
     return 'call ~/start_leg'
 
 
-def _while_recording(now: Situation) -> tuple[list[str], list[str]]:
+def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
     """Return what to do, and what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
     facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
@@ -126,16 +126,16 @@ def _while_recording(now: Situation) -> tuple[list[str], list[str]]:
         end = _end(now) if now.session.by_itself else (
             f'then stand still {REST_S:.0f} s and call ~/stop_leg')
         return [', '.join(wants), end], facts
-    if now.outlook is None:
+    if now.forecast is None:
         return [*wants, _end(now)], facts
-    facts.append(now.outlook.words())
-    if now.outlook_age_s > OLD_S:
-        facts.append(f'as it was {now.outlook_age_s:.0f} s ago')
-    ends = now.outlook.complete or now.session.by_itself
+    facts.append(now.forecast.words())
+    if now.forecast_age_s > OLD_S:
+        facts.append(f'as it was {now.forecast_age_s:.0f} s ago')
+    ends = now.forecast.complete or now.session.by_itself
     return wants + ([_end(now)] if ends else []), facts
 
 
-def _fault(now: Situation) -> str:
+def _fault(now: SessionView) -> str:
     """Return what the leg would be rejected for, and what to do."""
     worst = now.faults[0]
     if now.session.by_itself:
@@ -145,7 +145,7 @@ def _fault(now: Situation) -> str:
             f'{worst.text}. {worst.remedy.rstrip(".")}')
 
 
-def _end(now: Situation) -> str:
+def _end(now: SessionView) -> str:
     """Return how to end the leg."""
     if now.session.by_itself:
         left = now.session.config.leg.automatic_minutes - now.duration_s / 60
@@ -156,7 +156,7 @@ def _end(now: Situation) -> str:
     return (f'stand still {left:.0f} s more, then ' if left >= 1 else '') + 'call ~/stop_leg'
 
 
-def after_result(now: Situation) -> str:
+def after_result(now: SessionView) -> str:
     """Return what would help most after a result, and what would help the other quantities."""
     reasons = now.session.calibration.reasons if now.session.calibration else ()
     config = now.config

@@ -2,8 +2,8 @@
 
 from rclpy.node import Node
 
-from odocal_ros.config import Config
 from odocal_ros.live.topic_input import Input
+from odocal_ros.settings.config import Config
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')

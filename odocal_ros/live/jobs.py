@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 from std_msgs.msg import Header
 
-from odocal_ros.automatic import fold, refusal
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
-from odocal_ros.leg import LegRecorder
-from odocal_ros.live.outputs import paths
-from odocal_ros.parts import calibrate_parts
-from odocal_ros.pipeline import combine
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.live.result_files import paths
+from odocal_ros.pipeline.automatic import fold, refusal
+from odocal_ros.pipeline.calibrate import combine
+from odocal_ros.pipeline.parts import calibrate_parts
 from odocal_ros.reasons import Reason
+from odocal_ros.settings.config import Config
 
 MOST_KEPT = 30      # legs in memory and in the report; what those before tell is carried on
 

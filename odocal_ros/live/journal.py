@@ -11,14 +11,14 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.serialization import serialize_message
 
-from odocal_ros.config import Config
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import Heard, JournalWriter
-from odocal_ros.live.outputs import output_root
+from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input
+from odocal_ros.settings.config import Config
 
 EVERY_NS = 800_000_000    # with the time that writing takes, a kill then costs about a second
 MARGIN_S = 2.0            # kept beyond the pre-roll: the recorder's own margin, and a batch

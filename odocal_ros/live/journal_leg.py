@@ -11,7 +11,7 @@ from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.live.journal_space import claim, clear_empty, make_room
-from odocal_ros.whole import write_text
+from odocal_ros.outside.whole import write_text
 
 MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
 MARGIN = 2**20                # for metadata and file heads

@@ -9,7 +9,7 @@ import time
 from typing import TextIO
 
 from odocal_ros.bagio.numbered import JOURNAL
-from odocal_ros.whole import PART
+from odocal_ros.outside.whole import PART
 
 NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
 NEW_S = 10.0       # a node may be about to write into its folder

@@ -3,9 +3,9 @@
 from datetime import datetime, UTC
 
 from odocal_ros import __version__
-from odocal_ros.config import Config, flat
-from odocal_ros.outside import for_shell
-from odocal_ros.yaml_text import parameters
+from odocal_ros.outside.names import for_shell
+from odocal_ros.outside.yaml_text import parameters
+from odocal_ros.settings.config import Config, flat
 
 HEAD = """\
 # Journal of a leg: 'odocal replay' on this folder computes it again with the settings below,

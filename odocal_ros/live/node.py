@@ -15,9 +15,9 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
-from odocal_ros.live.outlets import Outlets
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.process import complain, run, SettledNode
+from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
 
@@ -59,10 +59,10 @@ class Calibrator(SettledNode):
         self.config = params.declare(self)
         params.declare_results(self)
         params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
-        self.outlets = Outlets(self)
-        self.journal = Journal(self, self.outlets.status_topic)
+        self.publishing = Publishing(self)
+        self.journal = Journal(self, self.publishing.status_topic)
         self.recording = Recording(self, self.config, self.journal.remember)
-        self.operation = Operation(self, self.recording, self.outlets, self.journal,
+        self.operation = Operation(self, self.recording, self.publishing, self.journal,
                                    lambda: self.config)
         self._lock = threading.RLock()  # for executors with several threads
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -94,7 +94,7 @@ class Calibrator(SettledNode):
 
     def _check_parameters(self, parameters) -> SetParametersResult:
         """Refuse what may not be set; changes nothing."""
-        if self.outlets.setting_results:
+        if self.publishing.setting_results:
             return SetParametersResult(successful=True)
         ours = [p.name for p in parameters if p.name in params.RESULTS]
         if ours:
@@ -126,7 +126,7 @@ class Calibrator(SettledNode):
                 self.recording.forget(self.config.leg.preroll,
                                       session.start_ns if session.open_leg else 0)
             if self._due('diagnostics', self.config.diagnostic_updater.period):
-                self.outlets.show_diagnostics(self.recording, self.config)
+                self.publishing.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):
                 self.operation.show_status()
 

@@ -11,14 +11,14 @@ from rclpy.event_handler import PublisherEventCallbacks
 
 from odocal_ros.apply.odometry import Odometry, Pose
 from odocal_ros.apply.vehicle import vehicle_of
-from odocal_ros.apply_config import ApplyConfig
+from odocal_ros.data.samples import take
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.inputs import IMU
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
-from odocal_ros.samples import take
+from odocal_ros.settings.apply_config import ApplyConfig
 
 TICK_S, LOOK_S = 0.01, 1.0
 WAIT_S, SELDOM_S = 5.0, 60.0     # of silence before it is said, and said again

@@ -4,10 +4,10 @@ from functools import partial
 
 from rclpy.task import Future
 
-from odocal_ros.live import answers, jobs, outputs
+from odocal_ros.foresee.quantities import words
+from odocal_ros.live import answers, jobs, result_files as outputs
 from odocal_ros.live.automatic_way import AutomaticWay
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
-from odocal_ros.live.quantities import words
 from odocal_ros.live.session import Refused, State
 
 
@@ -23,7 +23,7 @@ class Operation(AutomaticWay):
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {outputs.iso(session.start_ns)}, leg '
-                          f'{session.leg_id}; {hint(self.situation())}')
+                          f'{session.leg_id}; {hint(self.view())}')
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
         if session.state is State.RECORDING:      # one that nobody asked for
@@ -44,7 +44,7 @@ class Operation(AutomaticWay):
 
     def _last_result(self) -> tuple[bool, str]:
         """Return the answer to a stop without a leg."""
-        session, now = self.session, self.situation()
+        session, now = self.session, self.view()
         if now.lost:
             raise Refused(now.lost)
         good = words(quantities_ok(now))
@@ -72,8 +72,8 @@ class Operation(AutomaticWay):
         self._filing.withdraw(left)
         self.show_status()
         if not left:
-            self._outlets.set_results(None)
-            self._outlets.show_paths(jobs.leg_paths(None, self._config()))
+            self._publishing.set_results(None)
+            self._publishing.show_paths(jobs.leg_paths(None, self._config()))
             self.show_status()
             return True, f'{text}, none is left'
 
@@ -90,12 +90,12 @@ class Operation(AutomaticWay):
         if self.session.state is State.FAILED and self.session.open_leg:
             self._drop_leg('reset')
         dropped = self.session.begin_reset()
-        self._outlets.forget_restored()
+        self._publishing.forget_restored()
         for leg in dropped:  # each shown as undone, so that a replay of the bag leaves it out too
             self.session.dropped(leg)
             self.show_status()
-        self._outlets.set_results(None)
-        self._outlets.show_paths(jobs.leg_paths(None, self._config()))
+        self._publishing.set_results(None)
+        self._publishing.show_paths(jobs.leg_paths(None, self._config()))
         self._filing.withdraw([])
         self.show_status()
         return True, f'reset: {len(dropped)} leg{"s" * (len(dropped) != 1)} dropped'

@@ -15,13 +15,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.config import Config, SETTINGS, settings_of, with_settings
 from odocal_ros.errors import BadConfig
 from odocal_ros.live.restored import Restored
 from odocal_ros.output.stored import check_estimate
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Verdict
-from odocal_ros.setting import Setting
+from odocal_ros.settings.config import Config, SETTINGS, settings_of, with_settings
+from odocal_ros.settings.setting import Setting
 
 SCALE = 'm/pulse, m/rad or 1'
 ESTIMATES = {'scale_factor': SCALE, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
@@ -223,7 +223,7 @@ def _as_ros(setting: Setting):
 
 
 def _plain(value):
-    """Return a parameter's value as config.py knows it: no numpy, no array, no bytes."""
+    """Return a parameter's value as settings/config.py knows it: no numpy, no array, no bytes."""
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value
     return tuple(value)

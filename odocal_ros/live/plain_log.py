@@ -1,6 +1,6 @@
 """The node's log: lines in which nothing from outside steers the terminal they are read on."""
 
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
 
 
 class PlainLog:

@@ -14,7 +14,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
 
 from odocal_ros.errors import BadConfig, OdocalError
-from odocal_ros.outside import one_line, said_by
+from odocal_ros.outside.names import one_line, said_by
 
 
 class SettledNode(Node):

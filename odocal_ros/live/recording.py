@@ -8,13 +8,13 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from odocal_ros.config import Config
-from odocal_ros.leg import LegRecorder
-from odocal_ros.live.ability import Heard
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import Samples, take
+from odocal_ros.foresee.ability import Heard
+from odocal_ros.foresee.progress import Progress
 from odocal_ros.live.inputs import Inputs
-from odocal_ros.live.progress import Progress
 from odocal_ros.live.topic_input import Input
-from odocal_ros.samples import Samples, take
+from odocal_ros.settings.config import Config
 
 BACKWARD_S = 0.1   # a clock that steps back by more has jumped
 MARGIN_S = 1.0     # kept beyond the pre-roll, since forgetting goes by whole blocks

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.output.summary import values_in_words
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from enum import Enum
 
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.settings.config import Config
 
 
 class Refused(OdocalError):

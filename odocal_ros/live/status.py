@@ -4,7 +4,8 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from odocal_ros.live import quantities
+from odocal_ros.foresee import quantities
+from odocal_ros.foresee.forecast import as_keys
 from odocal_ros.live.guidance import (
     hint,
     manoeuvres,
@@ -13,9 +14,8 @@ from odocal_ros.live.guidance import (
     seconds_to_stand,
 )
 from odocal_ros.live.health import Health
-from odocal_ros.live.outlook import as_keys
 from odocal_ros.live.session import State
-from odocal_ros.live.situation import Situation
+from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
@@ -42,7 +42,7 @@ VALUES = {
 }
 
 
-def calibration_status(now: Situation) -> DiagnosticStatus:
+def calibration_status(now: SessionView) -> DiagnosticStatus:
     """Return the one status of ``~/status``."""
     session, results = now.session, now.results
     text, ok = hint(now), quantities_ok(now)
@@ -71,17 +71,17 @@ def calibration_status(now: Situation) -> DiagnosticStatus:
         'computing_percent': 100 * now.computed[0] if session.state is State.COMPUTING else 0.0,
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
-    } | quantities.as_keys(ok) | as_keys(now.outlook, now.outlook_age_s)
+    } | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
 
 
-def in_force(now: Situation, name: str) -> float:
+def in_force(now: SessionView, name: str) -> float:
     """Return a value or a sigma: of the running estimate in a leg, else of the result."""
     if now.session.state is not State.RECORDING:
         return now.results[f'result.{name}']
-    estimates = now.outlook.estimates if now.outlook else {}
+    estimates = now.forecast.estimates if now.forecast else {}
     estimate = estimates.get(name.removesuffix('_sigma'))
     if estimate is None or estimate.value is None:
         return math.nan
@@ -89,7 +89,7 @@ def in_force(now: Situation, name: str) -> float:
     return math.nan if found is None else float(found)
 
 
-def level(now: Situation) -> bytes:
+def level(now: SessionView) -> bytes:
     """Return STALE before anything came, ERROR for what needs the operator, WARN for doubts."""
     state = now.session.state
     if state in (State.FAILED, State.REJECTED) or now.lost_cause:
@@ -104,7 +104,7 @@ def level(now: Situation) -> bytes:
     return DiagnosticStatus.WARN if doubtful else DiagnosticStatus.OK
 
 
-def sentence(now: Situation, text: str, ok: dict[str, str]) -> str:
+def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
     """Return one sentence: what is, how good it is, and what to do next."""
     session = now.session
     legs = f'{len(session.legs)} leg{"s" * (len(session.legs) != 1)}'
@@ -142,7 +142,7 @@ def _unused(session) -> str:
     return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
 
 
-def _automatic(now: Situation) -> str:
+def _automatic(now: SessionView) -> str:
     """Return what leg.automatic is at, empty where it is off."""
     if not now.config.leg.automatic:
         return ''
@@ -151,7 +151,7 @@ def _automatic(now: Situation) -> str:
     return 'leg' if now.session.by_itself else 'leg of the operator'
 
 
-def _reason_codes(now: Situation) -> str:
+def _reason_codes(now: SessionView) -> str:
     if now.session.state is State.RECORDING:
         return ','.join(r.code.name for r in now.faults)
     calibration = now.session.calibration

@@ -17,13 +17,13 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from odocal_ros.config import Config
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
-from odocal_ros.messages import make_reader, Reader
-from odocal_ros.odometer_types import TYPES
-from odocal_ros.outside import said_by
+from odocal_ros.messages.decode import make_reader, Reader
+from odocal_ros.messages.odometer_types import TYPES
+from odocal_ros.outside.names import said_by
+from odocal_ros.settings.config import Config
 
 TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
           'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}

@@ -7,7 +7,7 @@ is as much again.
 
 import numpy as np
 
-from odocal_ros.samples import let_go
+from odocal_ros.data.samples import let_go
 
 CHUNK = 2**16     # rows
 

@@ -8,7 +8,7 @@ without any per-sample loop.
 
 import numpy as np
 
-from odocal_ros.samples import let_go
+from odocal_ros.data.samples import let_go
 
 BLOCK = 64       # quaternions a scan multiplies up in step; 40 to 800 make no difference
 CHUNK = 16384    # intervals worked on at a time: their arrays stay in the cache

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
+from odocal_ros.settings.config import Config, flat
 
 
 def once(paths: list[Path]) -> tuple[list[Path], list[Path]]:

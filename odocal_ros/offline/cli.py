@@ -16,7 +16,7 @@ COMMANDS = {
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
     'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
-    'watch': ('odocal_ros.live.watching', 'show what a running node is at, with bars'),
+    'watch': ('odocal_ros.live.watch_command', 'show what a running node is at, with bars'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
 LONGEST = 2000       # characters of a sentence: a bag may hold a name of any length

@@ -26,10 +26,10 @@ def run(args) -> int:
     import json
 
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.config_file import parse_set, read_config_file
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.offline.inspection_text import text
+    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_file import parse_set, read_config_file
     config = Config()
     if args.config:
         config = with_settings(config, read_config_file(Path(args.config)))

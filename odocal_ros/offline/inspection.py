@@ -5,20 +5,20 @@ import math
 
 import numpy as np
 
-from odocal_ros.bagio import cdr
 from odocal_ros.bagio.read import Bag, TopicInfo
-from odocal_ros.config import Config
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
-from odocal_ros.glitches import beyond
-from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import FIX, IMU, make_reader, Reader
-from odocal_ros.odometer_types import TYPES as ODOMETERS
+from odocal_ros.messages import cdr
+from odocal_ros.messages.decode import FIX, IMU, make_reader, Reader
+from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.offline import survey
 from odocal_ros.offline.inspection_drive import closed, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping
 from odocal_ros.offline.wheel_survey import FIELDS as LISTS, in_words, suggested, Values
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.samples import take
+from odocal_ros.screening.glitches import beyond
+from odocal_ros.settings.config import Config
 
 # what only a method that begins with an alignment, or sees the ends alone, minds
 ENDS = {Code.NO_STANDSTILL, Code.CHORD_TOO_SHORT, Code.YAW_NOT_SEPARABLE, Code.LEG_NOT_STRAIGHT}

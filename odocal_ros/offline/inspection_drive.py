@@ -7,11 +7,9 @@ import numpy as np
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.mounting import mounting, with_axes
-from odocal_ros.calib.sanity import imu_sanity, MAX_RATE
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
-from odocal_ros.config import Config
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.leg import LegRecorder
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.legs import EACH_STOP, find_legs, LegSpan, marked_legs
 from odocal_ros.offline.stretches import (
@@ -19,7 +17,9 @@ from odocal_ros.offline.stretches import (
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screen import screen
+from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config
 
 CLOSED = 0.2            # chord over way: below, a leg ends where it began
 RAD_PER_DEG = math.pi / 180

@@ -3,7 +3,7 @@
 import math
 import textwrap
 
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
 
 WIDTH = 98
 FEW = 3        # legs told in a line each

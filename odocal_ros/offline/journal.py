@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from odocal_ros.bagio.limits import is_file
 from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.data.leg import SLOTS
 from odocal_ros.errors import BadUsage
-from odocal_ros.leg import SLOTS
+from odocal_ros.outside.limits import is_file
 
 BLOCK = 'odocal_journal'
 
@@ -40,7 +40,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
         return None
     if not is_file(path):
         raise BadUsage(f'{path}: is a pipe, a device or a folder; remove it to replay the bag')
-    from odocal_ros.config_file import read_journal_file
+    from odocal_ros.settings.config_file import read_journal_file
     settings, about = read_journal_file(path, BLOCK)
     topics = {slot: about[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in about}
     return JournalNotes(path, settings, topics)

@@ -6,13 +6,13 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
-from odocal_ros.automatic import LegSearch
-from odocal_ros.bagio.limits import LATEST_NS
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
+from odocal_ros.outside.limits import LATEST_NS
+from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
 
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
 EACH_STOP = 'each-stop'

@@ -53,9 +53,9 @@ def add_arguments(parser) -> None:
 
 def run(args) -> int:
     """Predict and print; return 0."""
-    from odocal_ros.calib.planned_methods import plan_methods
     from odocal_ros.offline.plan_text import as_json, screen
     from odocal_ros.offline.what_helps import changes
+    from odocal_ros.plan.methods import plan_methods
     config = _config(args)
     drive, figures = _drive(args, config)
     sigmas = _sigmas(args, config, figures)
@@ -71,8 +71,8 @@ def run(args) -> int:
 
 def _config(args):
     """Return defaults < --config < --set < the options named for a plan."""
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.config_file import parse_set, read_config_file
+    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_file import parse_set, read_config_file
     config = Config()
     if args.config:
         config = with_settings(config, read_config_file(Path(args.config)))
@@ -122,8 +122,8 @@ def _drive(args, config):
 
 def _sigmas(args, config, figures):
     """Return the error figures: those of the bag, replaced by what is asked."""
-    from odocal_ros.calib.predict import Sigmas
     from odocal_ros.offline.what_helps import RTK
+    from odocal_ros.plan.predict import Sigmas
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma both give the error of a fix; give one')
     fix = RTK if args.rtk else args.fix_sigma

@@ -3,11 +3,11 @@
 import math
 import textwrap
 
-from odocal_ros.calib.planned_methods import NOT_PREDICTED, Plan
-from odocal_ros.calib.planned_smoother import SWAY_RATE, WHITE_SHARE
 from odocal_ros.offline.what_helps import ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
+from odocal_ros.plan.methods import NOT_PREDICTED, Plan
+from odocal_ros.plan.smoother import SWAY_RATE, WHITE_SHARE
 
 PITCH = 'pitch_mounting_angle'
 PARAMETERS = (SCALE, YAW, PITCH)

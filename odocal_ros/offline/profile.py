@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from odocal_ros.calib.planned_drive import from_rates, marked, PlannedDrive, STEP
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.plan.drive import from_rates, marked, PlannedDrive, STEP
 
 TURN_TIME = 8.0          # s of a turn of 90 deg
 MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
@@ -180,11 +180,11 @@ def _smooth(x, wide):
 def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
-    from odocal_ros.leg import LegRecorder
-    from odocal_ros.leg_profile import count_size, fix_figures, profile_of
-    from odocal_ros.messages import make_reader
+    from odocal_ros.data.leg import LegRecorder
+    from odocal_ros.messages.decode import make_reader
     from odocal_ros.offline.legs import find_legs, marked_legs
     from odocal_ros.offline.topics import choose_topics
+    from odocal_ros.plan.leg_profile import count_size, fix_figures, profile_of
     with open_bag(path) as bag:
         chosen = choose_topics(bag.topics, config, topics)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)

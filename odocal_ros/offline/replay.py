@@ -10,7 +10,7 @@ from textwrap import fill
 
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.say import say, warn
-from odocal_ros.outside import one_line
+from odocal_ros.outside.names import one_line
 
 HELP = 'calibrate from recorded bags'
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
@@ -60,7 +60,7 @@ def run(args) -> int:
     from odocal_ros.offline.cli import trace_file
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.output.frames import framed
-    from odocal_ros.pipeline import combine
+    from odocal_ros.pipeline.calibrate import combine
     paths, again = once([Path(bag) for bag in args.bags])
     for path in again:
         _tell(args, f'{path} is given twice: it is read once')
@@ -113,8 +113,8 @@ def _tell(args, note: str) -> None:
 
 def _config(args, journal=None):
     """Return defaults < a journal's settings < --config < --set, each checked."""
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.config_file import parse_set, read_config_file
+    from odocal_ros.settings.config import Config, with_settings
+    from odocal_ros.settings.config_file import parse_set, read_config_file
     config = with_settings(Config(), journal.settings if journal else {})
     if args.config:
         config = with_settings(config, read_config_file(Path(args.config)))
@@ -124,7 +124,7 @@ def _config(args, journal=None):
 
 def _readers(bag, args, config, journal):
     """Return slot -> topic of a bag, and topic -> reader."""
-    from odocal_ros.messages import make_reader
+    from odocal_ros.messages.decode import make_reader
     from odocal_ros.offline.topics import choose_topics
     overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
         'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
@@ -145,7 +145,7 @@ def _legs_of(path, args, asked, config, journal, unit):
     from concurrent.futures import ThreadPoolExecutor
 
     from odocal_ros.bagio.read import bag_sha256, open_bag
-    from odocal_ros.leg import LegRecorder
+    from odocal_ros.data.leg import LegRecorder
     from odocal_ros.offline.legs import (
         dropped_legs,
         find_legs,
@@ -199,7 +199,7 @@ def _calibrated(recorder, spans, config, notes, name, args):
     from dataclasses import replace
 
     from odocal_ros.offline.phases import Phase
-    from odocal_ros.parts import calibrate_parts
+    from odocal_ros.pipeline.parts import calibrate_parts
     results = []
     with Phase('calibrating', args.quiet or args.json) as phase:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
@@ -215,7 +215,7 @@ def _calibrated(recorder, spans, config, notes, name, args):
 
 def _worth_keeping(results, args):
     """Return legs found by themselves but for those that are no good, as the node has it."""
-    from odocal_ros.automatic import refusal
+    from odocal_ros.pipeline.automatic import refusal
     why = [refusal(leg) for leg in results]
     if all(why):
         return results

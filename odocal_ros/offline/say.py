@@ -2,7 +2,7 @@
 
 import sys
 
-from odocal_ros.outside import for_terminal, one_line
+from odocal_ros.outside.names import for_terminal, one_line
 
 
 def say(text: str, end: str = '\n') -> None:

@@ -7,8 +7,8 @@ import sys
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
-from odocal_ros.outside import for_comment, for_shell, one_line
-from odocal_ros.whole import uninterrupted, write_text
+from odocal_ros.outside.names import for_comment, for_shell, one_line
+from odocal_ros.outside.whole import uninterrupted, write_text
 
 HELP = 'write a bag with known truth'
 TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.drive import white_noise
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.screen import Inputs
+from odocal_ros.screening.screen import Inputs
 
 STRAIGHT = 0.97      # chord over way: a stretch at least this straight suits the two-point method
 POINTS = 600         # fixes looked at for straight stretches, evenly taken

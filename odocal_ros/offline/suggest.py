@@ -1,10 +1,10 @@
 """Which topics a bag's inputs most likely are, and the replay command that says so."""
 
 from odocal_ros.bagio.read import TopicInfo
-from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.topics import candidates, choose_topics, named, OPTION, wanted
-from odocal_ros.outside import for_shell
+from odocal_ros.outside.names import for_shell
+from odocal_ros.settings.config import Config, with_settings
 
 COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 

@@ -3,10 +3,10 @@
 from collections.abc import Iterable
 
 from odocal_ros.bagio.read import TopicInfo
-from odocal_ros.config import Config
 from odocal_ros.errors import BadUsage
-from odocal_ros.messages import FIX, full_type, IMU, VELOCITY
-from odocal_ros.odometer_types import TYPES as ODOMETERS
+from odocal_ros.messages.decode import FIX, full_type, IMU, VELOCITY
+from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
+from odocal_ros.settings.config import Config
 
 OPTION = {'imu': '--imu-topic', 'odometer': '--odometer-topic', 'fix': '--fix-topic',
           'odometer_right': '--odometer-right-topic', 'heading': '--heading-topic',

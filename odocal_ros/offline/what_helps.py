@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from odocal_ros.calib.planned_drive import AT_REST, PlannedDrive
-from odocal_ros.calib.planned_manoeuvres import stop_and_start, town_driving, turns_both_ways
-from odocal_ros.calib.planned_methods import Plan, plan_methods
-from odocal_ros.calib.planned_smoother import spacing_for
-from odocal_ros.calib.predict import predict, Sigmas
 from odocal_ros.calib.result import Estimate, MethodResult
-from odocal_ros.combination import together
-from odocal_ros.config import GRADES, with_settings
 from odocal_ros.output.figures import length, time_span
+from odocal_ros.pipeline.combination import together
+from odocal_ros.plan.drive import AT_REST, PlannedDrive
+from odocal_ros.plan.manoeuvres import stop_and_start, town_driving, turns_both_ways
+from odocal_ros.plan.methods import Plan, plan_methods
+from odocal_ros.plan.predict import predict, Sigmas
+from odocal_ros.plan.smoother import spacing_for
+from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 RTK = 0.02                        # m

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from odocal_ros.bagio import cdr
-from odocal_ros.glitches import beyond
-from odocal_ros.leg import MOST_DAYS
-from odocal_ros.odometer_types import JOINTS
+from odocal_ros.data.leg import MOST_DAYS
+from odocal_ros.messages import cdr
+from odocal_ros.messages.odometer_types import JOINTS
+from odocal_ros.screening.glitches import beyond
 
 TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
 ALIKE = 0.3            # of the largest way: what a wheel of the same vehicle rolls at least

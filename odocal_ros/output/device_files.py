@@ -3,10 +3,10 @@
 import textwrap
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.config import Config
 from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.file_head import head
 from odocal_ros.output.summary import inverse, known
+from odocal_ros.settings.config import Config
 
 DEVICES = 'wheel_input.txt'
 MICRO = 1e6

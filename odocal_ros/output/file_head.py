@@ -2,7 +2,7 @@
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.summary import sentence
-from odocal_ros.outside import for_comment, one_line
+from odocal_ros.outside.names import for_comment, one_line
 
 
 def head(calibration: Calibration, content: dict) -> str:

@@ -10,12 +10,12 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, TrackCheck
-from odocal_ros.config import Config, flat
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
 from odocal_ros.output.track_table import in_pieces, overall
+from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1
 MAIN = 'calibration.json'

@@ -17,7 +17,7 @@ import shutil
 import uuid
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.whole import disk, locked, PART, sync_folder, uninterrupted, write_text
+from odocal_ros.outside.whole import disk, locked, PART, sync_folder, uninterrupted, write_text
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 NOT_BY_RENAME = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.config import Config, with_settings
-from odocal_ros.outside import is_frame, one_line
+from odocal_ros.outside.names import is_frame, one_line
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, with_settings
 
 IMU_FRAME = 'imu_link'      # REP-145, where nobody names one
 

@@ -9,9 +9,9 @@ import json
 import numpy as np
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output.summary import sentence
+from odocal_ros.settings.config import Config
 
 TRACK = 'track.geojson'
 MOST = 5000          # points of a feature: maps draw no more

@@ -6,9 +6,9 @@ import io
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
 from odocal_ros.output.summary import known
-from odocal_ros.outside import for_table
+from odocal_ros.outside.names import for_table
+from odocal_ros.settings.config import Config
 
 LEGS = 'legs.csv'
 SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',

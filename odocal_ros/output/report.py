@@ -7,13 +7,13 @@ from importlib.resources import files
 
 from odocal_ros.calib.choice import ABOUT, leg_estimates
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import DEG, known, MEANING, sentence
 from odocal_ros.output.track_table import before_label, check_table
 from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
 MOST_BYTES = 2_600_000     # of figures; a page stays under 3 MB with its tables

@@ -6,12 +6,12 @@ import math
 import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration, Estimate, LegResult, MethodResult
-from odocal_ros.config import Config, flat, SETTINGS
 from odocal_ros.output.budget_table import LABELS as SOURCES
 from odocal_ros.output.figures import beyond_one, share, two_digits, with_sigma
 from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
 from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, flat, SETTINGS
 
 LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
           'yaw_mounting_angle': 'yaw mounting angle',

@@ -6,16 +6,16 @@ from xml.etree import ElementTree
 import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration
-from odocal_ros.config import Config
 from odocal_ros.output.controller_files import CONTROLLERS, controllers
 from odocal_ros.output.device_files import DEVICES, devices
 from odocal_ros.output.file_head import about, head
 from odocal_ros.output.frames import IMU_FRAME
 from odocal_ros.output.geojson import geojson, TRACK
 from odocal_ros.output.leg_table import leg_table, LEGS
-from odocal_ros.outside import for_comment, for_launch, for_shell, for_xml_comment
+from odocal_ros.outside.names import for_comment, for_launch, for_shell, for_xml_comment
+from odocal_ros.outside.yaml_text import no_date, parameters
 from odocal_ros.reasons import Verdict
-from odocal_ros.yaml_text import no_date, parameters
+from odocal_ros.settings.config import Config
 
 PARAMS = 'calibration.yaml'
 VELOCITY = 'vehicle_velocity_converter.param.yaml'

@@ -1,7 +1,7 @@
 """The verdict of a method as it is shown: no better than that of the data it was fed with."""
 
 from odocal_ros.calib.result import LegResult, MethodResult
-from odocal_ros.combination import driven_twice
+from odocal_ros.pipeline.combination import driven_twice
 from odocal_ros.reasons import Verdict, verdict_of
 
 

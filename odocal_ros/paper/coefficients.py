@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from odocal_ros.nav.error_model import coefficients, PAPER_RADIUS, STATES
 from odocal_ros.paper.cells import Cell, TABLE_1, TABLE_2
+from odocal_ros.paper.error_model import coefficients, PAPER_RADIUS, STATES
 
 LATITUDE = np.deg2rad(40.0)
 VELOCITY_N = (14.0, 14.0, 0.0)     # m/s, east, north, up

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import LegResult
-from odocal_ros.config import Config, with_settings
 from odocal_ros.nav.alignment import Alignment
-from odocal_ros.nav.error_forms import chord_error, plane_error, SpeedProfile
-from odocal_ros.nav.error_model import Path, planned_path, propagate
 from odocal_ros.nav.projection import plane_for
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.paper.coefficients import DRIFT, HEADING, LEVEL
-from odocal_ros.pipeline import calibrate
+from odocal_ros.paper.error_forms import chord_error, plane_error, SpeedProfile
+from odocal_ros.paper.error_model import Path, planned_path, propagate
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import Drive, SimOptions, simulate
 from odocal_ros.sim.sensors import imu_rotation

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from odocal_ros.grades import GRADES
+from odocal_ros.settings.grades import GRADES
 
 DEG, MG, K_HOUR = math.radians(1.0), 9.81e-3, math.radians(1.0) / 3600
 G = 9.81

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.grades import Grade, GRADES
+from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim.real import Real
 
 PERFECT = Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

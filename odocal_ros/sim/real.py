@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.grades import GRADES
+from odocal_ros.settings.grades import GRADES
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row

@@ -4,10 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.leg import Leg
-from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
-from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.samples import (
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
     ImuSamples,
@@ -16,6 +14,8 @@ from odocal_ros.samples import (
     OdometerForm,
     OdometerSamples,
 )
+from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim import body, real_wheels, sensors
 from odocal_ros.sim.housing import own_angles
 from odocal_ros.sim.motion import attitude, Hills, Motion, Start

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
     matrix_from_rpy,
@@ -18,7 +19,6 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
-from odocal_ros.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 from odocal_ros.sim import body, real_fixes, real_imu, real_wheels
 from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white

@@ -4,9 +4,8 @@ import numpy as np
 
 from odocal_ros.apply.odometry import Odometry
 from odocal_ros.apply.vehicle import vehicle_of
-from odocal_ros.apply_config import ApplyConfig
 from odocal_ros.calib.result import Estimate
-from odocal_ros.config import with_settings
+from odocal_ros.data.samples import take
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
@@ -14,7 +13,8 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
-from odocal_ros.samples import take
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.config import with_settings
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.sensors import imu_rotation
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from streams import alignment_of, given, odometry_of, poses_of, samples_of
 
-from odocal_ros.leg_run import LegRun
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.pipeline import calibrate
-from odocal_ros.samples import ImuSamples, OdometerForm, OdometerSamples, take
-from odocal_ros.screen import screen
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.pipeline.leg_run import LegRun
+from odocal_ros.screening.screen import screen
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'duration': 120.0}   # replay keeps each epoch

@@ -11,11 +11,11 @@ import ros_bags
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.mcap_records import CHUNK
 from odocal_ros.bagio.read import open_bag
-from odocal_ros.config import Config
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadBag, BadData
-from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import make_reader
+from odocal_ros.messages.decode import make_reader
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config
 
 SLOTS = {'/imu/data': 'imu', '/odometer': 'odometer', '/fix': 'fix'}
 

@@ -11,10 +11,10 @@ import ros_bags
 from ros_bags import T0
 
 from odocal_ros.bagio import definitions
-from odocal_ros.bagio.limits import LimitReached, RAISE, zstd_module
 from odocal_ros.bagio.mcap_records import MAGIC
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.errors import BadBag, BadData
+from odocal_ros.outside.limits import LimitReached, RAISE, zstd_module
 
 MOST = 2**28       # bytes: a quarter of what a reading may take over a clean bag's
 

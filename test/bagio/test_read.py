@@ -16,11 +16,11 @@ import ros_messages as make
 
 from odocal_ros.bagio import parts
 from odocal_ros.bagio.read import bag_sha256, open_bag
-from odocal_ros.config import Config, with_settings
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadBag, BadData, BadUsage
-from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import make_reader
+from odocal_ros.messages.decode import make_reader
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
 
 SLOTS = {'/imu/data': 'imu', '/odometer': 'odometer', '/fix': 'fix'}
 KINDS = [('mcap', 'none'), ('mcap', 'storage'), ('mcap', 'file'), ('mcap', 'message'),

@@ -12,9 +12,9 @@ from rosbags.rosbag2 import storage_mcap
 from test_damage import chunks_of
 
 from odocal_ros.bagio import rosbag1_file, write
-from odocal_ros.bagio.limits import Allowance, LimitReached
 from odocal_ros.bagio.parts import Part
 from odocal_ros.errors import BadBag
+from odocal_ros.outside.limits import Allowance, LimitReached
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate
 

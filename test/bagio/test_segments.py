@@ -17,7 +17,7 @@ from odocal_ros.bagio.numbered import JOURNAL, part_name, whole_name
 from odocal_ros.bagio.read import open_bag
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.errors import BadBag
-from odocal_ros.whole import PART
+from odocal_ros.outside.whole import PART
 
 T0 = ros_bags.T0
 CHANNELS = {

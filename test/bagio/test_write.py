@@ -7,8 +7,8 @@ import pytest
 
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.write import drive_topics, write_bag
+from odocal_ros.data.samples import HeadingSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.samples import HeadingSamples, OdometerSamples
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SHORT = {'scenario': 'town', 'duration': 140.0, 'imu_rate': 50.0}

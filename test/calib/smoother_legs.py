@@ -8,11 +8,11 @@ import numpy as np
 
 from odocal_ros.calib.smoother import keyframe_times, smoother_leg
 from odocal_ros.calib.smoother.state import C_bv, GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
-from odocal_ros.leg_run import LegRun
+from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.samples import VelocitySamples
-from odocal_ros.screen import screen
+from odocal_ros.pipeline.leg_run import LegRun
+from odocal_ros.screening.screen import screen
 from odocal_ros.sim import motion, sensors
 from odocal_ros.sim.noise import random_walk, stream
 from odocal_ros.sim.options import SIM_GRADES

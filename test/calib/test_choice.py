@@ -8,9 +8,9 @@ import pytest
 from odocal_ros.calib.agreement import disagreements, LOOSE
 from odocal_ros.calib.choice import choose, deciding, passed_over, worth_saying
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
-from odocal_ros.combination import combine
-from odocal_ros.config import Config, with_settings
+from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config, with_settings
 
 NO_YAW = Reason(Code.YAW_NOT_DETERMINED, 'no turns')
 ALL = with_settings(Config(), {'method': 'all'})

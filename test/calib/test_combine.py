@@ -9,9 +9,9 @@ import pytest
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
-from odocal_ros.combination import combine
-from odocal_ros.config import Config, with_settings
+from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, with_settings
 
 CONFIG = Config()
 LEGS = count(1)

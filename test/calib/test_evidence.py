@@ -9,12 +9,12 @@ import pytest
 from odocal_ros.calib.evidence import evidence, ROWS
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.sections import sections
-from odocal_ros.config import Config, with_settings
-from odocal_ros.leg import Leg
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import FixSamples
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.samples import FixSamples
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config, with_settings
 
 START_NS = 1_700_000_000_000_000_000
 END = 100.0                                  # s; 10 m/s, east for half of it, then north

@@ -10,9 +10,9 @@ from smoother_legs import leg_of, made
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.imperfect import believed, weigh_kinds
 from odocal_ros.calib.smoother.state import FAST
-from odocal_ros.config import Config, with_settings
-from odocal_ros.grades import grade_as_seen, GRADES
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.grades import grade_as_seen, GRADES
 from odocal_ros.sim.draw import drawn
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate

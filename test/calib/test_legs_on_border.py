@@ -14,10 +14,10 @@ from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.remarks import FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.slips import NO_SLIPS
-from odocal_ros.combination import combine
-from odocal_ros.config import with_settings
+from odocal_ros.pipeline.combination import combine
+from odocal_ros.pipeline.slow_slip import held
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.slow_slip import held
+from odocal_ros.settings.config import with_settings
 
 NAMES = ('k', 'z0', 'z1', 'z2', 'z3')
 LEGS, STATES, ROWS = 5, 80, 130

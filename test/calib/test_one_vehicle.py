@@ -5,9 +5,9 @@ import pytest
 
 from odocal_ros.calib.one_vehicle import unlike_legs
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
-from odocal_ros.combination import combine
-from odocal_ros.config import Config
+from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import Config
 
 DEG = np.pi / 180
 

@@ -6,7 +6,8 @@ from math import gcd
 import numpy as np
 import pytest
 
-from odocal_ros.calib.wheels.arrays import (
+from odocal_ros.errors import BadUsage
+from odocal_ros.patent.arrays import (
     bose,
     design_for,
     field_tables,
@@ -19,8 +20,7 @@ from odocal_ros.calib.wheels.arrays import (
     next_prime_power,
     prime_power,
 )
-from odocal_ros.calib.wheels.embodiment import FOUND, LEVELS, PRINTED
-from odocal_ros.errors import BadUsage
+from odocal_ros.patent.embodiment import FOUND, LEVELS, PRINTED
 
 PRIME_POWERS = [2, 3, 4, 5, 7, 8, 9, 11, 13, 16]
 

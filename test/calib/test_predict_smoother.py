@@ -7,24 +7,19 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.planned_drive import from_rates
-from odocal_ros.calib.planned_manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
-from odocal_ros.calib.planned_samples import ideal
-from odocal_ros.calib.planned_smoother import (
-    planned_levels,
-    predict_smoother,
-    spacing_for,
-    WIDEST,
-)
-from odocal_ros.calib.predict import Sigmas
 from odocal_ros.calib.smoother import bound, imperfect, problem, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import FLOOR
-from odocal_ros.config import Config, with_settings
 from odocal_ros.errors import BadConfig
-from odocal_ros.grades import GRADES
+from odocal_ros.plan.drive import from_rates
+from odocal_ros.plan.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.plan.predict import Sigmas
+from odocal_ros.plan.samples import ideal
+from odocal_ros.plan.smoother import planned_levels, predict_smoother, spacing_for, WIDEST
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.grades import GRADES
 
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with

@@ -8,15 +8,15 @@ import pytest
 from smoother_legs import made
 from test_legs_on_border import apart, leg_result, Toy, TRUTH
 
-from odocal_ros.automatic import fold
 from odocal_ros.calib.carried import carried_from
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.scale_steps import CHANGED, scale_steps
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.combination import combine
-from odocal_ros.config import with_settings
 from odocal_ros.output.files import as_json
+from odocal_ros.pipeline.automatic import fold
+from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import with_settings
 
 STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Source
-from odocal_ros.config import Config, with_settings
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}

@@ -15,9 +15,9 @@ from odocal_ros.calib.smoother.outside import Heading
 from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import YAW
-from odocal_ros.config import with_settings
 from odocal_ros.reasons import Code
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import with_settings
 
 ARMS = {'antenna_lever_arm': (0.5, -0.3, 1.2)}
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'} | ARMS

@@ -29,9 +29,9 @@ from odocal_ros.calib.smoother.state import (
     WITH_SLOW,
     YAW,
 )
-from odocal_ros.config import with_settings
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.settings.config import with_settings
 
 N = WITH_SLOW
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,

@@ -17,8 +17,8 @@ from odocal_ros.calib.smoother.outcome import not_settled
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import GYRO_SCALE, YAW
-from odocal_ros.config import with_settings
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.settings.config import with_settings
 
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 

@@ -7,9 +7,9 @@ from drives import settings
 import numpy as np
 import pytest
 
-from odocal_ros.pipeline import calibrate
+from odocal_ros.data.samples import OdometerSamples
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.samples import OdometerSamples
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

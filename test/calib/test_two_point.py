@@ -15,9 +15,9 @@ from drives import (
 import numpy as np
 import pytest
 
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.data.samples import take
+from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code
-from odocal_ros.samples import take
 
 CLEAN = {'imu_grade': 'perfect', 'fix_sigma': 0.0, 'odometer': 'angle', 'imu_rate': 100.0,
          'odometer_rate': 50.0}

@@ -7,18 +7,18 @@ from drives import changed, drive, seconds, settings
 import numpy as np
 import pytest
 
-from odocal_ros.align import align
-from odocal_ros.calib.wheels.faults import broken_wheels
 from odocal_ros.calib.wheels.slips import wheel_faults
-from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.align import align
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screen import screen
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import screen
+from odocal_ros.screening.wheel_faults import broken_wheels
 
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
 COUNT = 0.0213      # m

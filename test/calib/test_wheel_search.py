@@ -9,24 +9,24 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.align import align
-from odocal_ros.calib.wheels import planar
-from odocal_ros.calib.wheels.criteria import HUBER, loss, score, weights
-from odocal_ros.calib.wheels.direct import least_squares, repeats
-from odocal_ros.calib.wheels.embodiment import embodiment, FOUND, PRINTED, RADIUS
-from odocal_ros.calib.wheels.planar import course_pieces, planar_leg, PlanarLeg, positions
-from odocal_ros.calib.wheels.ranges import Ranges, ranges_of
-from odocal_ros.calib.wheels.search import MOST_ROWS, search
-from odocal_ros.calib.wheels.space import sets_of, Space
-from odocal_ros.calib.wheels.surface import fit_surface, minimum_in_box, refine
-from odocal_ros.config import Config, WheelsConfig, with_settings
-from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
+from odocal_ros.patent import planar
+from odocal_ros.patent.criteria import HUBER, loss, score, weights
+from odocal_ros.patent.direct import least_squares, repeats
+from odocal_ros.patent.embodiment import embodiment, FOUND, PRINTED, RADIUS
+from odocal_ros.patent.planar import course_pieces, planar_leg, PlanarLeg, positions
+from odocal_ros.patent.ranges import Ranges, ranges_of
+from odocal_ros.patent.search import MOST_ROWS, search
+from odocal_ros.patent.space import sets_of, Space
+from odocal_ros.patent.surface import fit_surface, minimum_in_box, refine
+from odocal_ros.pipeline.align import align
 from odocal_ros.reasons import Code
-from odocal_ros.screen import screen
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config, WheelsConfig, with_settings
 
 FREE, HELD = Space(held=False), Space(held=True)
 RTK = {'fix_noise': 'rtk', 'imu_grade': 'tactical', 'two_wheels': True}

@@ -12,7 +12,7 @@ from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.result import fit_wheels
 from odocal_ros.calib.wheels.slips import NO_SLIPS
 from odocal_ros.calib.wheels.unseen import drawn_out, unseen_slip, with_unseen
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 
 SIZE = 0.23          # m

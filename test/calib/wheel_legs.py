@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.align import align
 from odocal_ros.calib.marks import fix_at, standing_at
 from odocal_ros.calib.wheels.leg import WheelLeg
-from odocal_ros.fix_screen import origin_amid
 from odocal_ros.nav.angles import wrap, yaw_from_heading
 from odocal_ros.nav.dead_reckoning import dead_reckon, rough_scale
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.nav.strapdown import attitude
-from odocal_ros.screen import screen
+from odocal_ros.pipeline.align import align
+from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import screen
 
 
 def wheel_leg(leg, config) -> WheelLeg:

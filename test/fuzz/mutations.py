@@ -7,8 +7,8 @@ import struct
 
 import yaml
 
-from odocal_ros.bagio.limits import zstd_module
 from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
+from odocal_ros.outside.limits import zstd_module
 
 INTEGERS = [0, 1, -1, 2, 127, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
             2**63 - 1, 2**63, 2**64 - 1]
@@ -300,7 +300,7 @@ def text_file(rng, file):
 
 def texts(rng: random.Random, folder):
     """Return options of odd text: settings, legs, topics, a file of settings."""
-    from odocal_ros.config import SETTINGS
+    from odocal_ros.settings.config import SETTINGS
     found = []
     for _ in range(rng.choice([1, 1, 2, 4])):
         odd = rng.choice([*map(str, VALUES), *map(str, FLOATS), *NUMBERS, '[1, 2, 3]', '[]',

@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 from bench import wait_for
 
-from odocal_ros.config import Config
 from odocal_ros.live.console import Console
 from odocal_ros.live.session import Session
-from odocal_ros.live.situation import Situation
+from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 SECOND = 10**9
 
@@ -21,7 +21,7 @@ def test_each_thing_is_said_once_or_seldom():
 
     def tell(second, **known):
         before = len(said)
-        console.tell(Situation(session, Config(), **known), second * SECOND)
+        console.tell(SessionView(session, Config(), **known), second * SECOND)
         return said[before:]
 
     nothing = {'missing': ['no Imu on /imu/data']}

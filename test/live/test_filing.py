@@ -10,10 +10,10 @@ pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]'
 from bench import wait_for
 
 from odocal_ros.calib.result import Calibration
-from odocal_ros.config import Config, with_settings
 from odocal_ros.live.filing import Filing
 from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config, with_settings
 
 NOW_NS = 10**18
 GOOD = Calibration((), {}, {}, ())

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.config import Config, with_settings
+from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.foresee.progress import Clocks, FixPath, nominal_scale, Progress, Travel
 from odocal_ros.live.health import Health
-from odocal_ros.live.progress import Clocks, FixPath, nominal_scale, Progress, Travel
-from odocal_ros.samples import FixSamples, OdometerForm, OdometerSamples, take
+from odocal_ros.settings.config import Config, with_settings
 
 SECOND = 1_000_000_000
 COUNTER = OdometerForm('cumulative', 2**16, 'm/pulse')

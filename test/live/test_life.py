@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import get_parameter_value
 
 from odocal_ros.bagio import encode
-from odocal_ros.config import SETTINGS
+from odocal_ros.settings.config import SETTINGS
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 RELIABLE, BEST_EFFORT = 'reliable', 'best effort'
@@ -383,8 +383,8 @@ def test_1_khz_arrives_whole_and_services_answer_meanwhile(start, connect):
 
 
 def test_each_node_has_a_folder_of_its_own_in_the_ros_home(domain, tmp_path, monkeypatch):
-    from odocal_ros.config import Config, with_settings
-    from odocal_ros.live.outputs import output_root
+    from odocal_ros.live.result_files import output_root
+    from odocal_ros.settings.config import Config, with_settings
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     assert output_root(Config(), '/calibrator') == tmp_path / 'odocal/calibrator'
     assert output_root(Config(), '/car4/calibrator') == tmp_path / 'odocal/car4/calibrator'

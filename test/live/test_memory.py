@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from odocal_ros.leg import LegRecorder
-from odocal_ros.samples import OdometerSamples
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import OdometerSamples
 
 SECOND = 1_000_000_000
 

@@ -8,10 +8,10 @@ import numpy as np
 from player import messages_of, part, Player
 import pytest
 
-from odocal_ros.config import Config
-from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import make_reader
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.messages.decode import make_reader
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 15.0

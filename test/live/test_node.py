@@ -15,12 +15,12 @@ from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from odocal_ros.config import Config, with_settings
-from odocal_ros.leg import LegRecorder
-from odocal_ros.messages import make_reader
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.messages.decode import make_reader
 from odocal_ros.output.files import as_json
-from odocal_ros.pipeline import calibrate, combine
+from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0            # times real time: 2400 messages a second

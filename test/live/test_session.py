@@ -3,9 +3,9 @@
 import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.config import Config
 from odocal_ros.live.session import Refused, Session, State
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 CONFIG = Config()
 

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from odocal_ros.live import shelf as module
-from odocal_ros.live.shelf import Shelf
+from odocal_ros.live import result_folders as module
+from odocal_ros.live.result_folders import ResultFolders
 
 
 @pytest.fixture
@@ -29,69 +29,69 @@ def latest(tmp_path):
 
 
 def test_latest_goes_with_each_result_but_not_to_a_worse_one(make, tmp_path):
-    shelf = Shelf()
-    assert shelf.file(make('a'), frozenset({1}), False) == ''
-    assert shelf.file(make('b'), frozenset({1, 2}), False) == ''
+    folders = ResultFolders()
+    assert folders.file(make('a'), frozenset({1}), False) == ''
+    assert folders.file(make('b'), frozenset({1, 2}), False) == ''
     assert latest(tmp_path) == Path('b')
     bad = make('bad')
-    assert shelf.file(bad, frozenset({1, 2, 3}), False) == 'it is rejected'
+    assert folders.file(bad, frozenset({1, 2, 3}), False) == 'it is rejected'
     assert latest(tmp_path) == Path('b')
-    assert shelf.file(bad, frozenset({1, 2, 3}), True) == ''
+    assert folders.file(bad, frozenset({1, 2, 3}), True) == ''
     assert latest(tmp_path) == Path('bad')
     assert sorted(p.name for p in tmp_path.iterdir()) == ['a', 'b', 'bad', 'latest']
 
 
 def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):
-    Shelf().file(make('old'), frozenset({1}), False)
-    shelf = Shelf()
-    assert shelf.file(make('bad'), frozenset({2}), False) == 'it is rejected'
+    ResultFolders().file(make('old'), frozenset({1}), False)
+    folders = ResultFolders()
+    assert folders.file(make('bad'), frozenset({2}), False) == 'it is rejected'
     assert latest(tmp_path) == Path('old')
 
 
 def test_undo_takes_latest_back_to_the_legs_left(make, tmp_path):
-    Shelf().file(make('old'), frozenset({0}), False)
-    shelf = Shelf()
+    ResultFolders().file(make('old'), frozenset({0}), False)
+    folders = ResultFolders()
     a = make('a')
-    shelf.file(a, frozenset({1}), False)
-    shelf.file(make('b'), frozenset({1, 2}), False)
-    shelf.file(make('c'), frozenset({1, 2}), False)
-    assert shelf.withdraw(frozenset({1})) == a
+    folders.file(a, frozenset({1}), False)
+    folders.file(make('b'), frozenset({1, 2}), False)
+    folders.file(make('c'), frozenset({1, 2}), False)
+    assert folders.withdraw(frozenset({1})) == a
     assert latest(tmp_path) == Path('a')
-    assert shelf.withdraw(frozenset()) is None
+    assert folders.withdraw(frozenset()) is None
     assert latest(tmp_path) == Path('old')
-    assert shelf.withdraw(frozenset()) is None
+    assert folders.withdraw(frozenset()) is None
 
 
 def test_undo_of_the_first_result_of_all_leaves_no_latest(make, tmp_path):
-    shelf = Shelf()
-    shelf.file(make('a'), frozenset({1}), False)
-    shelf.withdraw(frozenset())
+    folders = ResultFolders()
+    folders.file(make('a'), frozenset({1}), False)
+    folders.withdraw(frozenset())
     assert latest(tmp_path) is None
     assert (tmp_path / 'a').is_dir()
 
 
 def test_a_link_that_somebody_moved_is_left_alone(make, tmp_path):
-    shelf = Shelf()
-    shelf.file(make('a'), frozenset({1}), False)
-    Shelf().file(make('other'), frozenset({5}), False)
-    shelf.withdraw(frozenset())
+    folders = ResultFolders()
+    folders.file(make('a'), frozenset({1}), False)
+    ResultFolders().file(make('other'), frozenset({5}), False)
+    folders.withdraw(frozenset())
     assert latest(tmp_path) == Path('other')
 
 
 def test_a_target_that_is_gone_is_not_linked_again(make, tmp_path):
     old = make('old')
-    Shelf().file(old, frozenset({0}), False)
-    shelf = Shelf()
-    shelf.file(make('a'), frozenset({1}), False)
+    ResultFolders().file(old, frozenset({0}), False)
+    folders = ResultFolders()
+    folders.file(make('a'), frozenset({1}), False)
     old.rmdir()
-    shelf.withdraw(frozenset())
+    folders.withdraw(frozenset())
     assert latest(tmp_path) is None
 
 
 def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
     """Whoever looks at what is there points at its own before the next looks."""
     good, bad = make('good'), make('bad')
-    late = threading.Thread(target=lambda: Shelf().file(good, frozenset({1}), False))
+    late = threading.Thread(target=lambda: ResultFolders().file(good, frozenset({1}), False))
     stored_in = module.stored_in
 
     def slowly(path):
@@ -101,6 +101,6 @@ def test_two_nodes_file_one_after_the_other(make, tmp_path, monkeypatch):
             late.join(0.3)
         return found
     monkeypatch.setattr(module, 'stored_in', slowly)
-    Shelf().file(bad, frozenset({2}), False)
+    ResultFolders().file(bad, frozenset({2}), False)
     late.join()
     assert latest(tmp_path) == Path('good')

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.grades import GRADES
 from odocal_ros.nav.alignment import complete, EDGE, gyrocompass, level_at_rest, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
+from odocal_ros.settings.grades import GRADES
 
 LATITUDE, SECONDS, RATE = 0.7, 60.0, 5.0
 RPY = np.array([0.05, -0.08, 2.3])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed, grid
 from odocal_ros.nav.odometer import travel
-from odocal_ros.samples import OdometerForm
 
 KMH = 1 / 3.6
 T = np.arange(0.0, 600.0, 0.1)

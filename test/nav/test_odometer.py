@@ -5,9 +5,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.odometer import mean_travel, Travel, travel
 from odocal_ros.reasons import Code
-from odocal_ros.samples import OdometerForm
 
 
 def counter(modulus):

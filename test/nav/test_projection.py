@@ -4,9 +4,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.config import ProjectionConfig
 from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.nav.projection import geodesic_chord, Plane, plane_chord, plane_for
+from odocal_ros.settings.config import ProjectionConfig
 
 pytest.importorskip('pyproj')
 MERIDIAN = 117.0

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from odocal_ros.config import Config
-from odocal_ros.grades import GRADES
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.standstill import MOVE, standstills
-from odocal_ros.screen import screen
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 RATE = 100.0       # Hz

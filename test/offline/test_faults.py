@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from odocal_ros import leg_methods
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.offline.cli import main
+from odocal_ros.pipeline import methods as leg_methods
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import simulate
 

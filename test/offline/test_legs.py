@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from odocal_ros.config import Config
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.leg import LegRecorder
 from odocal_ros.offline.legs import (
     _marked,
     find_legs,
@@ -18,6 +17,7 @@ from odocal_ros.offline.legs import (
     parse_leg,
 )
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 S = 10**9

@@ -8,10 +8,10 @@ import pytest
 import ros_bags
 import yaml
 
-from odocal_ros.config_file import parse_set
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.cli import main
 from odocal_ros.offline.legs import parse_leg
+from odocal_ros.settings.config_file import parse_set
 
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],
        {}, {'a': 1}, [None], -1e308, '1' * 5000, {'nanoseconds': []}, b'\xff']

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.config import with_settings
 from odocal_ros.offline.cli import main
 from odocal_ros.paper.drive import errors_of, PaperDrive, SOURCES
 from odocal_ros.paper.tables import compute
+from odocal_ros.settings.config import with_settings
 
 # method.md 1.4: table 1 by the corrected equations, rounded or cut
 FIGURES_1 = {

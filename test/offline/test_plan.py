@@ -9,14 +9,14 @@ import shlex
 import numpy as np
 import pytest
 
-from odocal_ros.calib.planned_manoeuvres import stop_and_start
-from odocal_ros.calib.planned_methods import plan_methods
-from odocal_ros.calib.planned_smoother import predict_smoother
-from odocal_ros.calib.predict import predict, Sigmas
-from odocal_ros.config import Config, with_settings
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.offline import profile
 from odocal_ros.offline.cli import main
+from odocal_ros.plan.manoeuvres import stop_and_start
+from odocal_ros.plan.methods import plan_methods
+from odocal_ros.plan.predict import predict, Sigmas
+from odocal_ros.plan.smoother import predict_smoother
+from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 
 PAPER = ['plan', '--scenario', 'paper', '--imu-grade', 'navigation']

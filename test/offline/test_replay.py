@@ -12,11 +12,11 @@ import yaml
 
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.config import Config, with_settings
-from odocal_ros.config_file import parse_set
-from odocal_ros.leg import LegRecorder
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.offline.cli import main
-from odocal_ros.pipeline import calibrate
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config_file import parse_set
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}

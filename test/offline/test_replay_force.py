@@ -6,11 +6,11 @@ import pytest
 
 from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.calib.result import Calibration
-from odocal_ros.config import Config
 from odocal_ros.offline import replay
 from odocal_ros.offline.cli import main
 from odocal_ros.output.files import write_results
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 
@@ -50,7 +50,7 @@ def interrupted(*_):
 
 
 @pytest.mark.parametrize(('where', 'said'), [
-    ('odocal_ros.pipeline.combine', 'odocal: interrupted, nothing written\n'),
+    ('odocal_ros.pipeline.calibrate.combine', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.folder._which', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.files.report_or_why', 'the results are in {out}/, report.html is not\n'),
     ('odocal_ros.output.summary.screen', 'the results are in {out}/\n')])

@@ -62,7 +62,7 @@ def test_the_options_in_truth_make_the_drive_again(tmp_path):
 
 def test_the_settings_are_settings_of_the_node(tmp_path):
     """Each name and value passes the very checks of the pipeline."""
-    from odocal_ros.config import Config, flat, SETTINGS, with_settings
+    from odocal_ros.settings.config import Config, flat, SETTINGS, with_settings
     assert odocal(*SHORT, '--out', tmp_path / 'drive', '--two-wheels', '--imu-grade', 'tactical',
                   '--antenna-lever-arm', 1.2, 0, 1.5, '--known-heading-sigma-deg', 0.06,
                   '--mounting-rpy-deg', 180, 0, 0, '--quiet') == 0

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from odocal_ros.calib.result import Estimate
-from odocal_ros.config import Config, with_settings
 from odocal_ros.output import ros_files
 from odocal_ros.output.files import as_json
+from odocal_ros.settings.config import Config, with_settings
 
 CREATED = '2026-01-02T03:04:05+00:00'
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from odocal_ros import __version__
-from odocal_ros.config import Config, SETTINGS, with_settings
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import files
 from odocal_ros.output.files import as_json, write_results
+from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
 CREATED = '2026-01-02T03:04:05+00:00'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]

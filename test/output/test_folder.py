@@ -12,10 +12,10 @@ import threading
 from faults import Refusing
 import pytest
 
-from odocal_ros import whole
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import folder as module
 from odocal_ros.output.folder import ResultFolder
+from odocal_ros.outside import whole
 
 MAIN, OURS = 'main.json', frozenset({'main.json', 'a.txt', 'b.txt', 'late.html'})
 

@@ -15,12 +15,12 @@ import pytest
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, Source
 from odocal_ros.calib.sections import Sections
-from odocal_ros.config import Config, with_settings
 from odocal_ros.output import report
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.plots import leg_figures
 from odocal_ros.output.plots_svg import look
 from odocal_ros.output.report import report_html, report_or_why
+from odocal_ros.settings.config import Config, with_settings
 
 CREATED, MADE = '2026-01-02T03:04:05+00:00', '2026-01-02 03:04:05 UTC'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from odocal_ros.config import Config
 from odocal_ros.output import report_tables
 from odocal_ros.output.files import as_json
 from odocal_ros.output.reason_lines import shared
@@ -12,6 +11,7 @@ from odocal_ros.output.report import report_html
 from odocal_ros.output.summary import screen
 from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 DEAD = Reason(Code.WHEEL_DEAD, 'the left wheel does not count')
 SLIP = Reason(Code.WHEEL_SLIP, 'a wheel spun')

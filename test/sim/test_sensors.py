@@ -6,9 +6,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.grades import Grade, GRADES
 from odocal_ros.nav.angles import heading_from_yaw, wrap
 from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy
+from odocal_ros.settings.grades import Grade, GRADES
 from odocal_ros.sim import sensors
 from odocal_ros.sim.motion import attitude, contact_travel, inertial_v, Motion, Start
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white

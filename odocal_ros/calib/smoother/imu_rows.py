@@ -13,8 +13,8 @@ from odocal_ros.calib.smoother.state import (
     GYRO_AXIS,
     GYRO_SIGNAL,
 )
+from odocal_ros.data.samples import let_go
 from odocal_ros.nav.strapdown import rotation_increments
-from odocal_ros.samples import let_go
 
 Floats = NDArray[np.float64]
 CHUNK = 8192      # samples worked on at a time: their arrays stay in the cache

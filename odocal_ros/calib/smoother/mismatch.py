@@ -4,8 +4,8 @@ import numpy as np
 
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
-from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import grade_of
 
 WORSE = 3.0            # times the grade's noise or bias that is another sensor
 ODD_FIXES = 0.15       # share of the fixes with little weight

@@ -18,8 +18,8 @@ from odocal_ros.calib.smoother.state import (
     PITCH,
     YAW,
 )
-from odocal_ros.grades import G, grade_of
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import G, grade_of
 
 SURE = 3.0             # sigmas at which something is there
 AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4

@@ -12,8 +12,8 @@ from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALE
 from odocal_ros.calib.smoother.priors import SHARED
 from odocal_ros.calib.smoother.remarks import beside, FLOOR
 from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
-from odocal_ros.grades import grade_of
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import grade_of
 
 P = 3                # parameters: ln K, yaw, pitch, the first of CONSTANTS
 DAY = 86400e9        # ns

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.slip import acceleration, excess_way, PINS, STEP as SLIP_STEP
-from odocal_ros.calib.wheels.pair import pair, runs
 from odocal_ros.calib.wheels.whole_drive import (
     changed,
     fitted,
@@ -23,6 +22,7 @@ from odocal_ros.calib.wheels.whole_drive import (
     unlike,
 )
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.wheel_pair import pair, runs
 
 STEP = 0.1            # s, grid
 GAPS = (10, 30, 80, 200, 500)   # steps between the ends: slips of up to 1, 3, 8, 20, 50 s

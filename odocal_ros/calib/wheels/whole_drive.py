@@ -8,8 +8,8 @@ that changes on the way.
 
 import numpy as np
 
-from odocal_ros.calib.wheels.pair import robust_fit
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.wheel_pair import robust_fit
 
 SURE = 6.0            # sigmas
 MEAN = 10             # steps that speed and turn rate are averaged over

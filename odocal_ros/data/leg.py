@@ -1,0 +1,153 @@
+"""
+A leg: what the sensors said between two marks, and the recorder that collects it.
+
+The recorder is the only thing in the package that remembers; both doors feed it.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    no_fix,
+    no_heading,
+    no_imu,
+    no_odometer,
+    no_velocity,
+    OdometerForm,
+    OdometerSamples,
+    take,
+    VelocitySamples,
+)
+from odocal_ros.data.spool import Rows
+from odocal_ros.errors import BadData
+
+EMPTY = {
+    'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
+    'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
+}
+SLOTS = tuple(EMPTY)
+LEAD_NS = 10**9         # of odometer and fixes, to interpolate at the first row of the Imu
+AFTER_NS = 600 * 10**9   # a first row later than that after a mark tells nothing of it
+MOST_DAYS = 7          # of a leg
+COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """
+    What the sensors said between two marks, with the pre-roll before the first.
+
+    Each topic holds the rows from ``start_ns`` minus the pre-roll to the first row after
+    ``stop_ns``, in order of arrival, as sent. ``odometer`` is the left wheel where
+    ``odometer_right`` is not empty; ``form_right`` is what its values mean where its messages are
+    not those of the left.
+    """
+
+    start_ns: int
+    stop_ns: int
+    imu: ImuSamples = field(default_factory=no_imu)
+    odometer: OdometerSamples = field(default_factory=no_odometer)
+    odometer_right: OdometerSamples = field(default_factory=no_odometer)
+    fix: FixSamples = field(default_factory=no_fix)
+    fix_velocity: VelocitySamples = field(default_factory=no_velocity)
+    heading: HeadingSamples = field(default_factory=no_heading)
+    form: OdometerForm = COUNTER
+    form_right: OdometerForm | None = None
+
+
+class LegRecorder:
+    """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
+
+    def __init__(self) -> None:
+        self._rows = {slot: Rows(nothing) for slot, nothing in EMPTY.items()}
+        self._newest = dict.fromkeys(SLOTS, 0)
+        self.form = COUNTER
+        self.form_right: OdometerForm | None = None
+
+    def feed(self, slot: str, block) -> None:
+        """Append a block (one row or many) to a slot of SLOTS."""
+        if len(block.stamp_ns):
+            self._rows[slot].feed(block)
+            self._newest[slot] = int(block.stamp_ns[-1])
+
+    def newest_ns(self, slot: str) -> int:
+        """Return the stamp of the last row fed, 0 before the first."""
+        return self._newest[slot]
+
+    def rows(self, slot: str):
+        """Return all rows of a slot as one block, in order of arrival."""
+        return self._rows[slot].all()
+
+    def snapshot(self) -> 'LegRecorder':
+        """
+        Return a recorder with the rows so far, which another thread may close.
+
+        This one goes on untouched: ``close`` joins the blocks of the copy, and joined blocks
+        could no longer be forgotten bit by bit.
+        """
+        copy = LegRecorder()
+        copy.form, copy.form_right = self.form, self.form_right
+        copy._newest = dict(self._newest)
+        copy._rows = {slot: rows.snapshot() for slot, rows in self._rows.items()}
+        return copy
+
+    def forget_before(self, stamp_ns: int, slots=SLOTS) -> None:
+        """Drop blocks that lie whole before a stamp, to bound memory."""
+        for slot in slots:
+            self._rows[slot].forget(lambda block: _key(block) < stamp_ns)
+
+    def clear(self) -> None:
+        """Drop everything, as after a jump of time."""
+        self.__init__()
+
+    def close(self, start_ns: int, stop_ns: int, preroll: float = 600.0) -> Leg:
+        """
+        Return the leg between two marks, with ``preroll`` seconds before the first.
+
+        Rows up to the first one after ``stop_ns`` are kept in each topic, so that values can be
+        interpolated at the mark; later ones are not, however late the leg is closed.
+
+        Raises
+        ------
+        BadData
+            The marks are days apart: what is computed second by second would not end.
+
+        """
+        days = (stop_ns - start_ns) / 86400e9
+        if days > MOST_DAYS:
+            raise BadData(f'the leg lasts {days:.0f} days by the stamps of its rows: a clock was '
+                          'set while it was recorded, or they are damaged; mark a part of it by '
+                          '--leg A:B')
+        first_ns = start_ns - round(preroll * 1e9)
+        rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=self.form,
+                   form_right=self.form_right, **rows)
+
+
+def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
+    """Return what lies between two stamps of a leg; ``first_ns``: no Imu row before it is."""
+    rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - LEAD_NS, stop_ns) for slot in SLOTS}
+    imu = rows['imu']
+    rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
+    return replace(leg, start_ns=start_ns, stop_ns=stop_ns, **rows)
+
+
+def _key(samples) -> np.ndarray:
+    """Return the stamp by which a row is placed: rows without one go by their arrival."""
+    return np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+
+
+def _cut(samples, first_ns: int, stop_ns: int):
+    key = _key(samples)
+    after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
+    last_ns = after.min() if len(after) else stop_ns
+    keep = (key >= first_ns) & (key <= last_ns)
+    if keep.all():
+        return samples
+    edges = np.flatnonzero(np.diff(keep, prepend=False, append=False))
+    # in order, as rows are wont to come, they are a view and no copy
+    return take(samples, slice(*edges) if len(edges) == 2 else keep)

@@ -1,0 +1,189 @@
+"""
+Samples: what the sensors said, as frozen arrays, one row or a million.
+
+Rows stand in order of arrival and hold what was sent, NaN and stale stamps included;
+``screening/screen.py`` decides what is usable. ``stamp_ns`` is the header stamp (arrival where a message
+has none), ``received_ns`` the arrival (bag time, or the middleware's source stamp): it is used
+to compare clocks and never enters a result.
+"""
+
+from dataclasses import dataclass, fields
+import mmap
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.errors import BadData
+
+Stamps = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """IMU rows, in the sensor's own frame i (before the nominal mounting rotation)."""
+
+    stamp_ns: Stamps      # (n,)
+    received_ns: Stamps   # (n,)
+    w_i: Floats           # (n, 3) rad/s, turn rate against inertial space
+    f_i: Floats           # (n, 3) m/s^2, specific force
+    q_ni: Floats          # (n, 4) x y z w, orientation as sent: takes i to ENU
+    yaw_variance: Floats  # (n,)   rad^2, orientation_covariance[8]; 0 unknown, NaN no orientation
+
+    def __post_init__(self) -> None:
+        freeze(self, w_i=(3,), f_i=(3,), q_ni=(4,), yaw_variance=())
+
+
+@dataclass(frozen=True, eq=False)
+class OdometerSamples:
+    """Odometer rows as sent; ``OdometerForm`` says what the value means."""
+
+    stamp_ns: Stamps     # (n,)
+    received_ns: Stamps  # (n,)
+    value: NDArray       # (n,) int64 for counters (uint64 as its int64 bits), else float64
+
+    def __post_init__(self) -> None:
+        whole = np.issubdtype(np.asarray(self.value).dtype, np.integer)
+        freeze(self, value=((), np.int64 if whole else np.float64))
+
+
+@dataclass(frozen=True)
+class OdometerForm:
+    """
+    What an odometer value means.
+
+    ``quantity`` is ``cumulative`` (a counter or angle), ``increment`` (since the row before) or
+    ``rate`` (m/s, or rad/s of a joint). ``modulus`` is the counter's span in counts, 0 for values
+    that do not roll over. ``scale_unit`` is the unit of the scale factor: ``m/pulse``, ``m/rad``
+    or ``1``. ``sides`` is false where two values come and nothing tells which is the left wheel:
+    only their mean has a meaning. ``chosen`` says what the reader took of a message, unasked.
+    """
+
+    quantity: str
+    modulus: int
+    scale_unit: str
+    sides: bool = True
+    chosen: str = ''
+
+
+@dataclass(frozen=True, eq=False)
+class FixSamples:
+    """GNSS fixes."""
+
+    stamp_ns: Stamps           # (n,)
+    received_ns: Stamps        # (n,)
+    latitude: Floats           # (n,) rad
+    longitude: Floats          # (n,) rad
+    height: Floats             # (n,) m, ellipsoidal
+    covariance_n: Floats       # (n, 3, 3) m^2, ENU
+    covariance_type: NDArray   # (n,) int64, 0 unknown .. 3 known
+    status: NDArray            # (n,) int64, NavSatStatus: -1 no fix .. 2
+
+    def __post_init__(self) -> None:
+        freeze(self, latitude=(), longitude=(), height=(), covariance_n=(3, 3),
+               covariance_type=((), np.int64), status=((), np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class VelocitySamples:
+    """GNSS velocity, ENU."""
+
+    stamp_ns: Stamps     # (n,)
+    received_ns: Stamps  # (n,)
+    velocity_n: Floats   # (n, 3) m/s
+    variance_n: Floats   # (n, 3) (m/s)^2, 0 unknown
+
+    def __post_init__(self) -> None:
+        freeze(self, velocity_n=(3,), variance_n=(3,))
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingSamples:
+    """Outside heading of the IMU's x axis, as ENU yaw."""
+
+    stamp_ns: Stamps      # (n,)
+    received_ns: Stamps   # (n,)
+    q_ni: Floats          # (n, 4) x y z w, as sent
+    yaw_variance: Floats  # (n,) rad^2; 0 unknown, NaN no orientation
+
+    def __post_init__(self) -> None:
+        freeze(self, q_ni=(4,), yaw_variance=())
+
+
+Samples = ImuSamples | OdometerSamples | FixSamples | VelocitySamples | HeadingSamples
+
+
+def freeze(owner, **rows) -> None:
+    """Swap each field for a read-only array; rows give the shape after n, or (shape, dtype)."""
+    n = len(owner.stamp_ns)
+    wanted = {'stamp_ns': ((), np.int64), 'received_ns': ((), np.int64)} | rows
+    for name, row in wanted.items():
+        shape, dtype = row if row and isinstance(row[0], tuple) else (row, np.float64)
+        given = np.asarray(getattr(owner, name))
+        array = np.array(given, dtype=dtype, order='C')
+        if array.shape != (n, *shape):
+            raise BadData(f'{type(owner).__name__}.{name}: want shape {(n, *shape)}, '
+                          f'got {array.shape}')
+        array.setflags(write=False)
+        object.__setattr__(owner, name, array)
+
+
+def take(samples, index):
+    """Return the rows that a numpy index picks, as the same type."""
+    return of_columns(type(samples), {f.name: getattr(samples, f.name)[index]
+                                  for f in fields(samples)})
+
+
+def join(blocks):
+    """Return many blocks of one type as one block, in the order given."""
+    blocks = list(blocks)
+    if len(blocks) == 1:
+        return blocks[0]
+    names = [f.name for f in fields(blocks[0])]
+    return of_columns(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
+                                    for n in names})
+
+
+def of_columns(kind, columns):
+    """Return samples of arrays that were checked before and that nobody else holds: no copy."""
+    samples = object.__new__(kind)
+    for name, array in columns.items():
+        array.setflags(write=False)
+        object.__setattr__(samples, name, array)
+    return samples
+
+
+def let_go(*arrays) -> None:
+    """Give back the memory of arrays that are mapped from a file; they can be read as before."""
+    for array in arrays:
+        while isinstance(array, np.ndarray):
+            array = array.base
+        if isinstance(array, memoryview):
+            array = array.obj
+        if isinstance(array, mmap.mmap):
+            array.madvise(mmap.MADV_DONTNEED)
+
+
+def no_imu() -> ImuSamples:
+    """Return an empty block."""
+    return ImuSamples([], [], np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), [])
+
+
+def no_odometer() -> OdometerSamples:
+    """Return an empty block."""
+    return OdometerSamples([], [], np.empty(0))
+
+
+def no_fix() -> FixSamples:
+    """Return an empty block."""
+    return FixSamples([], [], [], [], [], np.empty((0, 3, 3)), [], [])
+
+
+def no_velocity() -> VelocitySamples:
+    """Return an empty block."""
+    return VelocitySamples([], [], np.empty((0, 3)), np.empty((0, 3)))
+
+
+def no_heading() -> HeadingSamples:
+    """Return an empty block."""
+    return HeadingSamples([], [], np.empty((0, 4)), [])

@@ -1,0 +1,151 @@
+"""
+Rows of a topic: up to MEMORY in memory, hours of them in a file without a name.
+
+Two hours of an Imu at 1 kHz are 0.8 GB. What lies in the file is mapped: whoever reads it sees
+arrays like any others, and ``samples.let_go`` gives their memory back. Where the disk takes no
+more, rows stay in memory.
+"""
+
+from collections.abc import Callable
+from dataclasses import fields
+import mmap
+import os
+import tempfile
+
+import numpy as np
+
+from odocal_ros.data.samples import join, of_columns, take
+
+MEMORY = 2**26        # bytes of a topic's rows from which they go to the file
+TAIL = 2**23          # bytes after those of the file, the same
+MERGE = 2**20         # bytes: so much of small blocks is made one
+SOME = 2**20          # bytes moved at a time
+
+
+class Rows:
+    """The rows of one topic, in order of arrival."""
+
+    def __init__(self, nothing: Callable) -> None:
+        self._nothing = nothing
+        self._blocks: list = []           # after those of the file
+        self._fresh: list = []            # small ones, after the blocks
+        self._size = self._fresh_size = 0     # bytes of both, of the small ones
+        self._file: _Columns | None = None
+        self._stop = 0                    # rows of the file that are ours
+        self._writes = True
+
+    def feed(self, block) -> None:
+        """Append a block."""
+        size = _size(block)
+        self._fresh.append(block)
+        self._fresh_size += size
+        self._size += size
+        if self._fresh_size >= MERGE:
+            self._merge()
+            if self._size > (MEMORY if self._file is None else TAIL):
+                self._to_file()
+
+    def all(self):
+        """Return all rows as one block; of a file, as a view of it."""
+        self._merge()
+        if self._file is not None:
+            self._to_file()
+        parts = [*([self._file.rows(self._stop)] if self._file else []), *self._blocks]
+        if not parts:
+            return self._nothing()
+        if len(parts) > 1:
+            self._hold([join(parts)])
+            return self._blocks[0]
+        return parts[0]
+
+    def snapshot(self) -> 'Rows':
+        """Return the rows so far; what comes later or is forgotten does not change it."""
+        if self._file is not None:
+            self._merge()
+            self._to_file()
+        copy = Rows(self._nothing)
+        copy._writes = False              # the file is still written to by this one
+        copy._hold([*self._blocks, *self._fresh])
+        copy._file, copy._stop = self._file, self._stop
+        return copy
+
+    def forget(self, before: Callable) -> None:
+        """Drop blocks of which ``before``, (n,) bool of a block, is true throughout."""
+        if self._file is not None and before(self._file.row(self._stop // 2)).all():
+            # most of it may go: what is left is the pre-roll of the next leg
+            rows = self.all()
+            late = np.flatnonzero(~before(rows))
+            kept = slice(late[0], None) if len(late) else slice(0, 0)
+            self._hold([take(rows, np.arange(len(rows.stamp_ns))[kept])])
+        if self._file is None:
+            blocks, keep = [*self._blocks, *self._fresh], 0
+            while keep < len(blocks) and before(blocks[keep]).all():
+                keep += 1
+            large = max(0, len(self._blocks) - keep)
+            dropped = blocks[:keep]
+            self._blocks = self._blocks[len(self._blocks) - large:]
+            self._fresh = blocks[keep + large:]
+            self._size -= sum(map(_size, dropped))
+            self._fresh_size = sum(map(_size, self._fresh))
+
+    def _hold(self, blocks) -> None:
+        """Hold these blocks, and no file."""
+        self._blocks, self._fresh, self._file, self._stop = blocks, [], None, 0
+        self._size, self._fresh_size = sum(map(_size, blocks)), 0
+
+    def _merge(self) -> None:
+        if self._fresh:
+            self._blocks.append(join(self._fresh))
+            self._fresh, self._fresh_size = [], 0
+
+    def _to_file(self) -> None:
+        """Move the blocks to the file, as far as the disk takes them."""
+        try:
+            while self._blocks and self._writes:
+                if self._file is None:
+                    self._file = _Columns(self._blocks[0])
+                self._stop = self._file.write(self._blocks[0], self._stop)
+                self._size -= _size(self._blocks.pop(0))
+        except OSError:
+            self._writes = False          # the disk is full
+            self._file = self._file if self._stop else None
+
+
+class _Columns:
+    """Samples of one kind in files that have no name, one for each column."""
+
+    def __init__(self, like) -> None:
+        self._kind = type(like)
+        self._files = {}
+        for field in fields(like):
+            column = getattr(like, field.name)
+            file = tempfile.TemporaryFile(prefix='odocal_')      # noqa: SIM115 while rows are
+            self._files[field.name] = file, column.dtype, column.shape[1:]
+
+    def write(self, block, at: int) -> int:
+        """Write a block's rows from row ``at`` on; return the row after the last."""
+        for name, (file, dtype, shape) in self._files.items():
+            data = memoryview(np.ascontiguousarray(getattr(block, name), dtype)).cast('B')
+            offset = at * dtype.itemsize * int(np.prod(shape))
+            while data:
+                done = os.pwrite(file.fileno(), data[:SOME], offset)
+                data, offset = data[done:], offset + done
+        return at + len(block.stamp_ns)
+
+    def rows(self, stop: int):
+        """Return the rows before one, mapped."""
+        return of_columns(self._kind, {
+            name: np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype,
+                                stop * int(np.prod(shape))).reshape(stop, *shape)
+            for name, (file, dtype, shape) in self._files.items()})
+
+    def row(self, at: int):
+        """Return one row, in memory."""
+        return of_columns(self._kind, {
+            name: np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
+            for name, (file, dtype, shape) in self._files.items()
+            for size in [dtype.itemsize * int(np.prod(shape))]})
+
+
+def _size(block) -> int:
+    return sum(getattr(block, field.name).nbytes for field in fields(block))

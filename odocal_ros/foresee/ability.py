@@ -1,0 +1,142 @@
+"""
+What a drive can tell as things are configured and heard, and what it cannot, before it is driven.
+
+Asked of the code that will judge the leg: the alignment it will have, the methods that run.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from odocal_ros.calib.choice import deciding
+from odocal_ros.pipeline.align import HEADING_LIMIT
+from odocal_ros.pipeline.leg_run import METHODS
+from odocal_ros.plan.alignment import plan_alignment
+from odocal_ros.plan.drive import from_rates
+from odocal_ros.settings.config import Config, with_settings
+
+EXACT = 1e-6          # rad, of a heading that is said to be known exactly
+ROWS = 100            # newest orientations that tell how good they claim to be
+COURSE_FIX = 1.5      # m, sigma of a fix that a course is taken to come from
+SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
+           'imu_orientation': "the Imu's orientation", 'gyrocompass': 'the gyrocompass'}
+ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside
+
+
+@dataclass(frozen=True)
+class Heard:
+    """
+    What came before the start mark.
+
+    variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
+    none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
+    latitude : rad.   height : the fixes carry one.   felt : the Imu sends its acceleration.
+    """
+
+    variances: dict[str, float]
+    rested_s: float = 0.0
+    latitude: float = 0.7
+    height: bool = True
+    two_wheels: bool = False
+    felt: bool = True
+
+
+@dataclass(frozen=True)
+class Ability:
+    """Quantities that the drive can tell, those that it cannot and why, what weakens all."""
+
+    can: tuple[str, ...]
+    cannot: tuple[str, ...]
+    weak: str = ''
+
+    def words(self) -> str:
+        """Return it as a sentence."""
+        *first, last = self.can
+        told = f'{", ".join(first)} and {last}' if first else last
+        text = f'this drive can tell {told}'
+        if self.cannot:
+            text += f'; it cannot tell {"; nor ".join(self.cannot)}'
+        return text + (f'; {self.weak}' if self.weak else '')
+
+
+def ability(config: Config, heard: Heard) -> Ability:
+    """Return what a leg that starts here can tell and what not."""
+    methods = [name for name in METHODS if name in deciding(config.method)
+               and (heard.felt or name != ALL_SAMPLES)]
+    told = [(True, 'the scale'), _yaw(config, heard, methods),
+            (True, 'the pitch') if heard.height else
+            (False, 'the pitch, since the fixes carry no height')]
+    if not heard.felt:
+        told[-1] = False, 'the pitch, since the Imu sends no acceleration'
+    if heard.two_wheels:
+        told += _of_two_wheels(config, methods)
+    weak = '' if heard.rested_s >= config.leg.standstill else (
+        'level and gyro bias come from the drive itself, since it starts without a standstill')
+    return Ability(tuple(text for can, text in told if can),
+                   tuple(text for can, text in told if not can), weak)
+
+
+def _yaw(config, heard, methods):
+    if ALL_SAMPLES in methods:
+        return True, 'the yaw (by stops, starts and turns)'
+    alignment = _alignment(config, heard)
+    if not alignment.heading_separable:
+        return False, ('the yaw, since the course over ground, which holds it, is the only '
+                       'heading: give another (alignment.heading_source)')
+    source, sigma = SOURCES[alignment.heading_source], math.degrees(alignment.heading_sigma)
+    asked = math.degrees(config.verdict.max_yaw_sigma)
+    if sigma >= asked:
+        return False, f'the yaw to {asked:.2g} deg, since {source} is good to {sigma:.2g} deg'
+    return True, f'the yaw (by {source}, {sigma:.2g} deg)'
+
+
+def _of_two_wheels(config, methods):
+    if 'wheels' not in methods:
+        return [(False, f'left from right wheel, since method {config.method} takes their mean')]
+    width = config.odometer.track_width
+    return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
+
+
+def _alignment(config, heard):
+    """Return the alignment that a drive straight on from here will have."""
+    rest = heard.rested_s if heard.rested_s >= config.leg.standstill else 0.0
+    t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
+    drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
+                       latitude=heard.latitude)
+    return plan_alignment(drive, with_heading(config, heard.variances), COURSE_FIX,
+                          drive.standstills(config.leg.standstill))[0]
+
+
+def stated_variance(q_ni, yaw_variance) -> float:
+    """
+    Return the variance of the yaw that orientations state, rad^2; inf: none is sent.
+
+    q_ni, yaw_variance : (n, 4), (n,) as in ``ImuSamples``.
+    """
+    sent = ~np.isnan(yaw_variance) & (np.linalg.norm(q_ni, axis=1) > 0.5)
+    return float(np.median(yaw_variance[sent][-ROWS:])) if sent.any() else math.inf
+
+
+def with_heading(config: Config, variances: dict[str, float]) -> Config:
+    """
+    Return config with the heading source, and its sigma, that the alignment will find.
+
+    variances : as in ``Heard``. What is left ``auto`` is a gyrocompass or the course, as the
+    alignment itself decides.
+    """
+    asked = config.alignment
+    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT)
+    if source == 'auto' and not math.isnan(asked.heading):
+        source = 'fixed'
+    if source == 'fixed' and math.isnan(asked.heading):
+        source = 'course'
+    for name, stated in variances.items():
+        if source not in ('auto', name):
+            continue
+        if stated <= HEADING_LIMIT**2:
+            source, sigma = name, math.sqrt(stated) if stated > 0 else sigma
+        elif source == name:
+            source = 'course'
+    return with_settings(config, {'alignment.heading_source': source,
+                                  'alignment.heading_sigma': sigma})

@@ -1,0 +1,156 @@
+"""What is foreseen of a leg while it is recorded, and how it is said."""
+
+from dataclasses import dataclass, field
+import math
+
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.reasons import Reason
+
+COARSE = 0.01        # relative sigma from which it is said in per cent
+FARTHEST = 2e4       # m: who must drive on for more needs something else
+# estimate: unit at the end of its key
+RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
+
+
+class Abandoned(Exception):
+    """The leg is over: what it might have become is of no more interest."""
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """
+    What is foreseen of one parameter.
+
+    sigma, asked : relative or rad; sigma None: not determined by the way so far.
+    metres : m more for what is asked, 0: enough, None: no way makes it.
+    sources : (name, sigma) of the errors that matter, the largest first.
+    why : what keeps it from what is asked where no way helps.
+    now : the value so far, for people, where the drive tells it before its end.
+    lack : what to drive for it, besides metres.
+    """
+
+    sigma: float | None
+    asked: float
+    metres: float | None
+    sources: tuple[tuple[str, float], ...] = ()
+    why: str = ''
+    now: str = ''
+    lack: str = ''
+
+    def words(self, name: str, unit: str, factor: float) -> str:
+        """Return it for people, sigmas times ``factor`` in ``unit``."""
+        if unit == 'ppm' and self.sigma is not None and self.sigma >= COARSE:
+            unit, factor = '%', 100.0
+        asked = _three_digits(self.asked * factor)
+        sigma = None if self.sigma is None else _three_digits(self.sigma * factor)
+        known = name if sigma is None else f'{name} {sigma} {unit}'
+        if self.now and sigma is not None:
+            known = f'{name} {self.now} +- {sigma} {unit}'
+        if self.lack:
+            return f'{known} so far (asked {asked})' if self.now else (
+                f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
+        if self.metres is None:
+            return f'{known}: {self.why}'
+        if self.metres == 0.0:
+            return f'enough: {known} (asked {asked})'
+        more = f'{_rounded_up(self.metres)} m more bring it to the asked {asked} {unit}'
+        if sigma is None:
+            return f'{name} is not determined yet; {more}'
+        return f'{known} so far; {more}' if self.now else (
+            f'{name} would be good to {sigma} {unit} now; {more}')
+
+
+@dataclass(frozen=True)
+class WheelsForecast:
+    """
+    What the way so far tells of two wheels by themselves; None: it does not tell them.
+
+    left_right, track_width : relative sigmas, of the worse wheel and of the width.
+    """
+
+    left_right: float | None
+    track_width: float | None
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """
+    What is foreseen of a leg that ends where the vehicle is.
+
+    pitch : rad, sigma.   wheels : None with one counter, and where nothing could be said yet.
+    methods : what those say that need no end of the drive.   estimates : the running estimate,
+    each value by the method that will give it.   until_ns : stamp up to which it was looked at.
+    faults : what a method would reject the leg for however far it goes.
+    """
+
+    scale: Prospect
+    yaw: Prospect
+    pitch: float | None = None
+    wheels: WheelsForecast | None = None
+    methods: dict[str, MethodResult] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    until_ns: int = 0
+    faults: tuple[Reason, ...] = ()
+
+    def sigma(self, quantity: str) -> float | None:
+        """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
+        if quantity in ('scale', 'yaw'):
+            return getattr(self, quantity).sigma
+        return self.pitch if quantity == 'pitch' else getattr(self.wheels, quantity, None)
+
+    def words(self) -> str:
+        """Return it as a sentence: what is enough, what more makes it so, what never will be."""
+        return '; '.join([self.scale.words('scale', 'ppm', 1e6),
+                          self.yaw.words('yaw', 'deg', math.degrees(1))])
+
+    @property
+    def complete(self) -> bool:
+        """Return whether driving on would bring nothing that was asked for."""
+        return not (self.scale.metres or self.yaw.metres or self.lacks)
+
+    @property
+    def lacks(self) -> list[str]:
+        """Return what to drive besides metres."""
+        return [prospect.lack for prospect in (self.scale, self.yaw) if prospect.lack]
+
+
+def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict:
+    """
+    Return the keys of ``~/status``; what is not foreseen is empty.
+
+    age_s : how long ago the way ended that the forecast is of.
+    """
+    keys = _running(forecast, age_s)
+    for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
+        of = Prospect(None, 0.0, None) if forecast is None else getattr(forecast, name)
+        keys |= {
+            f'predicted_{name}_sigma_{unit}': '' if of.sigma is None else of.sigma * factor,
+            f'metres_to_go_{name}': '' if of.metres is None else of.metres,
+            f'largest_error_source_{name}': of.sources[0][0] if of.sources else '',
+            f'predicted_{name}_sources_{unit}': ', '.join(
+                f'{source} {_three_digits(sigma * factor)}' for source, sigma in of.sources)}
+    return keys
+
+
+def _running(forecast, age_s) -> dict:
+    """Return the keys of the running estimate, NaN where it tells nothing."""
+    found = {} if forecast is None else forecast.estimates
+    told = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
+    keys: dict = {}
+    for (name, unit), e in zip(RUNNING.items(), told.values(), strict=True):
+        for end, value in (('', e.value), ('_sigma', e.sigma if e.value is not None else None)):
+            keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
+    giving = dict.fromkeys(e.method for e in told.values() if e.value is not None)
+    return keys | {'estimate_method': ', '.join(giving),
+                   'estimate_age_s': math.nan if forecast is None else age_s}
+
+
+def _rounded_up(metres: float) -> int:
+    """Return metres in two digits, not fewer than they are."""
+    step = 10 ** max(0, math.floor(math.log10(max(metres, 1.0))) - 1)
+    return math.ceil(metres / step) * step
+
+
+def _three_digits(value: float) -> str:
+    """Return a number in three digits, never as a power of ten where it is large."""
+    return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'

@@ -1,0 +1,179 @@
+"""
+Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
+
+Foreseen for a vehicle that comes to rest where it is and stands for REST seconds in all, with the
+start mark and the way as recorded. Shown to the operator, never part of a result.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+
+from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.calib.judge import nominal_scale
+from odocal_ros.data.leg import Leg
+from odocal_ros.errors import BadData
+from odocal_ros.foresee.ability import stated_variance, with_heading
+from odocal_ros.foresee.forecast import Abandoned, FARTHEST, Forecast, Prospect
+from odocal_ros.foresee.smoother_forecast import (
+    gives_all,
+    look,
+    nothing_foreseen,
+    ONLY,
+    with_running,
+)
+from odocal_ros.foresee.smoother_so_far import SmootherSoFar
+from odocal_ros.foresee.wheels_so_far import sources_of, with_wheels
+from odocal_ros.nav.dead_reckoning import Origin, rough_scale
+from odocal_ros.plan.drive import AT_REST, PlannedDrive
+from odocal_ros.plan.leg_profile import fix_figures, profile_of
+from odocal_ros.plan.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config
+
+SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
+REST = 10.0          # s of standstill at the end that is foreseen
+MOST_ROWS = 1000     # of the drive that a prediction is made from
+NEAR_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class DriveSoFar(PlannedDrive):
+    """A drive up to here and the rest foreseen; what is added to it goes on from here."""
+
+    wanted: Callable[[], bool] = field(default=lambda: True)
+
+    def lengthened(self, metres: float) -> 'DriveSoFar':
+        """Return the drive with so many metres more straight on from here, at its own speed."""
+        if not self.wanted():
+            raise Abandoned
+        moving = np.flatnonzero(np.abs(self.speed) > AT_REST)
+        here = int(moving[-1])
+        usual = float(np.median(np.abs(self.speed[moving])))
+        on = np.linspace(0.0, metres / usual, 50)[1:]
+        speed, yaw, slope = (
+            np.insert(row, here + 1, np.full(len(on), value)) for row, value in (
+                (self.speed, usual), (self.yaw, self.yaw[here]), (self.slope, self.slope[here])))
+        t = np.concatenate([self.t[:here + 1], self.t[here] + on, self.t[here + 1:] + on[-1]])
+        return replace(self, t=t, speed=speed, yaw=yaw, slope=slope)
+
+
+def forecast_of(leg: Leg, fix_rate: float, config: Config,
+               wanted: Callable[[], bool] = lambda: True,
+               smoother: SmootherSoFar | None = None) -> Forecast:
+    """
+    Return what is foreseen of a leg that would end here, and what its methods say so far.
+
+    Parameters
+    ----------
+    leg : Leg
+        The way so far; its last row is here.
+    fix_rate : float
+        Hz.
+    config : Config
+        As frozen into the leg.
+    wanted : callable
+        Asked now and then; Abandoned is raised when it says no.
+    smoother : SmootherSoFar, optional
+        That of this leg; looks go from the one before to the next.
+
+    Raises
+    ------
+    OdocalError
+        Nothing can be foreseen yet: no motion, no fixes, scale unknown.
+
+    """
+    running = look(leg, config, smoother, wanted)
+    if deciding(config.method) == ONLY or gives_all(running):     # the ends add nothing to it
+        forecast = nothing_foreseen(config)
+    else:
+        forecast = _by_ends(leg, fix_rate, config, wanted)
+    if not wanted():
+        raise Abandoned
+    forecast = with_wheels(forecast, leg, config)
+    if running is not None:
+        forecast = with_running(forecast, running, config)
+    estimates, _ = choose(forecast.methods, config.method)
+    return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
+
+
+def _by_ends(leg, fix_rate, config, wanted) -> Forecast:
+    """Return what two_point would make of the leg, its end points being what they are."""
+    driven = profile_of(leg, config)
+    sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(leg, config),
+                    **fix_figures(leg, config) | {'fix_rate': fix_rate})
+    drive = _at_rest(_thinned(driven), wanted)
+    now = predict(drive, sigmas)
+
+    def prospect(parameter, asked, why=''):
+        sigma = now.sigma(parameter)
+        metres = 0.0 if sigma is not None and sigma <= asked else None
+        if metres is None and not why:
+            metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST)
+            why = f'no {FARTHEST / 1000:.0f} km more bring it to what is asked'
+        return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
+
+    limits = config.verdict
+    return Forecast(
+        prospect(SCALE, limits.max_scale_sigma),
+        prospect(YAW, limits.max_yaw_sigma, _yaw_limit(now, limits.max_yaw_sigma)),
+        now.method.estimates[PITCH].sigma)
+
+
+def _yaw_limit(now: Prediction, asked: float) -> str:
+    """Return why no drive brings the yaw to what is asked, empty where one may."""
+    alignment = now.alignment
+    if not alignment.heading_separable:
+        return ('not told from the course over ground, the only heading; give another '
+                '(alignment.heading_source)')
+    if alignment.heading_sigma >= asked:
+        return ('no drive brings it below its heading '
+                f'({math.degrees(alignment.heading_sigma):.2g} deg)')
+    return ''
+
+
+def _heading_found(leg: Leg, config: Config) -> Config:
+    """Return config with the heading source, and its sigma, that the alignment will find."""
+    variances = {}
+    for slot, name in ((leg.heading, 'heading_topic'), (leg.imu, 'imu_orientation')):
+        before = slot.stamp_ns <= leg.start_ns + NEAR_NS
+        variances[name] = stated_variance(slot.q_ni[before], slot.yaw_variance[before])
+    return with_heading(config, variances)
+
+
+def _quantum(leg: Leg, config: Config) -> float:
+    """Return the size of a count, m; raise BadData while metres are not known at all."""
+    inputs, _ = screen(leg, config)
+    geodetic = np.nan_to_num(inputs.geodetic)
+    fixes_n = Origin(*geodetic[0].tolist()).to_n(geodetic)
+    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
+    scale = (rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma)
+             or nominal_scale(config, inputs.scale_unit))
+    if not scale:   # what the profile takes instead, 1, would promise far too much
+        raise BadData('how far a count reaches is not known yet: drive on, or set '
+                      'odometer.nominal_scale')
+    return inputs.travel.quantum * scale
+
+
+def _thinned(drive: PlannedDrive) -> PlannedDrive:
+    """Return a drive of not many rows; where it stops and starts it stays as it is."""
+    rest = np.abs(drive.speed) <= AT_REST
+    change = np.flatnonzero(np.diff(rest))
+    if len(change) > MOST_ROWS // 4:
+        change = change[:0]
+    every = np.linspace(0, len(rest) - 1, min(len(rest), MOST_ROWS - 2 * len(change))).astype(int)
+    keep = np.unique(np.concatenate([every, change, change + 1]))
+    return replace(drive, **{name: getattr(drive, name)[keep]
+                             for name in ('t', 'speed', 'yaw', 'slope')})
+
+
+def _at_rest(drive: PlannedDrive, wanted) -> DriveSoFar:
+    """Return the drive with as much rest at its end as makes REST seconds."""
+    moving = np.flatnonzero(np.abs(drive.speed) > AT_REST)
+    rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
+    if rested < REST:
+        drive = drive.until(drive.duration, REST - rested)
+    return DriveSoFar(drive.t, drive.speed, drive.yaw, drive.slope, drive.latitude,
+                      drive.longitude, drive.height, wanted)

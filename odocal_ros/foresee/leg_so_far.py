@@ -1,0 +1,56 @@
+"""
+What is wrong with the leg that is recorded, by the functions that will judge it when it is over.
+
+Its rows in cells tell most of it, every few seconds in the worker (``pipeline.faults``). A gap of
+the Imu is seen in the stamps themselves, at once, and is never forgotten.
+"""
+
+import numpy as np
+
+from odocal_ros.data.leg import Leg
+from odocal_ros.pipeline.calibrate import faults
+from odocal_ros.reasons import Reason
+from odocal_ros.screening.screen import imu_gap
+from odocal_ros.settings.config import Config, with_settings
+
+MOST_GAP = 10.0      # s, of the setting leg.max_gap
+SILENT_S = 1.0       # what comes in no order may be as late on a busy machine
+
+
+class ImuGaps:
+    """The Imu stamps of a leg, as few as tell its gaps."""
+
+    def __init__(self, start_ns: int, limit_s: float) -> None:
+        self._start_ns, self._limit_s = start_ns, limit_s
+        self._newest_ns = start_ns
+        self._edges_ns: list[int] = []      # on both sides of a gap
+
+    def feed(self, block) -> int:
+        """Take Imu rows; return where they go on after a gap, 0 without one."""
+        stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
+        if not len(stamps):
+            return 0
+        known = np.append(self._newest_ns, np.sort(stamps))
+        gaps = np.flatnonzero(np.diff(known) > self._limit_s * 1e9)
+        for k in gaps:
+            self._edges_ns += known[k:k + 2].tolist()
+        self._newest_ns = int(known[-1])
+        return self._edges_ns[-1] if len(gaps) else 0
+
+    def reasons(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
+        """Return IMU_GAP if there was one; ``silent_s``: since when only the others speak."""
+        # between two gaps there is none: rows that close fill it
+        t = (np.array([*self._edges_ns, self._newest_ns]) - self._start_ns) * 1e-9
+        t = np.concatenate([[0.0], t])
+        sound = np.concatenate([np.arange(a, b, self._limit_s / 2)
+                                for a, b in t.reshape(-1, 2)] or [t])
+        end = t[-1] + (silent_s if silent_s > SILENT_S else 0.0)
+        return imu_gap(np.union1d(sound, t), 0.0, float(end), self._limit_s)
+
+
+def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
+    """Return the faults of a leg whose Imu rows are means over cells of time."""
+    cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
+        else 0.0
+    limit_s = min(config.leg.max_gap + 2 * cell_s, MOST_GAP)
+    return faults(leg, with_settings(config, {'leg.max_gap': limit_s}))

@@ -1,0 +1,235 @@
+"""
+What the operator wants to know while driving: distance, speed, standing or not, clocks.
+
+Light estimates from the blocks as they come; nothing here enters a result.
+"""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.samples import OdometerForm
+from odocal_ros.foresee.ability import Heard, stated_variance
+from odocal_ros.nav.earth import radii
+from odocal_ros.screening.force import felt
+from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.settings.config import Config
+
+FASTEST = 100.0        # m/s: what goes faster is a counter reset
+SPEED_NS = 1_000_000_000   # speeds are taken over that long, or longer
+STANDS_S = 0.5         # without a count: the vehicle stands
+REST_NS = 1_000_000_000   # a shorter pause is no standstill
+CLOCK_LIMIT = 0.5      # s
+CLOCK_ROWS = 10
+
+
+def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+    """Return m per unit of the odometer as well as it is known, 0 where it is not."""
+    if np.isfinite(found) and found > 0:
+        return float(found)
+    if config.odometer.nominal_scale > 0:
+        return config.odometer.nominal_scale
+    if form is None or form.scale_unit == '1':
+        return 1.0 if form else 0.0
+    turn = config.wheels.radius
+    if form.scale_unit == 'm/rad':
+        return turn
+    pulses = config.wheels.pulses_per_revolution
+    return 2 * np.pi * turn / pulses if pulses else 0.0
+
+
+class Travel:
+    """Distance, speed and standstill from odometer blocks, in odometer units."""
+
+    def __init__(self, form: OdometerForm) -> None:
+        self.form = form
+        self.total = 0.0
+        self.moved_ns = 0        # stamp of the last motion
+        self.newest_ns = 0
+        self._rows = Steps(form)
+        self._anchor = 0.0
+        self._rest = 0.0, 0      # length, s, and end of the last standstill
+        self.top = 0.0           # highest speed, units/s
+        self._since = 0.0, 0     # total and stamp that the speed is taken from
+
+    def feed(self, block, scale: float) -> None:
+        """Take a block; scale: m per unit, 0 unknown."""
+        steps, stamps, seconds = self._rows.of(block)
+        if not len(steps):
+            return
+        if scale > 0:
+            steps = np.where(np.abs(steps) * scale > FASTEST * np.maximum(seconds, 0.01), 0, steps)
+        path = self.total + np.cumsum(np.abs(steps))
+        for total, stamp in zip(path, stamps, strict=True):
+            if total - self._anchor > self._rows.still:
+                rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
+                if rest_ns > REST_NS:
+                    self._rest = rest_ns * 1e-9, int(stamp)
+                self._anchor, self.moved_ns = total, int(stamp)
+        self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
+        self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
+        before, since_ns = self._since
+        if abs(self.newest_ns - since_ns) >= SPEED_NS:    # rows of a burst tell no speed
+            if since_ns:
+                self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
+            self._since = self.total, self.newest_ns
+
+    def still_s(self) -> float:
+        """Return how long the vehicle has stood."""
+        return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
+
+    def rested_s(self, since_s: float) -> float:
+        """Return how long it stands, or stood at its last standstill if that is not longer ago."""
+        length, end_ns = self._rest
+        recent = self.newest_ns - end_ns < since_s * 1e9
+        return max(self.still_s(), length if recent else 0.0)
+
+
+class FixPath:
+    """Distance along the fixes while the counter moves; steps below the noise do not count."""
+
+    def __init__(self) -> None:
+        self.total = self.top = 0.0      # m, m/s
+        self._anchor: tuple | None = None
+
+    def feed(self, block, min_status: int, moving: bool) -> None:
+        """Take a block of fixes; moving: as the counter has it."""
+        for lat, lon, stamp, variance, status in zip(
+                block.latitude, block.longitude, block.stamp_ns,
+                block.covariance_n[:, 0, 0], block.status, strict=True):
+            if status < min_status or not (abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi):
+                continue        # NaN among them
+            if self._anchor is None or not moving:
+                self._anchor = (lat, lon, stamp)
+                continue
+            meridian, normal = radii(lat)
+            step = np.hypot((lat - self._anchor[0]) * meridian,
+                            (lon - self._anchor[1]) * normal * np.cos(lat))
+            apart_ns = stamp - self._anchor[2]
+            noise = 3 * np.sqrt(variance) if variance > 0 else 0.0
+            if step > max(3.0, noise) and apart_ns >= SPEED_NS:
+                self.total += float(step)
+                self.top = max(self.top, float(step) * 1e9 / apart_ns)
+                self._anchor = (lat, lon, stamp)
+
+
+class Clocks:
+    """
+    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
+
+    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
+    """
+
+    def __init__(self, simulated: bool = False) -> None:
+        self._simulated = simulated
+        self._imu: deque = deque(maxlen=40)
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
+        self._ahead_s: dict[str, deque] = {}
+
+    def feed(self, slot: str, block) -> None:
+        """Take a block."""
+        if slot != 'imu':
+            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
+            return
+        self._imu.append((block.received_ns, block.stamp_ns))
+        if not self._waiting:
+            return
+        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        first_received, first_stamp = int(received[0]), int(stamps[0])
+        received, stamps = received - first_received, stamps - first_stamp
+        # messages that queued for a node in simulated time arrive late, the Imu's more so than
+        # others': which of them belong together is not known then
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_LIMIT * 1e9
+        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
+            row = row_ns - first_received
+            if row > received.max():
+                continue
+            del self._waiting[name]
+            if row >= received.min() and not queued:
+                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
+                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
+
+    def differing(self, config: Config) -> list[tuple[str, float]]:
+        """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
+        offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
+                   'odometer_right': config.odometer.time_offset,
+                   'fix_velocity': config.gnss.time_offset}
+        result = []
+        for slot, ahead in self._ahead_s.items():
+            offset = offsets.get(slot, 0.0) - config.imu.time_offset
+            # latency on the way makes a row look older: behind are those of whom the freshest is;
+            # that of an Imu's row makes others look newer: ahead are those of whom most are
+            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
+            if abs(value) > CLOCK_LIMIT:
+                result.append((slot, value))
+        return result
+
+
+class Progress:
+    """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
+
+    def __init__(self, simulated: bool = False) -> None:
+        self.clocks = Clocks(simulated)
+        self._travel: dict[str, Travel] = {}
+        self._path = FixPath()
+        self._zero = 0.0
+        self._scale = 0.0
+        self._last: dict = {}        # slot -> newest block
+
+    def feed(self, slot: str, block, config: Config, form, found_scale: float) -> None:
+        """Take a block as it went into the recorder."""
+        if not len(block.stamp_ns):
+            return
+        self.clocks.feed(slot, block)
+        self._last[slot] = block
+        if slot == 'odometer' and form is not None:
+            self._scale = nominal_scale(config, form, found_scale)
+            self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
+        elif slot == 'fix':
+            travel = self._travel.get('odometer')
+            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDS_S
+            self._path.feed(block, config.gnss.min_status, moving)
+
+    def heard_before(self, preroll_s: float) -> Heard:
+        """Return what came so far that says what a leg can tell."""
+        travel = self._travel.get('odometer')
+        fix = self._last.get('fix')
+        place = Heard({})
+        if fix is not None and np.isfinite(fix.latitude[-1]):
+            place = Heard({}, latitude=float(fix.latitude[-1]),
+                          height=bool(np.isfinite(fix.height[-1])))
+        sent = {name: self._last.get(slot) for slot, name in (
+            ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
+        variances = {name: np.inf if block is None else stated_variance(
+            block.q_ni, block.yaw_variance) for name, block in sent.items()}
+        imu = self._last.get('imu')
+        return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
+                       rested_s=travel.rested_s(preroll_s) if travel else 0.0)
+
+    def begin_leg(self) -> None:
+        """Count distance and speed from here."""
+        self._path = FixPath()
+        travel = self._travel.get('odometer')
+        if travel is not None:
+            self._zero, travel.top = travel.total, 0.0
+
+    def distance_m(self) -> float:
+        """Return the distance of the leg so far: odometer where its scale is known, else fixes."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return (travel.total - self._zero) * self._scale
+        return self._path.total
+
+    def max_speed(self) -> float:
+        """Return the highest speed of the leg so far, m/s, over a second or more."""
+        travel = self._travel.get('odometer')
+        if travel is not None and self._scale > 0:
+            return travel.top * self._scale
+        return self._path.top
+
+    def still_s(self) -> float:
+        """Return how long the vehicle has stood by the odometer."""
+        travel = self._travel.get('odometer')
+        return travel.still_s() if travel else 0.0

@@ -1,0 +1,118 @@
+"""What the running estimate makes foreseen: which sigma counts, how far to drive, and what."""
+
+from dataclasses import replace
+import math
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.choice import ABOUT, choose, deciding
+from odocal_ros.data.leg import Leg
+from odocal_ros.errors import OdocalError
+from odocal_ros.foresee.forecast import FARTHEST, Forecast, Prospect
+from odocal_ros.foresee.smoother_so_far import Running, SmootherSoFar
+from odocal_ros.foresee.wheels_so_far import sources_of
+from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config
+
+ONLY = ('smoother',)
+SCALE, YAW, PITCH = PARAMETERS
+BRISK = 1.5            # m/s^2, of an ordinary stop and start
+SLOWEST = 5.0          # m/s that one would do them from
+# the way goes with the sigma to the power of minus this: with white errors of the fixes, with slow
+BY_WAY, BY_WAY_SLOW = 1.0, 2.0
+FAR_TOO_FEW = 50       # stops and starts: nobody does so many
+
+
+def look(leg: Leg, config: Config, smoother: SmootherSoFar | None, wanted) -> Running | None:
+    """
+    Return the smoother's running estimate, None where it says nothing yet or is not asked.
+
+    leg : the way so far.   wanted : asked between passes, Abandoned is raised when it says no.
+
+    Raises
+    ------
+    OdocalError
+        Nothing can be told yet, and the smoother is the only method.
+
+    """
+    if smoother is None or 'smoother' not in deciding(config.method):
+        return None
+    try:
+        return smoother.look(leg, config, wanted)
+    except OdocalError:
+        if deciding(config.method) == ONLY:
+            raise
+        return None
+
+
+def gives_all(running: Running | None) -> bool:
+    """Return whether scale, yaw and pitch of the result will be the smoother's."""
+    return running is not None and running.method.verdict is not Verdict.REJECTED and all(
+        running.method.estimates[name].value is not None for name in PARAMETERS)
+
+
+def nothing_foreseen(config: Config) -> Forecast:
+    """Return an forecast that only tells what is asked."""
+    return Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
+                   Prospect(None, config.verdict.max_yaw_sigma, None))
+
+
+def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
+    """Return an forecast with a running estimate, where the result will be by it."""
+    method = running.method
+    faults = [r for r in method.reasons
+              if r.code.gravity is Verdict.REJECTED and r.code not in ABOUT]
+    if faults:      # its values are of no use then
+        return replace(forecast, faults=tuple(faults))
+    if method.verdict is not Verdict.REJECTED:
+        forecast = replace(forecast, methods=forecast.methods | {'smoother': method})
+    given, _ = choose(forecast.methods, config.method)
+    by = {name: e.method for name, e in given.items() if e.value is not None}
+    scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
+    if by.get(SCALE) == 'smoother' or scale.sigma is None:
+        scale = _scale(running, scale.asked)
+    if by.get(YAW) == 'smoother' or yaw.sigma is None:
+        yaw = _yaw(running, yaw.asked)
+    if by.get(PITCH) == 'smoother' or pitch is None:
+        pitch = float(running.sigmas[2])
+    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch)
+
+
+def _scale(running: Running, asked: float) -> Prospect:
+    e = running.method.estimates[SCALE]
+    slow = running.method.details['noise']['correlation_time'] > 0
+    sigma = float(running.sigmas[0])
+    metres = _metres(running, sigma / asked, BY_WAY_SLOW if slow else BY_WAY)
+    now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
+    if now and e.unit != '1':
+        now += f' {e.unit}'
+    return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
+                    f'no {FARTHEST / 1000:.0f} km more bring it to what is asked', now)
+
+
+def _yaw(running: Running, asked: float) -> Prospect:
+    """Return the prospect of the yaw, of which acceleration, along or across, is what tells."""
+    e = running.method.estimates[YAW]
+    sigma = float(running.sigmas[1])
+    ratio, lack = sigma / asked, ''
+    if ratio > 1:
+        one = 2 * BRISK * max(running.speed, SLOWEST)
+        stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
+        often = 'often' if stops > FAR_TOO_FEW else f'{stops} time{"s" * (stops > 1)}'
+        lack = f'stop and start {often}, or turn as often, for the yaw'
+    now = '' if e.value is None or e.sigma is None else _digits(
+        math.degrees(e.value), math.degrees(e.sigma))
+    return Prospect(sigma, asked, _metres(running, ratio, 2.0),
+                    sources_of(running.method, YAW), '', now, lack)
+
+
+def _metres(running, ratio, power) -> float | None:
+    """Return the metres more that make a sigma so many times better, driven as so far."""
+    metres = running.distance * (max(ratio, 1.0)**power - 1)
+    return metres if metres <= FARTHEST else None
+
+
+def _digits(value: float, sigma: float) -> str:
+    """Return a value to a tenth of its sigma, no more than eight digits of it."""
+    size = max(abs(value), sigma)
+    places = math.floor(math.log10(size)) - math.floor(math.log10(sigma)) + 2
+    return f'{value:.{min(max(places, 1), 8)}g}'

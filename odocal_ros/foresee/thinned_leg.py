@@ -1,0 +1,117 @@
+"""
+A leg in few rows, kept while it is recorded: enough to foresee its sigmas, never for a result.
+
+Rows are gathered into cells of time. Turn rates are averaged, since picking every tenth row would
+take vibration for turns; counts are kept as they stand at the end of a cell. When the cells
+become too many they are made twice as wide, so that neither memory nor work grows with the leg.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.leg import COUNTER, Leg
+from odocal_ros.data.samples import ImuSamples, join, OdometerForm, OdometerSamples, take
+
+CELL_NS = 100_000_000
+MOST = 16_000           # cells of a topic: 26 minutes of 0.1 s, pre-roll and all
+FLOATS = OdometerForm('cumulative', 0, '')
+
+
+class ThinnedLeg:
+    """Cells of each topic; ``feed`` takes blocks in order of arrival."""
+
+    def __init__(self, form: OdometerForm | None = None) -> None:
+        self.form = form or COUNTER
+        self._cells: dict = {}       # slot -> rows, one a cell
+        self._open: dict = {}        # slot -> rows of the cell that is not over
+        self._width_ns: dict = {}
+        self._last: dict = {}        # slot -> last count as sent, and as unrolled
+        self._fix_steps: list = []
+
+    def feed(self, slot: str, samples) -> None:
+        """Take rows as they were recorded."""
+        samples = _usable(samples)
+        if not len(samples.stamp_ns):
+            return
+        if slot == 'fix':
+            before = self._open.get('fix', take(samples, slice(0, 0))).stamp_ns[-1:]
+            self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
+        if slot.startswith('odometer') and self.form.quantity != 'rate':
+            samples = self._unrolled(slot, samples)
+        rows = join([self._open[slot], samples]) if slot in self._open else samples
+        width_ns = self._width_ns.setdefault(slot, CELL_NS)
+        cell = rows.stamp_ns // width_ns
+        over = int(np.flatnonzero(np.diff(cell))[-1]) + 1 if (np.diff(cell) != 0).any() else 0
+        self._open[slot] = take(rows, slice(over, None))
+        if not over:
+            return
+        done = _gathered(take(rows, slice(None, over)), cell[:over], self._averaged(slot))
+        cells = join([self._cells[slot], done]) if slot in self._cells else done
+        while len(cells.stamp_ns) > MOST:
+            width_ns *= 2
+            cells = _gathered(cells, cells.stamp_ns // width_ns, self._averaged(slot))
+        self._cells[slot], self._width_ns[slot] = cells, width_ns
+
+    def leg(self, start_ns: int) -> Leg:
+        """Return what there is as a leg that ends with the last cell of the Imu."""
+        form = self.form
+        if form.quantity != 'rate':
+            whole = np.issubdtype(self._cells['odometer'].value.dtype, np.integer) \
+                if 'odometer' in self._cells else True
+            form = replace(COUNTER if whole else FLOATS, scale_unit=form.scale_unit,
+                           sides=form.sides)
+        stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **self._cells)
+
+    def fix_rate(self) -> float:
+        """Return fixes a second by the median of their intervals, NaN where there are too few."""
+        steps = np.concatenate([np.empty(0, np.int64), *self._fix_steps])
+        self._fix_steps = [steps[-MOST:]]
+        rising = steps[steps > 0]
+        return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
+
+    def _averaged(self, slot) -> tuple[str, ...]:
+        rates = ('value',) if self.form.quantity == 'rate' else ()
+        return {'imu': ('w_i', 'f_i'), 'odometer': rates, 'odometer_right': rates}.get(slot, ())
+
+    def _unrolled(self, slot, samples) -> OdometerSamples:
+        """Return counts or increments as a running count that never rolls over."""
+        sent, count = self._last.get(slot, (None, 0))
+        value = samples.value
+        if self.form.quantity == 'increment':
+            step = value.copy()
+        else:
+            step = np.diff(value, prepend=value[:1] if sent is None else sent)
+            if 0 < self.form.modulus < 2**63:
+                half = self.form.modulus // 2
+                step = (step + half) % self.form.modulus - half
+        total = count + np.cumsum(step)
+        self._last[slot] = value[-1:], total[-1]
+        return replace(samples, value=total)
+
+
+def _usable(samples):
+    """Return the rows that have a stamp and finite figures where a mean is taken."""
+    keep = samples.stamp_ns > 0
+    if isinstance(samples, ImuSamples):
+        keep &= np.isfinite(samples.w_i).all(axis=1) & np.isfinite(samples.f_i).all(axis=1)
+    elif isinstance(samples, OdometerSamples):
+        keep &= np.isfinite(samples.value)
+    return samples if keep.all() else take(samples, keep)
+
+
+def _gathered(rows, cell, averaged):
+    """Return one row for each run of equal ``cell``: its last, but the mean of ``averaged``."""
+    first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+    count = np.diff(np.append(first, len(cell)))
+    last = take(rows, first + count - 1)
+    if not averaged:
+        return last
+
+    def mean(values):
+        return (np.add.reduceat(values, first).T / count).T
+
+    since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)
+    return replace(last, stamp_ns=rows.stamp_ns[first] + mean(since_ns).astype(np.int64),
+                   **{name: mean(getattr(rows, name)) for name in averaged})

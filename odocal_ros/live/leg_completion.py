@@ -1,0 +1,263 @@
+"""A leg's way from its stop mark to the answer: closed, computed, combined, told, saved."""
+
+from collections.abc import Callable
+from functools import partial
+from math import nan
+import time
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.task import Future
+
+from odocal_ros.calib.result import Calibration
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.foresee.ability import Ability, ability
+from odocal_ros.foresee.quantities import words
+from odocal_ros.live import answers, jobs, result_files as outputs
+from odocal_ros.live.computing import Computing
+from odocal_ros.live.console import Console
+from odocal_ros.live.filing import Filing
+from odocal_ros.live.guidance import after_result, clocks_differ, hint, quantities_ok
+from odocal_ros.live.journal import Journal
+from odocal_ros.live.journal_text import replay_command
+from odocal_ros.live.params import restored_from
+from odocal_ros.live.publishing import Publishing
+from odocal_ros.live.recording import Recording
+from odocal_ros.live.running_estimate import RunningEstimate
+from odocal_ros.live.session import Session, State
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
+from odocal_ros.outside.names import for_shell
+from odocal_ros.settings.config import Config
+
+PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
+
+
+class LegCompletion:
+    """
+    A leg's way from mark to answer; the operator's commands are in ``Operation``.
+
+    Nothing blocks: the heavy work runs in the worker thread, and ``tick`` takes over what it has
+    done.
+    """
+
+    def __init__(self, node, recording: Recording, publishing: Publishing, journal: Journal,
+                 config: Callable[[], Config]) -> None:
+        self.session = Session()
+        self.session.restored = restored_from(publishing.results())
+        self._recording, self._publishing, self._config = recording, publishing, config
+        self._journal = journal
+        self._log, self._clock = node.get_logger(), node.get_clock()
+        self._worker = Worker()
+        self._watch = RunningEstimate(self._worker, self._log)
+        self._node_name = node.get_fully_qualified_name()
+        self._computing = Computing(self._worker, self._fail, self.show_status)
+        self._ability: Ability | None = None  # of the leg last started
+        self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
+        self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
+        self._distance_m = 0.0                # of the leg last touched
+        self._console = Console(self._log)
+        self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    def tick(self) -> None:
+        """Take over what the worker has done and what time has brought."""
+        self._worker.poll()
+        self._filing.poll()
+        self.pump()
+        if self._recording.time_jumped:
+            self._start_time_anew()
+        self._stop_when_too_long()
+        self._close_when_complete()
+        if self.session.state is State.RECORDING:
+            self._watch.look(self._recording.newest_imu_ns)
+        self._journal.tick(self._config(), self.session.busy)
+
+    def pump(self) -> None:
+        """Decode what has arrived."""
+        running = self._watch.forecast and self._watch.forecast.estimates.get('scale_factor')
+        found = running.value if running else None
+        self._recording.pump(self._config(), found or self._publishing.scale_factor())
+
+    def close(self) -> bool:
+        """Let the worker end; return whether it has."""
+        self._watch.end()
+        until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
+        done = self._worker.close(until - time.monotonic())
+        return self._filing.close(max(0.0, until - time.monotonic())) and done
+
+    def left_behind(self) -> str:
+        """Return where a leg lies that was not stopped, and what computes it; empty: none was."""
+        if self.session.state is not State.RECORDING:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {for_shell(["odocal", "replay", folder])} '
+                'computes it') if folder else 'no journal was kept of it'
+        return f'leg {self.session.leg_id} was not stopped: {kept}'
+
+    def _start_time_anew(self) -> None:
+        """Drop what was recorded on the old time; a running leg cannot go on."""
+        if self.session.state is State.RECORDING or self._close_by_ns is not None:
+            self._log.warning(f'time jumped: leg {self.session.leg_id} is cancelled')
+            self._drop_leg(lost='time jumped back')
+            self._log.warning(self._lost_leg())
+        else:
+            self._log.warning('time jumped: the samples so far are dropped')
+        self._recording.start_anew()
+        self._journal.start_anew()
+
+    def view(self) -> SessionView:
+        """Return what is so just now."""
+        session = self.session
+        recording = session.state is State.RECORDING
+        if recording:
+            self._distance_m = self._recording.progress.distance_m()
+        end_ns = session.stop_ns or self._recording.newest_imu_ns
+        forecast = self._watch.forecast
+        return self._publishing.view(
+            self._recording, session=session, saved=self._filing.saved,
+            computed=self._computing.at,
+            save_trouble=self._filing.trouble, distance_m=self._distance_m,
+            config=session.config if session.busy else self._config(), lost=self._lost_leg(),
+            ability=self._ability if recording else None, forecast=forecast,
+            faults=self._watch.faults(self._recording.imu_silent_s()) if recording else (),
+            forecast_age_s=(end_ns - forecast.until_ns) * 1e-9 if forecast else nan,
+            journal=self._journal.folder, journal_trouble=self._journal.trouble,
+            duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
+
+    def show_status(self) -> None:
+        """Publish the status as it is now, and say what is new in it."""
+        now = self.view()
+        self._console.tell(now, self._steady.now().nanoseconds)
+        array = self._publishing.show_status(now)
+        self._journal.hear(self.session, array)
+
+    # a leg's way
+
+    def _mark_ns(self) -> int:
+        """Return the stamp of the newest Imu sample: marks are on the sensors' own clock."""
+        self.pump()
+        return self._recording.newest_imu_ns
+
+    def _stop_when_too_long(self) -> None:
+        session = self.session
+        if session.state is not State.RECORDING:
+            return
+        gone_s = (self._recording.newest_imu_ns - session.start_ns) * 1e-9
+        if gone_s > session.config.leg.max_duration:
+            self._log.warning(
+                f'leg {session.leg_id} is longer than leg.max_duration and is stopped')
+            self.end_leg_now()
+
+    def _why_not(self) -> str:
+        """Return why no leg can be started, empty where one can."""
+        missing = self._recording.inputs.missing(self._config())
+        clocks = self._recording.progress.clocks.differing(self._config())
+        return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
+
+    def _begin_leg(self, mark_ns: int, by_itself: bool = False) -> str:
+        """Open a leg at a mark and return what there is to say."""
+        session = self.session
+        session.start(mark_ns, self._config(), by_itself)
+        self._journal.begin(session, self._recording.inputs.topics)
+        if not by_itself:
+            self._recording.progress.begin_leg()
+        self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
+        self._ability = ability(session.config, self._recording.heard_before(
+            session.config.leg.preroll))
+        self.show_status()
+        text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
+                f'{hint(self.view())}. As configured, {self._ability.words()}')
+        self._log.info(text)
+        return text
+
+    def end_leg_now(self) -> None:
+        """End the leg at the newest Imu stamp."""
+        self._end_leg(self._mark_ns())
+
+    def _end_leg(self, mark_ns: int) -> None:
+        self._distance_m = self._recording.progress.distance_m()
+        self.session.stop(mark_ns)
+        self._watch.end()
+        self._close_by_ns = self._steady.now().nanoseconds + round(PATIENCE_S * 1e9)
+        self.show_status()
+        self._close_when_complete()
+
+    def _close_when_complete(self) -> None:
+        """Hand the leg to the worker once each topic has passed the stop mark, or time is up."""
+        if self._close_by_ns is None:
+            return
+        late = self._steady.now().nanoseconds > self._close_by_ns
+        if late or self._recording.passed(self.session.stop_ns):
+            self._close_by_ns = None
+            self._journal.end()
+            self._snapshot = self._recording.snapshot()
+            self._compute(self._snapshot)
+
+    def _compute(self, samples: LegRecorder) -> None:
+        session = self.session
+        kept = [leg.results for leg in session.legs]
+        self._computing.submit(partial(
+            jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
+            session.carried, session.by_itself, self._computing.tell), self._take_leg)
+
+    def _fail(self, trouble: str) -> None:
+        self.session.fail(trouble)
+        self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
+        remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
+                  'it') if self.session.open_leg else 'call ~/reset'
+        self._computing.answer(False, f'failed: {trouble}; {remedy}')
+
+    def _take_leg(self, done: jobs.Computed) -> None:
+        leg_id, self._snapshot = self.session.leg_id, None
+        self._distance_m = sum(one.distance for one in done.results)
+        if done.calibration is None:
+            self.session.leave_out(done.refused)
+            text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
+                    f'{done.refused.code.name}: {done.refused.text}')
+            self._log.info(text)
+            self._computing.answer(False, text)
+            return
+        self.session.finish(done.results, done.calibration)
+        self.session.carry_on(done.carried, done.folded)
+        success, text = self._take_result(done.calibration, done.paths, done.results)
+        if success and self._config().output.autosave:
+            self._save(done.calibration)
+
+    def _take_result(self, calibration, paths, parts=()) -> tuple[bool, str]:
+        """Publish a result and answer those who wait for it."""
+        self._publishing.set_results(calibration)
+        self._publishing.show_paths(paths)
+        now = self.view()
+        success, text = answers.outcome(calibration, parts, self.session.leg_id,
+                                        words(quantities_ok(now)), after_result(now))
+        self._log.info(text)
+        self._computing.answer(success, text)
+        return success, text
+
+    def _lost_leg(self) -> str:
+        """Return what became of a leg that was dropped by nobody's wish, empty without one."""
+        session = self.session
+        if not session.lost:
+            return ''
+        folder = self._journal.folder
+        kept = (f'what was driven is in {folder}: {replay_command(folder, session.start_ns)} '
+                'computes it' if folder else 'no journal was kept of it')
+        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; ~/start_leg starts '
+                'another')
+
+    def _drop_leg(self, text: str = '', lost: str = '') -> None:
+        self.session.cancel(lost)
+        self._watch.end()
+        self._close_by_ns = self._snapshot = None
+        self._computing.drop()
+        self.show_status()
+        self._journal.end()
+        self._computing.answer(False, text or self._lost_leg())
+
+    def _save(self, calibration: Calibration, asked: bool = False) -> Future:
+        """Write the result files in the worker; the future has the answer."""
+        inputs = self._recording.inputs
+        return self._filing.save(calibration, self.session.config, inputs.topics,
+                                 inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
+                                 asked)

@@ -1,0 +1,131 @@
+"""The side of the node that speaks: status, diagnostics, paths, result parameters."""
+
+from functools import partial
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Path as PathMessage
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64, String
+
+from odocal_ros.live import params, result_files as outputs
+from odocal_ros.live.guidance import action_first
+from odocal_ros.live.recording import Recording
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.live.status import calibration_status, in_force, input_status
+from odocal_ros.outside.yaml_text import no_date
+from odocal_ros.settings.config import Config
+
+PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',
+           'yaw_mounting_angle_sigma')
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
+
+
+class Publishing:
+    """Publishers and result parameters of a node."""
+
+    def __init__(self, node: Node) -> None:
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        publish = partial(node.create_publisher, event_callbacks=quiet)
+        self._node = node
+        self._status = publish(DiagnosticArray, '~/status', LATCHED)
+        self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
+        self._hint = publish(String, '~/hint', LATCHED)
+        self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
+        self._shown: dict = {}        # what these publishers said last
+        self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
+                       for name in ('dead_reckoning', 'reference')]
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._setting = False
+        self._before = self.results()    # what holds while no leg is kept: restored, or nothing
+
+    @property
+    def setting_results(self) -> bool:
+        """Return whether it is the node itself that sets ``result.*`` just now."""
+        return self._setting
+
+    def results(self) -> dict:
+        """Return the ``result.*`` parameters in force."""
+        return {name: self._node.get_parameter(name).value for name in params.RESULTS}
+
+    def scale_factor(self) -> float:
+        """Return the scale factor in force, NaN where none is."""
+        return self._node.get_parameter('result.scale_factor').value
+
+    def set_results(self, calibration) -> None:
+        """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
+        stamp = no_date(outputs.iso(self._node.get_clock().now().nanoseconds))
+        results = self._before
+        if calibration:
+            vehicle = self._node.get_parameter('vehicle').value
+            results = params.as_results(calibration, stamp, vehicle)
+        self._setting = True
+        try:
+            self._node.set_parameters_atomically(
+                [Parameter(name, value=value) for name, value in results.items()])
+        finally:
+            self._setting = False
+
+    def forget_restored(self) -> None:
+        """Let go of a result that came with the start."""
+        self._before = dict(params.RESULTS)
+
+    def show_paths(self, messages) -> None:
+        """Publish dead reckoning and reference of a leg."""
+        for publisher, message in zip(self._paths, messages, strict=True):
+            publisher.publish(message)
+
+    @property
+    def status_topic(self) -> str:
+        """Return the resolved name of ``~/status``."""
+        return self._status.topic_name
+
+    def view(self, recording: Recording, **known) -> SessionView:
+        """Return what is so just now; ``known`` are the fields that are not read off here."""
+        config, progress = known['config'], recording.progress
+        return SessionView(
+            missing=recording.inputs.missing(config), doubled=recording.inputs.doubled(),
+            clocks=progress.clocks.differing(config),
+            rates_hz=recording.rates_hz(), results=self.results(),
+            max_speed=progress.max_speed(), still_s=progress.still_s(),
+            two_wheels=recording.two_wheels(), heard=recording.heard(),
+            restored=known['session'].restored_since(), **known)
+
+    def show_status(self, now: SessionView) -> DiagnosticArray:
+        """Publish ``~/status`` and return it."""
+        array = self._array([calibration_status(now)])
+        self._status.publish(array)
+        self._show(self._hint, String(data=action_first(now)))
+        for name, publisher in self._plotted.items():
+            self._show(publisher, Float64(data=in_force(now, name)))
+        return array
+
+    def _show(self, publisher, message) -> None:
+        """Publish what is new; NaN after NaN is not."""
+        if repr(message) != self._shown.get(publisher):
+            self._shown[publisher] = repr(message)
+            publisher.publish(message)
+
+    def show_diagnostics(self, recording: Recording, config: Config) -> None:
+        """Publish the health of each input."""
+        node = self._node.get_fully_qualified_name()
+        if not config.diagnostic_updater.use_fqn:
+            node = node.lstrip('/')      # with its namespace: two vehicles are not one
+        now_ns = self._steady.now().nanoseconds
+        needed = recording.inputs.required(config)
+        self._diagnostics.publish(self._array([
+            input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
+                         one in needed, now_ns)
+            for slot, one in recording.inputs.by_slot.items()
+            if slot != 'heading' or one.reader is not None]))
+
+    def _array(self, statuses) -> DiagnosticArray:
+        array = DiagnosticArray(status=statuses)
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        return array

@@ -1,0 +1,81 @@
+"""The result folders that a session has written, and what ``latest`` points at."""
+
+from dataclasses import dataclass
+from pathlib import Path
+import uuid
+
+from odocal_ros.output.worse import replacing, stored_in
+from odocal_ros.outside.whole import locked
+
+LATEST = 'latest'
+
+
+@dataclass(frozen=True)
+class Filed:
+    """A written folder: the start marks of its legs, what ``latest`` was before it."""
+
+    folder: Path
+    legs: frozenset[int]
+    before: str
+
+    @property
+    def root(self) -> Path:
+        """Return the folder that holds all results."""
+        return self.folder.parent
+
+
+class ResultFolders:
+    """
+    Keeps ``latest`` at the best that is known, in this session and over earlier ones.
+
+    The link does not go from a good calibration to a worse one unless forced, and it goes back
+    when the legs of what it points at are undone. Nothing written is ever removed.
+    """
+
+    def __init__(self) -> None:
+        self._filed: list[Filed] = []
+
+    def file(self, folder: Path, legs: frozenset[int], force: bool) -> str:
+        """
+        Point ``latest`` at a folder just written; return why it stays where it is instead.
+
+        legs : start marks, ns, of the legs in it.
+        """
+        link = folder.parent / LATEST
+        with locked(folder.parent):         # another node may file there, too
+            before = _target(link)
+            worse = '' if force else replacing(stored_in(link), folder)
+            if worse:
+                return worse
+            _point(link, folder.name)
+        self._filed.append(Filed(folder, legs, before))
+        return ''
+
+    def withdraw(self, left: frozenset[int]) -> Path | None:
+        """
+        Take back what holds legs that are dropped; ``left`` are the start marks of the others.
+
+        Returns the newest folder of this session that still stands, None when there is none.
+        """
+        dropped = [f for f in self._filed if not f.legs <= left]
+        self._filed = [f for f in self._filed if f.legs <= left]
+        for one in reversed(dropped):
+            link = one.root / LATEST
+            if _target(link) != one.folder.name:
+                continue       # somebody else has moved it since
+            if one.before and (one.root / one.before).is_dir():
+                _point(link, one.before)
+            else:
+                link.unlink(missing_ok=True)
+        return self._filed[-1].folder if self._filed else None
+
+
+def _target(link: Path) -> str:
+    return link.readlink().name if link.is_symlink() else ''
+
+
+def _point(link: Path, name: str) -> None:
+    """Move the link in one step: whoever follows it finds the old or the new."""
+    other = link.with_name(f'.{LATEST}-{uuid.uuid4().hex}')
+    other.symlink_to(name)
+    other.replace(link)

@@ -1,0 +1,156 @@
+"""The running estimate: looks at a leg every few seconds while it is recorded, in the worker."""
+
+from functools import partial
+import threading
+import time
+
+from odocal_ros.data.leg import LegRecorder, SLOTS
+from odocal_ros.data.samples import join, take
+from odocal_ros.foresee.forecast import Forecast
+from odocal_ros.foresee.foresight import Abandoned, forecast_of
+from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.foresee.smoother_so_far import SmootherSoFar
+from odocal_ros.foresee.thinned_leg import ThinnedLeg
+from odocal_ros.live.answers import one_line
+from odocal_ros.live.worker import Worker
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config
+
+EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
+SHARE = 1 / 20             # of one core is what looking may cost in the long run
+
+
+class RunningEstimate:
+    """
+    Keeps the newest forecast of the leg that is recorded, None without one.
+
+    The callback thread only collects blocks; cells and prediction are made in the worker, one look
+    at a time. ``end`` makes a look that is under way give up at its next step, so that the result
+    of the leg need not wait for it. What fails here is a note in the log, never more.
+    """
+
+    def __init__(self, worker: Worker, log) -> None:
+        self._worker, self._log = worker, log
+        self.forecast: Forecast | None = None
+        self._faults: tuple[Reason, ...] = ()
+        self._gaps: ImuGaps | None = None
+        self._thinned: ThinnedLeg | None = None
+        self._smoother = SmootherSoFar()
+        self._before: LegRecorder | None = None
+        self._fresh: list = []
+        self._over = threading.Event()
+        self._start_ns = self._due_ns = 0
+        self._config = Config()
+        self._looking = self._warm = False
+        self._pause_until = 0.0
+
+    def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
+        """RunningEstimate a leg that starts at a mark; ``recorder`` holds what came so far."""
+        self.end()
+        self._config, self._before = config, recorder
+        self._look_from(start_ns, recorder.form)
+        self._gaps = ImuGaps(start_ns, config.leg.max_gap)
+        self._gaps.feed(recorder.rows('imu'))      # a mark may lie back, as leg.automatic sets it
+
+    def end(self) -> None:
+        """Let go of the leg."""
+        self._forget()
+        self._thinned = self._gaps = None
+
+    def _forget(self) -> None:
+        """Let a look that is under way give up, and forget what was seen."""
+        self._over.set()
+        self.forecast = self._before = None
+        self._faults = ()
+        self._fresh = []
+        self._looking = self._warm = False
+        self._pause_until = 0.0
+
+    def _look_from(self, start_ns: int, form) -> None:
+        """Look at what comes after a stamp."""
+        self._over, self._start_ns = threading.Event(), start_ns
+        self._thinned, self._smoother = ThinnedLeg(form), SmootherSoFar()
+        self._due_ns = start_ns + EVERY_NS
+
+    def feed(self, slot: str, block) -> None:
+        """Remember a block as it went into the recorder."""
+        if self._thinned is None:
+            return
+        if slot == 'imu' and self._gaps is not None and (again_ns := self._gaps.feed(block)):
+            # the leg is cut there: what is foreseen is of the part since then
+            self._forget()
+            self._look_from(again_ns, self._thinned.form)
+            block = take(block, block.stamp_ns >= again_ns)
+        self._fresh.append((slot, block))
+
+    def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
+        """
+        Return what is wrong with the leg so far, one reason of a code, the gravest first.
+
+        silent_s : for how long the Imu has said nothing while others did.
+        """
+        if self._gaps is None:
+            return ()
+        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there, figures are of the part '
+                      'since') for r in self._gaps.reasons(silent_s)]
+        seen = (*cut, *self._faults,
+                *(self.forecast.faults if self.forecast else ()))
+        first = {r.code: r for r in reversed(seen)}
+        order = list(Verdict)
+        return tuple(sorted(first.values(), key=lambda r: -order.index(r.code.gravity)))
+
+    def look(self, newest_ns: int) -> None:
+        """Have the worker look if it is time to."""
+        if (self._thinned is None or self._looking or newest_ns < self._due_ns
+                or time.monotonic() < self._pause_until):
+            return
+        self._due_ns, self._looking = newest_ns + EVERY_NS, True
+        before, self._before = self._before, None
+        fresh, self._fresh = self._fresh, []
+        self._worker.submit(
+            partial(_look, self._thinned, before, fresh, self._start_ns, self._config, self._over,
+                    self._smoother),
+            partial(self._take, self._over))
+
+    def _take(self, over: threading.Event, look, error: Exception | None) -> None:
+        if over.is_set():
+            return
+        self._looking = False
+        self.forecast, self._faults, seconds, failure = look or (None, (), 0.0, error)
+        # the first look brings in the pre-roll, and modules: a cost that comes once
+        self._pause_until = time.monotonic() + seconds / SHARE if self._warm else 0.0
+        self._warm = True
+        if failure is not None:
+            self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')
+
+
+def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns: int, config: Config,
+          over: threading.Event, smoother: SmootherSoFar,
+          ) -> tuple[Forecast | None, tuple[Reason, ...], float, Exception | None]:
+    """
+    Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.
+
+    Without what is done ever less often as a leg grows: that is a small share by itself.
+    """
+    begin = time.thread_time()
+    forecast, found, failure = None, (), None
+    try:
+        _bring_up_to_date(thinned, before, fresh, over)
+        leg = thinned.leg(start_ns)
+        found = faults_in_cells(leg, config)
+        forecast = forecast_of(leg, thinned.fix_rate(), config,
+                             lambda: not over.is_set(), smoother)
+    except Exception as error:  # whatever is wrong with a look, the leg goes on
+        failure = error
+    return forecast, found, time.thread_time() - begin - smoother.once_s, failure
+
+
+def _bring_up_to_date(thinned, before, fresh, over) -> None:
+    for slot in SLOTS:
+        if over.is_set():
+            raise Abandoned
+        blocks = [before.rows(slot)] if before is not None else []
+        blocks += [block for name, block in fresh if name == slot]
+        blocks = [block for block in blocks if len(block.stamp_ns)]
+        if blocks:
+            thinned.feed(slot, join(blocks))

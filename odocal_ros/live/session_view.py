@@ -1,0 +1,52 @@
+"""What is so just now: everything that status, hint and answers are made from."""
+
+from dataclasses import dataclass, field
+from math import nan
+
+from odocal_ros.foresee.ability import Ability
+from odocal_ros.foresee.forecast import Forecast
+from odocal_ros.live.session import Session, State
+from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.settings.config import Config
+
+
+@dataclass(frozen=True, eq=False)
+class SessionView:
+    """One moment of the node; in a leg the config is the one frozen into it."""
+
+    session: Session
+    config: Config
+    missing: list[str] = field(default_factory=list)
+    doubled: list[str] = field(default_factory=list)     # topics with several publishers
+    clocks: list[tuple[str, float]] = field(default_factory=list)
+    rates_hz: dict[str, float] = field(default_factory=dict)
+    results: dict = field(default_factory=dict)  # result.* parameters
+    restored: str = ''                           # when they were made, of a saved result
+    distance_m: float = 0.0
+    duration_s: float = 0.0
+    max_speed: float = 0.0
+    still_s: float = 0.0
+    two_wheels: bool = False                     # the right wheel is heard by itself
+    ability: Ability | None = None               # of the leg that is recorded
+    forecast: Forecast | None = None               # of the leg that is recorded
+    faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
+    forecast_age_s: float = nan                   # since the way it is of
+    computed: tuple[float, str] = (0.0, '')      # share of a leg's result, and what is at work
+    saved: str = ''
+    lost: str = ''                               # a leg that nobody wanted dropped
+    save_trouble: str = ''                       # why the newest result is in no folder
+    journal: str = ''                            # folder of the newest leg's journal
+    journal_trouble: str = ''                    # why it cannot be written
+    heard: bool = True                           # any message on any topic so far
+
+    @property
+    def state(self) -> str:
+        """Return the state as published: idle with an input missing is ``waiting``."""
+        if self.session.state is State.IDLE and self.missing:
+            return 'waiting'
+        return self.session.state.value
+
+    @property
+    def lost_cause(self) -> bool:
+        """Return whether the leg that is recorded would be rejected as it is."""
+        return any(r.code.gravity is Verdict.REJECTED for r in self.faults)

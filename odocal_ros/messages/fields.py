@@ -1,0 +1,138 @@
+"""Fields of messages by their path, whether the message is bytes (a layout) or an object."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import re
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.messages import cdr
+
+PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
+
+
+class View(Protocol):
+    """What a column asks of a message: its joint names and how long its lists are."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return the list ``name`` (of joints), empty where there is none."""
+
+    def count(self, path: str) -> int:
+        """Return how many values a list has, 0 if it is not there."""
+
+
+class MessageView:
+    """A deserialised message, of rosbags or rclpy."""
+
+    def __init__(self, message: object) -> None:
+        self.message = message
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return the list ``name`` (of joints), empty where there is none."""
+        return list(getattr(self.message, 'name', ()))
+
+    def count(self, path: str) -> int:
+        """Return how many values a list has, 0 if it is not there."""
+        try:
+            return len(self.value(path))
+        except (AttributeError, LookupError, TypeError):
+            return 0
+
+    def value(self, path: str):
+        """
+        Return what lies at a dotted path, with [i] in a list or [name] by the list ``name``.
+
+        Raises
+        ------
+        AttributeError, LookupError
+            Not there.
+
+        """
+        here: Any = self.message
+        owner = here
+        for name, key in parts(path):
+            if name:
+                here, owner = getattr(here, name), here
+            else:
+                here = here[self._index(owner, key)]
+        return here
+
+    @staticmethod
+    def _index(owner, key: str) -> int:
+        names = list(getattr(owner, 'name', ()))
+        if key in names:
+            return names.index(key)
+        if key.isdigit():
+            return int(key)
+        raise LookupError(f'no {key!r} among {", ".join(map(str, names)) or "no names"}')
+
+    def fields(self) -> list[str]:
+        """Return the names of the message's fields, to tell people what there is."""
+        given = getattr(type(self.message), '__dataclass_fields__', None)
+        if given is None and hasattr(self.message, 'get_fields_and_field_types'):
+            given = self.message.get_fields_and_field_types()
+        return [name for name in (given or ()) if not name.startswith('__')]
+
+
+@lru_cache
+def parts(path: str) -> tuple[tuple[str, str], ...]:
+    """Return a path as (name, '') and ('', key) pairs; empty if it is no path."""
+    found = tuple(PART.findall(path))
+    whole = ''.join(f'[{key}]' if key else f'.{name}' for name, key in found)
+    return found if whole.lstrip('.') == path else ()
+
+
+@dataclass(frozen=True)
+class Column:
+    """
+    Values wanted of every message.
+
+    ``pick`` says at which paths they lie in a message, None if they are not there.
+    """
+
+    dtype: type
+    width: int
+    pick: Callable[[View], Sequence[str] | None]
+
+    def of_table(self, layout: cdr.Layout, table: cdr.Table) -> NDArray | None:
+        """Return (n, width) values of messages of one layout, None if they are not there."""
+        paths = self.pick(layout)
+        return cdr.columns(layout, table, paths) if paths else None
+
+    def of_message(self, view: MessageView) -> list | None:
+        """Return the same values of one message."""
+        paths = self.pick(view)
+        if not paths:
+            return None
+        values = [view.value(path) for path in paths]
+        if self.dtype is np.int64:
+            values = [(int(v) + 2**63) % 2**64 - 2**63 for v in values]   # uint64 as int64 bits
+        return values
+
+
+def fixed(dtype: type, *paths: str) -> Column:
+    """Return a column whose values lie at the same paths in every message."""
+    return Column(dtype, len(paths), lambda view: paths)
+
+
+def xyz(prefix: str, names: str = 'xyz') -> Column:
+    """Return the column of a vector or quaternion."""
+    return fixed(np.float64, *(f'{prefix}.{name}' for name in names))
+
+
+def array(path: str, *indices: int) -> Column:
+    """Return the column of some elements of an array."""
+    return fixed(np.float64, *(f'{path}[{i}]' for i in indices))
+
+
+STAMP = (fixed(np.int64, 'header.stamp.sec'), fixed(np.int64, 'header.stamp.nanosec'))
+
+
+def stamp_ns(sec: NDArray, nanosec: NDArray) -> NDArray[np.int64]:
+    """Return header stamps in nanoseconds from the two columns of STAMP."""
+    return sec[:, 0] * 10**9 + nanosec[:, 0]

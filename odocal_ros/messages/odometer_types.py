@@ -1,0 +1,234 @@
+"""Odometer messages: where the value lies in each type, and what it means."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from numbers import Integral
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.errors import BadConfig, BadData
+from odocal_ros.messages import cdr
+from odocal_ros.messages.fields import Column, MessageView, parts, STAMP, stamp_ns, View
+from odocal_ros.messages.wheel_choice import choose, sided
+from odocal_ros.settings.config import Config
+
+JOINTS = 'sensor_msgs/msg/JointState'
+TWIST = 'geometry_msgs/msg/Twist'
+DEFAULT_FIELD = {
+    JOINTS: '',   # position, or velocity where no position is sent
+    TWIST: 'linear.x',
+    f'{TWIST}Stamped': 'twist.linear.x',
+    f'{TWIST}WithCovarianceStamped': 'twist.twist.linear.x',
+    'nav_msgs/msg/Odometry': 'twist.twist.linear.x',
+    'std_msgs/msg/Int32MultiArray': 'data',
+    'std_msgs/msg/Int64MultiArray': 'data',
+} | {f'std_msgs/msg/{name}': 'data' for name in (
+    'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
+TYPES = tuple(DEFAULT_FIELD)
+
+
+class OdometerPlan:
+    """
+    What to take from the messages of an odometer topic, and what it means.
+
+    Some of it only the first message tells (does a JointState hold positions? which of its joints
+    are wheels? is a foreign field a whole number?); ``ready`` is asked with messages in order
+    until it says yes.
+    """
+
+    def __init__(self, slot: str, msgtype: str, config: Config) -> None:
+        self.slot, self.msgtype, self.odometer = slot, msgtype, config.odometer
+        self.known = msgtype in DEFAULT_FIELD
+        self.field = config.odometer.field or DEFAULT_FIELD.get(msgtype, '')
+        self.keys = _wheel_keys(slot, config)
+        self.two = len(self.keys) == 2
+        self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
+        self.columns: tuple[Column, ...] = ()
+        self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
+        self.unclear = ''        # why the last message did not tell which values are wheels
+        self._check()
+        self.choosing = self._listed() and not _base(self.field)[1] and not self.keys[0]
+        if msgtype == JOINTS and not self.field:
+            self.fields: tuple[str, ...] = {
+                'auto': ('position', 'velocity'), 'rate': ('velocity',)}.get(
+                self.odometer.quantity, ('position',))
+        else:
+            self.fields = (self.field,)
+        if self.known:
+            self.form = self._meaning(self.fields[0])
+            if len(self.fields) == 1 and not self.choosing:
+                self._settle(self.field or self.fields[0])
+
+    def _check(self) -> None:
+        """Refuse what can be seen to fail before any message came."""
+        if not self.known and not self.field and not self.two:
+            raise BadData(
+                f'{self.slot}: {self.msgtype} is not read as an odometer by itself: set '
+                f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
+                f'lists its fields), or give a topic of {", ".join(TYPES)}')
+        if self.field and not parts(self.field):
+            raise BadConfig(f'odometer.field: {self.field!r} is no path such as '
+                            'twist.linear.x, data[0] or position[joint]')
+        if not self.known:
+            return
+        kinds = _kinds(self.msgtype)
+        base, key = _base(self.field)
+        if self.field and base not in kinds:
+            raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; it has '
+                          f'{", ".join(kinds)}')
+        if self.two and not self._listed():
+            raise BadConfig(f'odometer.left and odometer.right: {self.msgtype} holds one value '
+                            f"({self.field}); use 'topic' for wheels on two topics")
+        if self.odometer.field and self._listed() and not (
+                key or self.two or self.msgtype == JOINTS):
+            raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value of it, '
+                            f'{base}[0], or set odometer.left and odometer.right')
+
+    def _listed(self) -> bool:
+        """Return whether the field is a list of values, of which one or two are wanted."""
+        base, _ = _base(self.field)
+        return self.known and (not base or '[' in _kinds(self.msgtype)[base])
+
+    def ready(self, view: View) -> bool:
+        """Learn from a message what is still open; False: ask again with the next one."""
+        if self.columns:
+            return True
+        if not self.known:
+            assert isinstance(view, MessageView)
+            self._learn(view)
+            return True
+        for field in self.fields:
+            if self.choosing and view.count(field):
+                self._choose(field, view)
+                return bool(self.columns)
+            if not self.choosing and self._pick(field, self.keys[0])(view):
+                self._settle(field)
+                return True
+        return False
+
+    def _choose(self, field: str, view: View) -> None:
+        """Find the wheels in a message, and settle; else note why they cannot be told."""
+        found = choose(view.names, view.count(field))
+        if isinstance(found, str):
+            self.unclear = found
+            return
+        own = {'odometer_right': 'right'}.get(
+            self.slot, 'left' if self.odometer.right == 'topic' else '')
+        if own:
+            key = sided(found, own)
+            if not key:
+                self.unclear = found.about
+                return
+            self.keys = (key,)
+        else:
+            self.keys, self.two = found.keys, len(found.keys) == 2
+        self._settle(field)
+        self.form = replace(self.form, sides=found.sides, chosen=found.about)
+
+    def _learn(self, view: MessageView) -> None:
+        """Settle a foreign type by its first message."""
+        value = None
+        for key in self.keys:
+            path = self._path(self.field, key)
+            try:
+                value = view.value(path)
+            except (AttributeError, LookupError, TypeError) as error:
+                raise BadData(f'odometer.field: {self.msgtype} has no value {path!r} ({error}); '
+                              f'its fields are {", ".join(view.fields())}') from None
+            if not isinstance(value, (Integral, float, np.floating)):
+                raise BadData(f'odometer.field: {path!r} of {self.msgtype} is not a number but '
+                              f'{type(value).__name__}; name one value, as in path.to.value[0]')
+        self.stamped = hasattr(view.message, 'header')
+        self._settle(self.field, 'int64' if isinstance(value, Integral) else 'float64')
+
+    def _settle(self, field: str, kind: str = '') -> None:
+        """Fix columns and form for a field; ``kind`` of foreign types comes from their values."""
+        self.form = self._meaning(field, kind)
+        whole = 'int' in (kind or self._kind(field))
+        dtype = np.int64 if whole else np.float64
+        self.columns = STAMP * self.stamped + tuple(
+            Column(dtype, 1, self._pick(field, key)) for key in self.keys)
+
+    def _kind(self, field: str) -> str:
+        return _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
+
+    def _meaning(self, field: str, kind: str = '') -> OdometerForm:
+        """Return what the values of a field mean."""
+        bits = 0
+        if self.known:
+            kind = self._kind(field)
+            bits = int(kind.lstrip('uintfloa'))
+        whole = 'int' in kind
+        joint = self.msgtype == JOINTS and _base(field)[0] in ('position', 'velocity')
+        quantity = self.odometer.quantity
+        if quantity == 'auto':
+            quantity = 'cumulative' if whole or joint and 'position' in field else 'rate'
+        modulus = (self.odometer.wrap or (2**bits if bits else 0)) * (
+            whole and quantity == 'cumulative')
+        unit = 'm/rad' if joint else 'm/pulse' if whole or quantity != 'rate' else '1'
+        return OdometerForm(quantity, modulus, unit)
+
+    def _path(self, field: str, key: str) -> str:
+        """Return the path of a wheel's value: the list's element, or the key as a path."""
+        if not key:
+            return field
+        return f'{_base(field)[0]}[{key}]' if field else key
+
+    def _pick(self, field: str, key: str):
+        """Return the function that says where in a message a wheel's values lie."""
+        path = self._path(field, key)
+        base, own = _base(field)
+        if not self.known or '[' not in _kinds(self.msgtype)[base]:
+            return lambda view: (path,)
+        key = key or own        # never by way of the path: a joint may have any name
+
+        def pick(view: View) -> Sequence[str] | None:
+            n = view.count(base)
+            names = view.names
+            at = names.index(key) if key in names else int(key) if key.isdigit() else n
+            return (f'{base}[{at}]',) if at < n else None
+        return pick
+
+    def missing(self, view: View) -> str:
+        """Say why a message holds no value, for people."""
+        if self.unclear and not self.columns:
+            return self.unclear
+        wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
+        names = f', its names are {", ".join(view.names)}' if view.names else ''
+        return f'no {wanted} in a {self.msgtype}{names}'
+
+    def build(self, received_ns: NDArray, columns: list[NDArray]) -> list:
+        """Return (slot, block) pairs."""
+        stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
+        slots = ('odometer', 'odometer_right') if self.two else (self.slot,)
+        values = columns[2:] if self.stamped else columns
+        return [(slot, OdometerSamples(stamps, received_ns, value[:, 0]))
+                for slot, value in zip(slots, values, strict=True)]
+
+
+def _wheel_keys(slot: str, config: Config) -> tuple[str, ...]:
+    """Return the keys of the wheels in one message: ('',), or those of left and right."""
+    left, right = config.odometer.left, config.odometer.right
+    if 'topic' in (left, right) or not (left or right):
+        return ('',)
+    if not (left and right):
+        raise BadConfig('odometer.left and odometer.right belong together: set both or neither')
+    if left == right:
+        raise BadConfig(f'odometer.left and odometer.right are both {left!r}: name two wheels')
+    return (left, right) if slot == 'odometer' else ('',)
+
+
+def _kinds(msgtype: str) -> dict[str, str]:
+    """Return path -> kind of the numbers in a type."""
+    lines = (line.split() for line in cdr.SCHEMAS[msgtype])
+    return {path: kind for kind, path in lines if not kind.startswith(('string', 'dim'))}
+
+
+def _base(path: str) -> tuple[str, str]:
+    """Split 'position[left]' into ('position', 'left'); without brackets the key is ''."""
+    if not path.endswith(']'):
+        return path, ''
+    base, _, key = path[:-1].rpartition('[')
+    return base, key

@@ -1,0 +1,130 @@
+"""
+The embodiment of source B as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
+
+It lists seven combinations that an orthogonal array is said to have chosen, and names as best one
+that is not among them. No orthogonal array for 7 x 7 x 9 levels is smaller than all 441
+combinations; here a nearly balanced one of 81 stands beside all of them, the refined optimum and
+least squares. Errors are what is to be added: true radius = nominal radius + error, and the track
+is to be turned counter-clockwise by the heading error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.patent.arrays import full_factorial, least_rows, nearly_balanced
+from odocal_ros.patent.criteria import score
+from odocal_ros.patent.direct import least_squares, LeastSquares
+from odocal_ros.patent.planar import PlanarLeg
+from odocal_ros.patent.space import sets_of, Space
+from odocal_ros.patent.surface import refine, Refined
+
+LEVELS = (7, 7, 9)
+RADIUS_STEP, HEADING_STEP = 0.01, np.deg2rad(0.25)      # m, rad
+# left radius, right radius, m; heading, deg: as printed
+PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
+           (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
+FOUND = (-0.01, 0.01, 0.25)     # printed as best, with 21.76 m at most and 13.24 m in the mean
+RADIUS = 0.3                    # m; the source states none
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One line of the table.
+
+    left, right : m, error of the radius.   heading_deg : error.   criteria : as Scores.row.
+    """
+
+    name: str
+    left: float
+    right: float
+    heading_deg: float
+    criteria: dict
+
+
+@dataclass(frozen=True, eq=False)
+class Embodiment:
+    """
+    The table and what stands behind it.
+
+    imbalance : of the array of 81, see ``arrays``.   least : rows of an orthogonal array.
+    small, whole : the rows of the best of 81 and of all 441 among ``rows``.
+    refined, refined_together : by surfaces inside the range, left and right free or together.
+    direct, direct_together : by least squares, in no range.   radius : m, nominal, of both wheels.
+    """
+
+    rows: tuple[Row, ...]
+    imbalance: float
+    least: int
+    small: Row
+    whole: Row
+    refined: Refined
+    refined_together: Refined
+    direct: LeastSquares
+    direct_together: LeastSquares
+    radius: float
+
+    @property
+    def sigma_radius(self) -> float:
+        """Return the formal sigma of right less left radius by positions, m."""
+        return self.direct.sigma_difference * self.radius
+
+    @property
+    def told_apart(self) -> bool:
+        """Tell whether the fixes say more of left against right than the range does."""
+        return self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2
+
+
+def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment:
+    """
+    Run the embodiment on a leg.
+
+    Parameters
+    ----------
+    leg : PlanarLeg
+        Its start values belong to wheels of the nominal radius.
+    radius : float
+        Nominal radius of both wheels, m.
+    truth : (left, right, heading), optional
+        True errors, m and deg, for a line of their own.
+
+    """
+    half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * HEADING_STEP])
+    design = nearly_balanced(LEVELS)     # 81 rows
+    small, whole = (_levels(rows, half) for rows in (design.rows, full_factorial(LEVELS)))
+    x_small, x_whole = (_best(leg, x) for x in (small, whole))
+    step = 2 * half / (np.array(LEVELS) - 1)
+    spaces = Space(held=False), Space(held=True)
+    refined, together = (
+        refine(lambda x: score(leg, sets_of(leg, x), course=False).loss, x_small, step, half,
+               space, widen=False) for space in spaces)
+    direct, direct_together = (least_squares(leg, x_small, space) for space in spaces)
+
+    def row(name, x):
+        criteria = score(leg, sets_of(leg, x)).row(0)
+        return Row(name, *(float(r) for r in x[:2] * radius), float(np.rad2deg(x[2])), criteria)
+
+    def given(name, errors):
+        return row(name, np.array([errors[0] / radius, errors[1] / radius,
+                                   np.deg2rad(errors[2])]))
+
+    best = row(f'best of {len(small)}', x_small), row(f'best of all {len(whole)}', x_whole)
+    rows = [given('start values', (0.0, 0.0, 0.0))]
+    rows += [given(f'printed {k}', errors) for k, errors in enumerate(PRINTED, 1)]
+    rows += [given('printed as best', FOUND), *best,
+             row('response surface', refined.x), row('  wheels together', together.x),
+             row('least squares', direct.x), row('  wheels together', direct_together.x)]
+    rows += [] if truth is None else [given('truth', truth)]
+    return Embodiment(tuple(rows), design.imbalance, least_rows(LEVELS), *best, refined, together,
+                      direct, direct_together, radius)
+
+
+def _levels(rows, half):
+    return (2 * rows / (np.array(LEVELS) - 1) - 1) * half
+
+
+def _best(leg, x):
+    """Return the row with the least mean distance, ties by the largest."""
+    scores = score(leg, sets_of(leg, x), course=False)
+    return x[np.lexsort((scores.max, scores.mean))[0]]

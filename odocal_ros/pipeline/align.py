@@ -1,0 +1,255 @@
+"""
+Alignment of a leg: which standstill, which heading source, in the order of design.md section 3.
+
+Pure: takes screened inputs, returns an Alignment and what was found on the way.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.nav.alignment import (
+    COMPASS_LIMIT,
+    complete,
+    COURSE_DISTANCE,
+    gyrocompass,
+    Level,
+    level_at_rest,
+    level_in_motion,
+    MOTION_LEVEL,
+    off_the_earth,
+)
+from odocal_ros.nav.angles import wrap, yaw_from_heading
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.earth import C_en, earth_rate_n
+from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
+from odocal_ros.nav.strapdown import attitude
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.force import TILT
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import G, Grade, grade_of
+
+COURSE_TIME = 300.0       # s within which the way for a course must be driven
+HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
+NOISY = 10.0              # times the noise of the grade at rest: another gyro, or another unit
+NO_EARTH = 4.0            # sigmas: a gyro with such a bias is no compass
+NEAR = 0.5                # s: a heading sample this near to a moving start is taken
+
+
+def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Config):
+    """
+    Align a leg.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        Screened leg.
+    spans : (k, 2) array
+        Standstills, s.
+    metres_per_unit : float
+        Rough scale.
+    fixes_n : (n, 3) array
+        Fixes in n, m.
+    origin : Origin
+        Where n is fixed.
+    config : Config
+        Heading source, grade.
+
+    Returns
+    -------
+    Alignment, reasons.
+
+    """
+    grade = grade_of(config.imu)
+    if not inputs.felt:
+        grade = replace(grade, accel_bias=TILT * G)
+    level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
+    level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
+    yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
+    reasons += why
+    if source == 'course':
+        yaw, sigma, why = _course(inputs, level, metres_per_unit, fixes_n, origin, grade)
+        reasons += why
+    return complete(level, yaw, sigma, source, shared, origin.latitude, grade, gyro_noise), reasons
+
+
+def choose_standstill(spans):
+    """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
+    before = [s for s in spans if s[0] <= 0.5]
+    return before[-1] if before else None
+
+
+def _from_place(inputs, span, fixes_n, origin):
+    """
+    Return C_np of the place of a standstill: east, north and up differ from those at the origin.
+
+    By 0.16 mrad for each kilometre of the way from there to the mark.
+    """
+    if span is None or not len(fixes_n):
+        return np.eye(3)
+    near = (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
+    if not near.any():
+        near = np.argmin(np.abs(inputs.t_fix - span[1]), keepdims=True)
+    place_n = np.nan_to_num(np.median(fixes_n[near], axis=0))
+    latitude, longitude, _ = origin.to_geodetic(place_n)
+    return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
+
+
+def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
+    span = choose_standstill(spans)
+    if span is not None:
+        seen = _measured_noise(inputs, span)
+        noise = max(grade.gyro_noise, seen)
+        level = level_at_rest(inputs.t_imu, inputs.w_b, inputs.f_b, span, grade, noise)
+        return level, noise, _against_grade(seen, grade)
+    t = inputs.t_imu
+    first = max(0.0, float(t[0]))
+    pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
+    if pick.sum() < 2:      # the Imu falls silent at the mark: IMU_GAP will say so
+        pick = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
+    _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    ends = t[pick][[0, -1]]
+    speed = (inputs.travel.at(ends + 0.5) - inputs.travel.at(ends - 0.5)) * metres_per_unit
+    inside = np.clip(ends + 0.5, *inputs.travel.t[[0, -1]]) - np.clip(
+        ends - 0.5, *inputs.travel.t[[0, -1]])
+    level = level_in_motion(t[pick], inputs.w_b[pick], inputs.f_b[pick], q_0b,
+                            speed / np.maximum(inside, 1e-3), latitude, grade)
+    found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: levelled over '
+                   f'{t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
+                   f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
+    return level, grade.gyro_noise, (found,)
+
+
+def _against_grade(noise, grade: Grade):
+    """Return a caution where the gyro at rest is far noisier than its grade: walks will be too."""
+    times = noise / max(grade.gyro_noise, 1e-12)
+    if times <= NOISY:
+        return ()
+    unit = ', as one that sends deg/s would be' if 30 < times < 120 else ''
+    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'at rest the gyro is {times:.0f} times as noisy as '
+                   f'its grade{unit}'),)
+
+
+def _measured_noise(inputs, span):
+    """Return the white gyro noise seen at rest, rad/s/sqrt(Hz), the largest axis."""
+    pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
+    t, w = inputs.t_imu[pick], inputs.w_b[pick]
+    if len(t) < 20:
+        return 0.0
+    return float((np.diff(w, axis=0).std(axis=0) / np.sqrt(2)).max()
+                 * np.sqrt((t[-1] - t[0]) / (len(t) - 1)))
+
+
+def _heading(inputs, level: Level, latitude, grade, config: Config):
+    """Return yaw of L's x axis, sigma, source, shared, reasons; a course has no yaw yet."""
+    asked = config.alignment.heading_source
+    order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
+    if asked == 'auto' and not np.isnan(config.alignment.heading):
+        order = ['fixed']
+    refusals = []
+    for source in order:
+        if source == 'course':
+            break
+        result, why = SOURCES[source](inputs, level, latitude, grade, config)
+        if result is not None:
+            yaw, sigma = result
+            return yaw, sigma, source, source != 'gyrocompass', ()
+        refusals.append(Reason(Code.GYROCOMPASS_REFUSED if source == 'gyrocompass'
+                               else Code.HEADING_UNAVAILABLE, f'heading from {source}: {why}'))
+    reasons = tuple(refusals) if asked not in ('auto', 'course') else ()
+    return 0.0, np.pi, 'course', True, reasons
+
+
+def _fixed(inputs, level, latitude, grade, config):
+    if np.isnan(config.alignment.heading):
+        return None, 'alignment.heading is not set'
+    mark_yaw = float(yaw_from_heading(config.alignment.heading))
+    # the heading holds at the mark: carry it back over the turn since the standstill, and to
+    # the north of where that was
+    turned = _turn_since(inputs, level) if level.standstill and level.t < 0.0 else 0.0
+    turned += float(np.arctan2(level.C_np[1, 0], level.C_np[0, 0]))
+    return (float(wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
+
+
+def _turn_since(inputs, level):
+    """Return how far b has turned about the vertical from the level's epoch to the mark, rad."""
+    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
+    if pick.sum() < 2:
+        return 0.0
+    rate = (inputs.w_b[pick] - level.mean_rate_b)
+    _, q = attitude(inputs.t_imu[pick], rate, quat_from_matrix(level.C_Lb), np.zeros(3))
+    C = matrix_from_quat(q[-1])
+    return float(np.arctan2(C[1, 0], C[0, 0]))
+
+
+def _imu_orientation(inputs, level, latitude, grade, config):
+    C_bi = inputs.C_bi
+    return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance, level, config,
+                             lambda C_ni: C_ni @ transpose(C_bi), 0.0)
+
+
+def _heading_topic(inputs, level, latitude, grade, config):
+    return _from_quaternions(inputs.t_heading, inputs.q_heading, inputs.heading_variance, level,
+                             config, lambda C: C, config.alignment.heading_offset)
+
+
+def _from_quaternions(t, q, variance, level, config, to_b, offset):
+    """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
+    # of hours only the rows that are looked at
+    begin, end = level.standstill or (level.t - NEAR, level.t + NEAR)
+    near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
+    t, q, variance = t[near], q[near], variance[near]
+    pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
+    if not level.standstill:
+        away = np.where(pick, np.abs(t - level.t), np.inf)
+        pick = (away <= NEAR) & (away == away.min(initial=np.inf))
+    if not pick.any():
+        return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
+    C = to_b(matrix_from_quat(q[pick]))
+    yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
+    stated = float(np.median(variance[pick]))
+    sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
+    if sigma > HEADING_LIMIT:
+        return None, f'its covariance says +-{np.rad2deg(sigma):.3g} deg'
+    return (float(wrap(yaw)), float(sigma)), ''
+
+
+def _gyrocompass(inputs, level, latitude, grade, config):
+    if level.standstill is None:
+        return None, 'needs a standstill'
+    yaw, sigma = gyrocompass(level, latitude, grade)
+    if sigma > COMPASS_LIMIT:
+        return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
+                      f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
+    off = off_the_earth(level, latitude, grade)
+    if off > NO_EARTH:
+        return None, (f'at rest the gyro does not show the turn of the Earth, by {off:.0f} sigma: '
+                      f'its bias is not that of the {config.imu.grade} grade')
+    return (yaw, sigma), ''
+
+
+SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic': _heading_topic,
+           'gyrocompass': _gyrocompass}
+
+
+def _course(inputs, level, metres_per_unit, fixes_n, origin, grade):
+    """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
+    trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
+    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + COURSE_TIME)
+    t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
+                       earth_rate_n(origin.latitude))
+    track = dead_reckon(t, q_nb, inputs.travel)
+    near = (inputs.t_fix >= max(t[0], 0.0)) & (inputs.t_fix <= t[-1])
+    if near.sum() >= 2:
+        true = fixes_n[near, :2] - fixes_n[near][0, :2]
+        dr = track.at(inputs.t_fix[near])[:, :2, 0] * metres_per_unit
+        dr = dr - dr[0]
+        sigma_fix = np.sqrt(np.median(inputs.covariance_n[near, 0, 0]))
+        long_enough = np.hypot(*dr.T) >= max(COURSE_DISTANCE, 8 * sigma_fix)
+        if long_enough.any():
+            k = int(np.argmax(long_enough))
+            yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
+            return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
+    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course either: the fixes do not move '
+                               f'{COURSE_DISTANCE:.0f} m within {COURSE_TIME:.0f} s'),)

@@ -1,0 +1,172 @@
+"""
+Where legs begin and end by themselves (``leg.automatic``): one search for both doors.
+
+It goes by the stamps of the rows alone, so that a recording gives the legs that the node had. A
+leg begins where the vehicle drives off, and ends at the first standstill after half of
+``leg.automatic_minutes``, at any long one, or when the minutes are over, in motion: the next one
+then begins where it ended. A gap of the Imu that no leg survives lies between two legs.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.result import LegResult
+from odocal_ros.data.samples import OdometerForm
+from odocal_ros.pipeline.combination import combine
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.odometer_steps import Steps
+from odocal_ros.settings.config import Config
+
+SECOND = 10**9
+REST_NS = 10 * SECOND        # of the standstill that ends a leg: it tells place and biases
+PARKED_NS = 120 * SECOND     # a longer standstill ends a leg of any length
+BEFORE_NS = 1 * SECOND       # of the first count of a drive-off the vehicle stood
+MOST_WAITING = 200_000       # odometer rows that wait for the Imu
+
+
+@dataclass
+class Span:
+    """A leg; ``stop_ns`` is 0 while it is open."""
+
+    start_ns: int
+    stop_ns: int = 0
+
+
+class LegSearch:
+    """
+    Finds legs in rows as they come; ``spans`` holds them, the open one last.
+
+    The rows of the odometer decide, once the Imu has passed them; how they were chopped into
+    blocks leaves no trace.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._steps: Steps | None = None
+        self._standstill_ns = round(config.leg.standstill * 1e9)
+        self._rest_ns = max(REST_NS, self._standstill_ns)
+        self._longest_ns = round(config.leg.automatic_minutes * 60e9)
+        self._max_gap_ns = round(config.leg.max_gap * 1e9)
+        surveyed = config.reference.start and config.reference.end
+        self._first_ns = dict.fromkeys(('imu', 'odometer') + (() if surveyed else ('fix',)), 0)
+        self.spans: deque[Span] = deque()
+        # stamp and travel of odometer rows
+        self._waiting: deque[tuple[int, float]] = deque(maxlen=MOST_WAITING)
+        self._gaps: deque[tuple[int, int]] = deque()         # of the Imu: both edges
+        self._imu_ns = 0
+        self._travel = 0.0
+        self._anchor: tuple[int, float] | None = None        # where it moved last
+        self._newest_ns = self._from_ns = 0
+        self._needs_rest = False
+
+    @property
+    def open(self) -> Span | None:
+        """Return the leg that has not ended."""
+        return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
+
+    def feed(self, slot: str, block, form: OdometerForm | None = None) -> None:
+        """Take rows as they went into the recorder; ``form`` is that of the odometer's."""
+        if slot not in self._first_ns or not len(block.stamp_ns):
+            return
+        self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
+        if slot == 'imu':
+            self._hear(block.stamp_ns)
+        elif slot == 'odometer':
+            self._steps = self._steps or Steps(form)
+            steps, stamps, _ = self._steps.of(block)
+            travel = self._travel + np.cumsum(steps)
+            if len(travel):
+                self._waiting.extend(zip(stamps.tolist(), travel.tolist(), strict=True))
+                self._travel = float(travel[-1])
+        self._decide()
+
+    def begin_anew(self, after_ns: int, at_rest: bool) -> None:
+        """
+        Forget the legs: the next begins after a stamp.
+
+        at_rest : where the vehicle drives off from a standstill, else as soon as it moves.
+        """
+        self.spans.clear()
+        self._from_ns, self._needs_rest = after_ns, at_rest
+
+    def _hear(self, stamps) -> None:
+        known = np.append(self._imu_ns or stamps[0], stamps[stamps > self._imu_ns])
+        for k in np.flatnonzero(np.diff(known) > self._max_gap_ns):
+            self._gaps.append((int(known[k]), int(known[k + 1])))
+        self._imu_ns = int(known.max())
+
+    def _decide(self) -> None:
+        """Go through the rows that the Imu has passed."""
+        if not all(self._first_ns.values()):
+            return
+        first_ns = max(self._first_ns.values())
+        while self._waiting and self._waiting[0][0] <= self._imu_ns:
+            t, s = self._waiting.popleft()
+            if t > self._newest_ns and t >= first_ns:
+                self._newest_ns = t
+                self._row(t, s)
+
+    def _row(self, t: int, s: float) -> None:
+        while self._gaps and self._gaps[0][0] < t:
+            last, again = self._gaps.popleft()
+            self._close(last)
+            self._anchor, self._from_ns = None, max(self._from_ns, again)
+        if t < self._from_ns:
+            return
+        if self._anchor is None:
+            self._anchor = t, s
+        elif abs(s - self._anchor[1]) > self._steps.still:
+            self._moves(t)
+            self._anchor = t, s
+        else:
+            self._stands(t)
+
+    def _moves(self, t: int) -> None:
+        stood_ns = self._anchor[0]
+        self._stands(t - BEFORE_NS)
+        rested = t - stood_ns >= self._standstill_ns
+        leg, off_ns = self.open, max(t - BEFORE_NS, stood_ns, self._from_ns)
+        if leg is not None and rested and self._long_enough(leg, stood_ns):
+            self._close(off_ns)
+        elif leg is not None and t - leg.start_ns >= self._longest_ns:
+            self._close(t)
+            off_ns = t
+        if self.open is None and not self._needs_rest:
+            self.spans.append(Span(off_ns))
+
+    def _stands(self, t: int) -> None:
+        since_ns = self._anchor[0]
+        stood_ns = t - since_ns
+        self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
+        leg = self.open
+        if leg is not None and (stood_ns >= PARKED_NS or stood_ns >= self._rest_ns
+                                and self._long_enough(leg, since_ns)):
+            self._close(since_ns + self._rest_ns)
+
+    def _long_enough(self, leg: Span, until_ns: int) -> bool:
+        return 2 * (until_ns - leg.start_ns) >= self._longest_ns
+
+    def _close(self, stop_ns: int) -> None:
+        leg = self.open
+        if leg is not None and stop_ns > leg.start_ns:
+            leg.stop_ns = stop_ns
+        elif leg is not None:
+            self.spans.pop()
+
+
+def refusal(result: LegResult) -> Reason | None:
+    """Return why a leg that nobody asked for is dropped: what it is rejected for, None if not."""
+    if result.verdict is not Verdict.REJECTED:
+        return None
+    every = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
+    return next((r for r in every if r.code.gravity is Verdict.REJECTED),
+                Reason(Code.NO_METHOD, 'no method could be run'))
+
+
+def fold(legs, config: Config, carried: Carried | None = None) -> Carried | None:
+    """Return what is carried on with some legs taken in, by time."""
+    for leg in legs:
+        carried = combine([leg], config, carried).carried or carried
+    return carried

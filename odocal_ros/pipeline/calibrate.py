@@ -1,0 +1,129 @@
+"""
+The pipeline: one pure function from a leg to its result, one from results to a calibration.
+
+No state, no clock, no files: the live node and the replay call these and nothing else.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.mounting import with_axes
+from odocal_ros.calib.result import LegResult
+from odocal_ros.data.leg import Leg
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.pipeline.combination import combine
+from odocal_ros.pipeline.leg_run import leg_result, LegRun
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
+from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
+from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.settings.config import Config
+
+__all__ = ['calibrate', 'combine', 'faults']
+# of a leg that is not over
+NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
+
+
+def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
+              notes: tuple[Reason, ...] = (), holdout: bool = False,
+              progress: Callable[[float, str], None] | None = None) -> LegResult:
+    """
+    Take one leg from samples to result.
+
+    Parameters
+    ----------
+    leg : Leg
+        Raw samples between two marks, with pre-roll.
+    config : Config
+        Settings in force.
+    alignment : Alignment, optional
+        Used instead of the leg's own (a simulation puts errors in it).
+    notes : tuple of Reason
+        What the door knows of the data already (a truncated bag).
+    holdout : bool
+        Keep the last fifth of the distance back from the fit and check the correction on it.
+    progress : callable, optional
+        Called now and then with the share that is done, 0 to 1, and what is being done. Of a fit
+        nobody knows the end: its share is that of usual ones.
+
+    Returns
+    -------
+    LegResult; a leg that cannot be calibrated says why in its reasons.
+
+    """
+    inputs, reasons, run = _begun(leg, config, alignment, notes, holdout)
+    if run is None:
+        return leg_result(leg, inputs, reasons)
+    told = [*reasons]
+    run.progress = progress or run.progress
+    result = run.result()
+    back, scale = _reversed(result, inputs)
+    if not len(back):
+        return result
+    told += said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
+    again = LegRun(leg, inputs.mirrored(back), config, told, alignment, holdout)
+    again.progress = run.progress
+    return again.result()
+
+
+def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
+    """
+    Return what lowers the verdict of a leg, as ``calibrate`` has it, but for what methods say.
+
+    A leg that is not over may be given: what more of a drive cures is left out.
+    """
+    _, reasons, run = _begun(leg, config)
+    if run is not None:
+        run.examine()
+    return tuple(r for r in reasons
+                 if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
+
+
+def _begun(leg, config, alignment=None, notes=(), holdout=False):
+    """Return inputs, what they say (a list that the run adds to), and the run, None without."""
+    inputs, found = screen(leg, config)
+    reasons = [*notes, *found]
+    missing = _missing(leg, inputs)
+    if missing or not len(inputs.t_fix):
+        seen = {r.code for r in reasons}
+        return inputs, reasons + [r for r in missing if r.code not in seen], None
+    sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
+    reasons += with_axes(sanity, inputs)
+    if z_down:
+        inputs = turned_over(inputs)
+    if UNUSABLE & {r.code for r in sanity}:
+        return inputs, reasons, None
+    return inputs, reasons, LegRun(leg, inputs, config, reasons, alignment, holdout)
+
+
+def _reversed(result, inputs):
+    """Return where a counter without a sign shows in the smoother's slips, (m, 2) s, and scale."""
+    smoother = result.methods.get('smoother')
+    scale = smoother and smoother.estimates['scale_factor'].value
+    if not scale:
+        return (), None
+    return doubled(smoother.details['slips'], inputs.travel, scale), scale
+
+
+def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
+    """Return what a leg lacks for any method to be tried."""
+    missing = []
+    if leg.stop_ns <= leg.start_ns:
+        missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark'))
+    for n, least, code, what in (
+            (len(inputs.t_imu), 4, Code.NO_IMU, 'Imu'),
+            (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
+        if n < least:
+            missing.append(Reason(code, f'{n} usable {what} messages'))
+    if not len(inputs.t_fix) and len(leg.fix.stamp_ns):     # none sent is said already
+        missing.append(Reason(Code.FIXES_UNUSABLE, 'no usable fix'))
+    return missing
+
+
+def turned_over(inputs: Inputs) -> Inputs:
+    """Return inputs with a forward-right-down Imu read as what it is."""
+    C = matrix_from_rpy([np.pi, 0.0, 0.0])
+    return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)

@@ -1,0 +1,58 @@
+"""An odometer in coarse steps: what is said of it, and what it does to methods that add it up."""
+
+import numpy as np
+
+from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
+from odocal_ros.reasons import Code, Reason
+
+NAME = 'speed_truncation'
+ADDED_UP = ('two_point', 'wheels')      # methods whose travel is the sum of the speeds
+WORTH = 5e-4        # of the scale: half a step that is worth a word
+COARSE = 0.2        # m, a count that is
+
+
+def half_step(run) -> float:
+    """
+    Return how much of the way half a step of the speed is, 0.0 where there are no steps.
+
+    Speeds sent are too low by that on the mean where the sender truncates, by nothing where it
+    rounds, and the grid does not say which.
+    """
+    coarse = _coarse(run.inputs)
+    if coarse is None:
+        return 0.0
+    pick = (coarse.t >= 0.0) & (coarse.t <= run.inputs.t_stop) & (coarse.value != 0)
+    mean = float(np.abs(coarse.value[pick]).mean()) if pick.any() else 0.0
+    return coarse.step / 2 / mean if mean else 0.0
+
+
+def held_steps(method, run):
+    """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
+    size = half_step(run)
+    if method.name not in ADDED_UP or not size:
+        return method
+    return with_scale_error(method, run, NAME, dict.fromkeys(SCALES, size), shared=True)
+
+
+def coarse_reasons(run) -> list[Reason]:
+    """Say that speed or counts come in coarse steps."""
+    inputs, K, size = run.inputs, run.nominal or run.rough, half_step(run)
+    count = inputs.travel.quantum * K
+    if count > COARSE:
+        return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '
+                       'by up to that')]
+    if size < WORTH:
+        return []
+    coarse = _coarse(inputs)
+    metres = coarse.step * K
+    sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
+        else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
+    between = ', with values interpolated in between' if coarse.interpolated else ''
+    return [Reason(Code.SPEED_COARSE, f'the odometer sends whole steps of {sent}{between}: '
+                   f'what they add up to is {100 * size:.2g} % too little if they are truncated')]
+
+
+def _coarse(inputs):
+    """Return the grid of the speed, of one of two wheels, None where there is none."""
+    each = (inputs.travel, inputs.travel_left, inputs.travel_right)
+    return next((way.coarse for way in each if way is not None and way.coarse), None)

@@ -1,0 +1,190 @@
+"""Several legs to one calibration: which legs count, what is said of the whole."""
+
+from dataclasses import replace
+
+from odocal_ros.calib.carried import Carried
+from odocal_ros.calib.choice import choose, worth_saying
+from odocal_ros.calib.combine import combine_method
+from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.one_vehicle import unlike_legs
+from odocal_ros.calib.result import Calibration, Estimate, MethodResult
+from odocal_ros.calib.smoother.several import combine_legs
+from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config
+
+PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
+# the same of legs that are combined on their border: all of them may tell what none does
+ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
+             Code.YAW_FAR_FROM_NOMINAL}
+SMOOTHER = 'smoother'      # the method whose legs are combined on their border
+OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
+
+
+def combine(legs, config: Config, carried: Carried | None = None) -> Calibration:
+    """
+    Combine legs of one vehicle.
+
+    Parameters
+    ----------
+    legs : sequence of LegResult
+        At least one. Rejected legs are left out while any other is left, and named.
+    config : Config
+        Limits, frames.
+    carried : Carried, optional
+        What earlier legs tell of the vehicle.
+
+    Returns
+    -------
+    Calibration: what is published and written.
+
+    """
+    legs = tuple(legs)
+    good = [leg for leg in legs if leg.verdict is not Verdict.REJECTED]
+    twice = driven_twice(good)
+    good = [leg for leg in good if leg not in twice]
+    used = good or legs
+    names = dict.fromkeys(n for leg in used for n in leg.methods)
+    carried = carried if carried and _belongs(carried, used) else None
+    methods = {n: _combined(n, [
+        (leg.methods[n], leg.start_ns, i) for i, leg in enumerate(legs, 1)
+        if leg in used and n in leg.methods], config, carried) for n in names}
+    on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
+    estimates, giving = choose(methods, config.method)
+    reasons = _leg_reasons(legs, good, twice, giving, estimates, carried is not None)
+    if giving:
+        known = {(r.code, r.text) for r in reasons}
+        rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
+        nominal = nominal_scale(config, estimates['scale_factor'].unit)
+        own = [r for n in giving for r in worth_saying(methods[n].reasons, n, estimates)
+               if len(legs) == 1 or r.code in OF_ALL
+               or n in on_border and r.code in ON_BORDER]
+        reasons += [r for r in (*own, *judge(estimates, nominal, config))
+                    if (r.code, r.text) not in known and r.code not in rejecting]
+        reasons = list(dict.fromkeys(reasons))
+    reasons += unlike_legs([(i, leg) for i, leg in enumerate(legs, 1) if leg in good])
+    if len(good) < config.verdict.min_legs and good:
+        reasons.append(Reason(Code.MORE_LEGS_NEEDED, f'{len(good)} good leg'
+                              f'{"s" * (len(good) > 1)} of {config.verdict.min_legs}'))
+    if not giving and not any(r.code.gravity is Verdict.REJECTED for r in reasons):
+        reasons.append(Reason(Code.NO_METHOD, 'no method could be run'))
+    quaternion, rpy = _imu_rotation(estimates, used[0].C_bi)
+    return Calibration(tuple(reasons), estimates, methods, legs, quaternion, rpy,
+                       _carried_on(methods, good, carried))
+
+
+def _belongs(carried, legs):
+    """Tell whether legs are of the odometer of earlier ones, and driven after them."""
+    smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
+    return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
+        and min(leg.start_ns for leg in legs) > carried.last_ns
+
+
+def _carried_on(methods, good, before):
+    """Return what legs leave for those to come, None where they tell nothing."""
+    whole = methods.get(SMOOTHER)
+    times = [leg.start_ns for leg in good if SMOOTHER in leg.methods
+             and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
+    if whole is None or whole.border is None or not times:
+        return None
+    return Carried(whole.border, whole.estimates['scale_factor'].unit,
+                   before.first_ns if before else min(times), max(times),
+                   len(times) + (before.legs if before else 0))
+
+
+def driven_twice(legs):
+    """Return legs that share more than a tenth of their time with one before: not independent."""
+    twice = []
+    for i, leg in enumerate(legs):
+        for other in legs[:i]:
+            shared = min(leg.stop_ns, other.stop_ns) - max(leg.start_ns, other.start_ns)
+            if other not in twice and shared > 0.1 * (leg.stop_ns - leg.start_ns):
+                twice.append(leg)
+                break
+    return twice
+
+
+def together(name, results, times_ns, config, numbers=None, carried=None) -> MethodResult:
+    """
+    Return what a method says of several legs, and of those carried on where it can.
+
+    results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
+    """
+    if carried and all(r.border for r in results):
+        unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
+        results = [MethodResult(name, (), unknown, border=carried.border), *results]
+        numbers = [0, *(numbers or range(1, len(results)))]
+        times_ns = [carried.last_ns, *times_ns]
+    if len(results) > 1 and all(r.border for r in results):
+        return combine_legs(results, times_ns, config, numbers)
+    return combine_method(name, results)
+
+
+def _combined(name, driven, config, carried=None):
+    """
+    Return a method's combination of the legs where it is not rejected, of all if of none.
+
+    driven : list of (MethodResult, start_ns, number).
+    """
+    good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
+    results, times_ns, numbers = zip(*(good or driven), strict=True)
+    whole = together(name, list(results), times_ns, config, numbers, good and carried)
+    if good or len(results) == 1:
+        return whole
+    why = dict.fromkeys(r for one in results for r in one.reasons
+                        if r.code.gravity is Verdict.REJECTED)
+    return replace(whole, reasons=(*whole.reasons, *why))
+
+
+def _leg_reasons(legs, good, twice, giving, estimates, carried):
+    """Return the legs' own reasons, numbered where there are several."""
+    alone = len(legs) == 1 and not carried
+    reasons = []
+    for number, leg in enumerate(legs, 1):
+        prefix = f'leg {number}: ' if len(legs) > 1 else ''
+        methods = [leg.methods[n] for n in giving if n in leg.methods]
+        own = [*leg.reasons, *(r for m in methods
+                               for r in worth_saying(_further(m, leg), m.name, estimates)
+                               if alone or r.code not in PER_LEG
+                               and not (m.border and r.code in ON_BORDER))]
+        if leg in twice:
+            reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
+                                  'covers; not used'))
+        elif good and leg not in good:
+            every = [*leg.reasons, *(r for m in leg.methods.values() for r in _further(m, leg))]
+            reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
+                                  + _why(every)))
+        else:
+            refused = [m for m in methods if good and m.verdict is Verdict.REJECTED]
+            reasons += [Reason(Code.LEG_REJECTED, f'{prefix}not used for {m.name}: '
+                               + _why(m.reasons)) for m in refused]
+            reasons += [replace(r, text=prefix + r.text) for r in own
+                        if not any(r in m.reasons for m in refused)
+                        and not (refused and r.code is Code.METHOD_REJECTED)]
+    return reasons
+
+
+def _further(method, leg):
+    """Return a method's reasons without what rejects the leg already, in other words."""
+    known = {r.code for r in leg.reasons if r.code.gravity is Verdict.REJECTED}
+    return [r for r in method.reasons if r.code not in known]
+
+
+def _why(reasons):
+    """Return what rejects, in words."""
+    return '; '.join(dict.fromkeys(r.text for r in reasons
+                                   if r.code.gravity is Verdict.REJECTED))
+
+
+def _imu_rotation(estimates, C_bi):
+    """Return the static rotation base_link <- imu frame, x y z w and rpy, None without a yaw."""
+    yaw = estimates.get('yaw_mounting_angle')
+    pitch = estimates.get('pitch_mounting_angle')
+    if yaw is None or yaw.value is None:
+        return None, None
+    small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0,
+             yaw.value]
+    C_vi = matrix_from_rpy(small) @ C_bi
+    return (tuple(float(x) for x in quat_from_matrix(C_vi)),
+            tuple(float(x) for x in rpy_from_matrix(C_vi)))
+

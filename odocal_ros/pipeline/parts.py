@@ -1,0 +1,65 @@
+"""A leg whose Imu was silent for a while: cut there, its parts are legs of the same vehicle."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.result import LegResult
+from odocal_ros.data.leg import Leg, part_of
+from odocal_ros.nav.gaps import gaps_longer
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config
+
+SHORTEST_NS = 10**9              # of a part: less is lost with the gap
+MOST = 20                        # an Imu with more gaps stutters: its leg is rejected
+BEFORE_NS = 60 * 10**9           # what lies nearer to the start mark belongs to the leg
+
+
+def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
+    """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
+    stamps = leg.imu.stamp_ns
+    near = stamps[(stamps >= leg.start_ns - BEFORE_NS) & (stamps <= leg.stop_ns)]
+    if len(near) < 2:
+        return [leg]
+    # seconds since the mark hold a nanosecond; a gap up to a mark is one, too
+    t = np.unique(np.concatenate([near, [max(leg.start_ns, near.min()), leg.stop_ns]]))
+    gaps = np.round(gaps_longer((t - leg.start_ns) * 1e-9, limit_s) * 1e9).astype(np.int64) \
+        + leg.start_ns
+    if not 0 < len(gaps) < MOST:
+        return [leg]
+    begins = [None, *gaps[:, 1].tolist()]
+    ends = [*gaps[:, 0].tolist(), leg.stop_ns]
+    spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
+             for first, last in zip(begins, ends, strict=True)]
+    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= SHORTEST_NS] or [leg]
+
+
+def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
+                    holdout: bool = False, progress=None) -> list[LegResult]:
+    """
+    Take a leg from samples to results: one, or one of each part that carries.
+
+    Arguments as for ``calibrate``. Where no part carries, or a gap is not what rejects the leg,
+    the result is that of the whole.
+    """
+    parts = parts_of(leg, config.leg.max_gap)
+    results = []
+    for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
+        def told(share, stage, k=k):
+            if progress is not None:
+                progress((k + share) / len(parts), stage)
+        results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=told))
+    good = [one for one in results if one.verdict is not Verdict.REJECTED]
+    if not good:
+        return [calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)]
+    if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
+        return good      # the gap lay before the mark
+    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good)))) for one in good]
+
+
+def _cut(leg, one, count) -> Reason:
+    begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
+    return Reason(Code.LEG_CUT, f'this is the leg from {begin:.1f} to {end:.1f} s of '
+                  f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s'
+                  + (f', one of {count} parts' if count > 1 else ', the only part that carries'))

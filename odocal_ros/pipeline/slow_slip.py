@@ -1,0 +1,43 @@
+"""
+Slip of one wheel that a method's own model does not hold: its sigma is widened by the size known.
+
+A wheel that slips all along from some moment on, or loses air, leaves a scale between that of
+before and that of after; the fixes of the leg do not tell which of them is the vehicle's. A slip
+drawn out over tens of seconds is no step, and hides in the smoother's road noise.
+"""
+
+import numpy as np
+
+from odocal_ros.pipeline.scale_error import SCALES, WHEELS, with_scale_error
+
+NAME = 'slow_wheel_slip'
+STEP = 8.0          # s: method wheels takes a slip for a step, which a longer one is not
+
+
+def held(method, run):
+    """
+    Return a method's result with the slip of one wheel in its sigmas, as it was without any.
+
+    method : MethodResult.   run : LegRun, prepared.
+    """
+    slips = run.wheel_slips
+    # halves of the way half the change apart in the mean of the wheels: the mean is a quarter off
+    mean, wheel = abs(slips.change) / 4, abs(slips.change) / 2
+    if run.distance > 0:
+        part = float(np.linalg.norm(_not_held(method, slips))) / run.distance
+        mean, wheel = float(np.hypot(mean, part / 2)), float(np.hypot(wheel, part))
+    if not mean:
+        return method
+    return with_scale_error(method, run, NAME,
+                            dict.fromkeys(SCALES, mean) | dict.fromkeys(WHEELS, wheel))
+
+
+def _not_held(method, slips):
+    """Return the sizes, m, of the slips of one wheel that are not in the method's sigmas yet."""
+    long = slips.end - slips.begin > STEP
+    own = [(s['t'], s['t'] + s['duration']) for s in method.details.get('slips', ())]
+    seen = np.array([any(a <= end and b >= begin for a, b in own)
+                     for begin, end in zip(slips.begin, slips.end, strict=True)], bool)
+    # two_point sees only the ends: there the whole slip is in, however long it took
+    left = {'wheels': long, 'smoother': ~seen}.get(method.name, np.zeros(len(long), bool))
+    return slips.size[left]

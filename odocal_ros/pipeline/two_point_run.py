@@ -1,0 +1,176 @@
+"""The two-point method on one leg: its marks, its chord, and the checks of its track."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.budget import drift_sources
+from odocal_ros.calib.check import (
+    against_travel,
+    fix_noise_factor,
+    mismatch,
+    pieces,
+    steady,
+    stray,
+    track_check,
+)
+from odocal_ros.calib.judge import judge
+from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
+from odocal_ros.calib.slow_errors import marks_no_better
+from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
+from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.pipeline.tracks import as_configured, near, Paths
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import toward
+
+NAMES = ('start', 'end')
+
+
+def two_point(run):
+    """
+    Run the two-point method on a leg.
+
+    run : LegRun, aligned and reckoned; what is found of the data joins its reasons.
+
+    Returns
+    -------
+    MethodResult, and the antenna's Paths; None where refused.
+
+    """
+    return TwoPointRun(run).result()
+
+
+class TwoPointRun:
+    """The method on its way over one leg."""
+
+    def __init__(self, run):
+        self.run, self.inputs, self.config, self.track = run, run.inputs, run.config, run.track
+        self.reasons = []
+
+    def result(self):
+        """Return the method's result and the path."""
+        chord = self._chord()
+        refused = tuple(self.reasons) if chord is None else refusal(chord, self.run.rough)
+        if refused:
+            return unsolved(refused, self.inputs.scale_unit), None
+        f, _ = solve(chord, np.inf)
+        t_fix = self.inputs.t_fix
+        between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
+        between &= near(self.run, self.run.path(f), chord.start, between)
+        factor = np.ones(3)
+        if between.sum() >= 3:
+            chord, factor = self._judged(chord, f, between)
+        chord = replace(chord, slips=self._slips(chord, solve(chord, factor[2])[0]))
+        method = fit(chord, self.run.nominal, self.inputs.scale_unit, self.inputs.travel.quantum,
+                     factor, self.config)
+        self._reversed(chord)
+        method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
+            method.estimates, self.run.nominal, self.config)))
+        f = method.details['f']
+        return method, Paths(*map(self.run.path, (
+            as_configured(self.run, f, method.estimates), f)))
+
+    def _slips(self, chord, f):
+        """Return slips of the mean between the marks, s and m; name those not named already."""
+        if not self.inputs.felt:
+            return np.empty(0), np.empty(0)
+        t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
+                             toward(self.run.facing, f), self.run.origin.latitude,
+                             rounding(self.inputs.travel))
+        one = self.run.wheel_slips      # of one wheel: half of it goes into the mean
+        known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
+        held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
+        self.run.reasons += slip_reason(t[held], size[held])
+        inside = (one.t >= chord.start.t) & (one.t <= chord.end.t)
+        return np.append(t[held], one.t[inside]), np.append(size[held], one.size[inside] / 2)
+
+    def _chord(self):
+        """Return the chord between the marks, or None and say why."""
+        run, track, travel = self.run, self.track, self.inputs.travel
+        ends = (max(0.0, float(track.t[0]), float(travel.t[0])),
+                min(run.t_fit, float(track.t[-1]), float(travel.t[-1])))
+        path = run.path(np.array([run.rough, 0.0, 0.0]))
+        marks = [run.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True)]
+        for mark, name in zip(marks, NAMES, strict=True):
+            if mark is None:
+                self.reasons.append(Reason(Code.NO_FIX, f'no usable fix at the {name} mark'))
+        if None in marks:
+            return None
+        chord = Chord(track, run.origin, *marks, run.lever_b, self._velocity_change(marks),
+                      run.alignment, (self.inputs.doubt_t, self.inputs.doubt_sigma))
+        if not all(m.standing or m.surveyed for m in marks):     # the fit moves with the solution
+            if refusal(chord, run.rough):
+                return chord
+            path = run.path(solve(chord, np.inf)[0])
+            marks = [run.mark(m.t, path, name) for m, name in zip(marks, NAMES, strict=True)]
+            chord = replace(chord, start=marks[0], end=marks[1])
+        return chord
+
+    def _velocity_change(self, marks):
+        """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
+        change = np.zeros((3, 3))
+        for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
+            if not mark.standing:
+                low, high = np.clip([mark.t - 0.5, mark.t + 0.5], *self.track.t[[0, -1]])
+                rate = np.diff(np.interp([low, high], self.track.t, self.track.s))[0]
+                change += sign * self.track.C_nb_at(np.array(mark.t)) * rate / max(
+                    high - low, 1e-6)
+        return change
+
+    def _judged(self, chord, f, between):
+        """Return the chord with honest marks, the factor on fix sigmas; judge the track."""
+        run = self.run
+        fixes = self.inputs.t_fix[between], run.fixes_n[between]
+        drift_n = self._drift(chord, f)
+        drift = float(np.linalg.norm(drift_n))
+        residual = stray(run.path(f), chord.start, fixes)
+        up = stray(run.path(solve(chord)[0]), chord.start, fixes)
+        residual[:, 2] = up[:, 2]              # the pitch is no noise of heights
+        covariance = self.inputs.covariance_n[between]
+        factor = self._noise_factor(residual, covariance, drift, chord)
+        if np.isnan(self.config.gnss.correlation_time):     # else told, not judged
+            start, end = marks_no_better(
+                (chord.start, chord.end), run.spans, fixes[0], self.track.at(fixes[0]) @ f,
+                chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
+            chord = replace(chord, start=start, end=end)
+        f, _ = solve(chord, factor[2])
+        self._judge_track(chord, f, fixes, residual, drift)
+        return chord, factor
+
+    def _drift(self, chord, f):
+        """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
+        keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
+        D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
+        sources = drift_sources(self.track.t[keep], D, matrix_from_quat(self.track.q_nb[keep]),
+                                self.run.alignment)
+        # the bow of a pinned track is a quarter of what its free end would stray
+        return np.concatenate(list(sources.values()), axis=1) / 4
+
+    def _noise_factor(self, residual, covariance, drift, chord):
+        factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
+        if factor.max() > 1.0:
+            self.reasons.append(Reason(
+                Code.FIXES_NOISIER_THAN_SAID, 'the fixes stray from the track '
+                f'{factor[0]:.1f} times (in height {factor[2]:.1f} times) as far as their '
+                'covariance says'))
+        return factor
+
+    def _judge_track(self, chord, f, fixes, residual, drift):
+        """Compare the corrected track with the fixes: reversing, sanity."""
+        run, (t, p) = self.run, fixes
+        track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
+        keep, sigma = steady(residual, run.fix_sigma)
+        _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
+        found = against_travel(direction, course, stretch, self.config.odometer.signed)
+        run.reasons += found
+        if not found:
+            check = track_check(stray(run.path(f), chord.start, fixes), run.distance)
+            self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
+
+    def _reversed(self, chord):
+        """Say that the odometer counts down where nothing tells how the Imu is pushed."""
+        backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
+        if backwards and self.run.facing is None and not chord.alignment.heading_separable:
+            self.run.reasons.append(Reason(
+                Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive '
+                'counts mean backwards, or the vehicle was reversed all the way'))

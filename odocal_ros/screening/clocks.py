@@ -1,0 +1,91 @@
+"""Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
+
+import numpy as np
+
+from odocal_ros.data.samples import take
+from odocal_ros.reasons import Code, Reason
+
+LIMIT = 0.5          # s, between topics (design.md, Stamps)
+REACH = 1.0          # s, what a time_offset setting holds
+SET = 0.02           # s, a clock set by more than this is named
+NEIGHBOURS = 50      # rows each side that tell the lag there
+GAP = 5.0            # median intervals: a step of the stamps worth a look
+GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
+TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
+
+
+def judge_clocks(leg, offsets, labels) -> list[Reason]:
+    """
+    Compare each topic's clock with the Imu's, at equal times of arrival.
+
+    Parameters
+    ----------
+    leg : Leg
+        As it came.
+    offsets, labels : dict
+        Of each slot: s to be added to its stamps, and what people call it.
+
+    """
+    found = [r for slot in ('imu', *TOPICS) for r in _was_set(getattr(leg, slot), labels[slot],
+                                                              leg.start_ns)]
+    imu = _stamped(leg.imu)
+    if len(imu.stamp_ns) < 2:
+        return found
+    base = imu.received_ns[0]
+    arrival, lag = (imu.received_ns - base) * 1e-9, _lag(imu)
+    if not (np.diff(arrival) > 0).all():     # what queued arrives at once: its mean tells
+        arrival, group, count = np.unique(arrival, return_inverse=True, return_counts=True)
+        lag = np.bincount(group, lag) / count
+    for slot in TOPICS:
+        samples = _stamped(getattr(leg, slot))
+        if not len(samples.stamp_ns):
+            continue
+        there = np.interp((samples.received_ns - base) * 1e-9, arrival, lag)
+        ahead = float(np.median(there - _lag(samples))) + offsets[slot]
+        if abs(ahead) > LIMIT:
+            found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '
+                                's against the Imu stamps of the same moment'
+                                f'{_cure(slot, ahead)}'))
+    return found
+
+
+def _stamped(samples):
+    good = samples.stamp_ns > 0
+    return samples if good.all() else take(samples, good)
+
+
+def _lag(samples):
+    """Return arrival less stamp, s: (n,)."""
+    return (samples.received_ns - samples.stamp_ns) * 1e-9
+
+
+def _cure(slot, ahead):
+    """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
+    if slot not in GROUP or abs(ahead) > REACH:
+        return ''
+    return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
+
+
+def _was_set(samples, label, start_ns):
+    """
+    Name a clock that was set during the leg: its stamps step, arrivals do not, and so it stays.
+
+    Rows out of order or with a false stamp step there and back, and leave the lag as it was.
+    """
+    samples = _stamped(samples)
+    step = np.diff(samples.stamp_ns) * 1e-9
+    if len(step) < 3:
+        return []
+    odd = np.flatnonzero((step <= 0) | (step > max(GAP * np.median(step), SET)))
+    if not len(odd):
+        return []
+    first, last = int(odd[0]), int(odd[-1])
+    lag = _lag(samples)
+    before, after = lag[max(0, first + 1 - NEIGHBOURS):first + 1], lag[last + 1:][:NEIGHBOURS]
+    moved = float(np.median(before) - np.median(after))      # of the stamps, against arrival
+    at = int(odd[np.argmin(np.abs(step[odd] - moved))])
+    if abs(moved) < SET or abs(step[at] - moved) > 0.3 * abs(moved) + np.median(step):
+        return []
+    return [Reason(Code.CLOCKS_DIFFER, f'the {label} clock was set by {moved:+.3f} s during the '
+                   f'leg, at t = {(samples.stamp_ns[at] - start_ns) * 1e-9:.2f} s: its stamps '
+                   'before and after do not fit together')]

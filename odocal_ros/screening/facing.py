@@ -1,0 +1,162 @@
+"""
+Where an Imu faces in the vehicle: forward is where speeding up pushes it.
+
+All that follows takes the body frame for forward-left-up but for some degrees. Where it is a
+quarter or a half turn off, the odometer parts from the Imu at every start, as if wheels spun.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.samples import let_go
+from odocal_ros.nav.angles import wrap
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
+from odocal_ros.nav.integral import medians
+from odocal_ros.reasons import Code, Reason
+
+BIN = 1.0                      # s, accelerations are compared as means over it
+LEAST = 20                     # bins
+SOME = 64                      # bins worked on at a time
+SURE = np.deg2rad(10.0)        # 1 sigma of where the Imu faces, to speak of it
+GAIN = 0.5, 2.0                # of the push by what the wheels say: else it is something else
+FAR = np.deg2rad(75.0)         # off the nominal: no mounting is meant so
+NEAR = np.deg2rad(10.0)        # off what a method takes for forward: no matter for slips
+BACKWARDS = np.deg2rad(150.0)  # an odometer that runs the other way looks so too
+WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
+
+
+@dataclass(frozen=True, eq=False)
+class Pushes:
+    """
+    What pushes the Imu in the level plane, by bins of BIN seconds, complex: e1 + i e2.
+
+    e1, e2 : (3,) level axes, in the frame of the Imu's data.   force : (m,) m/s^2.
+    onward, inward : (m,) of the vehicle, real m/s^2: speeding up; to the left in turns.
+    near : (m,) whether the bin before it is the one just before.
+    """
+
+    e1: NDArray[np.float64]
+    e2: NDArray[np.float64]
+    force: NDArray[np.complex128]
+    onward: NDArray[np.float64]
+    inward: NDArray[np.float64]
+    near: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Yaw mounting angle by the pushes, rad, and its sigma."""
+
+    yaw: float
+    sigma: float
+
+
+def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
+    """
+    Return the pushes of a drive, None where it is too short.
+
+    Parameters
+    ----------
+    t, w, f : (n,), (n, 3), (n, 3) arrays
+        Times, s, turn rate, rad/s, and specific force, in any one frame fixed to the Imu.
+    up : (3,)
+        Unit vector, as gravity shows.
+    travel : Travel
+        Odometer; positive is taken as forward.
+    metres_per_unit : float
+        Its rough scale.
+
+    """
+    t0, t1 = max(t[0], travel.t[0]) + BIN, min(t[-1], travel.t[-1]) - BIN
+    if t1 - t0 < LEAST * BIN:
+        return None
+    edges = np.arange(t0, t1, BIN)
+    first = np.searchsorted(t, edges, side='right')
+    count = np.diff(first)
+    means = np.empty((len(count), 4))
+    for bins in (slice(k, k + SOME) for k in range(0, len(count), SOME)):
+        rows = slice(first[bins.start], first[bins.start + len(count[bins])])
+        cell = np.repeat(np.arange(len(count[bins])), count[bins])
+        for k, column in enumerate((*f[rows].T, w[rows] @ up)):
+            means[bins, k] = np.bincount(cell, column, len(count[bins]))
+        let_go(f, w)
+    means /= np.maximum(count, 1)[:, None]
+    f, turn_rate = means[:, :3].copy(), means[:, 3].copy()
+    speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
+    middle = (edges[:-1] + edges[1:]) / 2
+    onward = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
+        * metres_per_unit / BIN**2
+    e1 = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(up, e1)
+    use = np.flatnonzero(count)
+    return Pushes(e1, e2, (f @ e1 + 1j * (f @ e2))[use], onward[use], (speed * turn_rate)[use],
+                  np.diff(use, prepend=-9) == 1)
+
+
+def facing(t, w_b, f_b, travel, metres_per_unit) -> Facing | None:
+    """
+    Return where the Imu faces, None where the drive does not show it.
+
+    Changes from bin to bin are compared, so that a slope, which changes slowly, is no push. The
+    turns have a factor of their own: a gyro of the wrong sign does not turn the answer.
+
+    Parameters
+    ----------
+    t, w_b, f_b : (n,), (n, 3), (n, 3) arrays
+        Times, s, turn rate, rad/s, and specific force, m/s^2, in the configured body frame.
+    travel, metres_per_unit
+        As for ``pushes``.
+
+    """
+    mean = medians(f_b)
+    size = float(np.linalg.norm(mean))
+    found = pushes(t, w_b, f_b, mean / size, travel, metres_per_unit) if size else None
+    if found is None:
+        return None
+    force, onward, inward = (np.diff(x)[found.near[1:]]
+                             for x in (found.force, found.onward, found.inward))
+    A = np.stack([onward, 1j * inward], -1)
+    normal = A.conj().T @ A
+    if len(A) < LEAST or np.linalg.cond(normal) > 1e9:
+        return None
+    inverse = np.linalg.inv(normal)
+    gain = inverse @ (A.conj().T @ force)
+    rest = force - A @ gain
+    # only half of the residual lies across, only every other change (they share bins) is a draw
+    variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
+    sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
+    if sigma > SURE or not GAIN[0] < abs(gain[0]) < GAIN[1]:
+        return None
+    forward = gain[0].real * found.e1 + gain[0].imag * found.e2
+    return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
+
+
+def toward(found: Facing | None, f):
+    """Return scale times forward axis, (3,), turned to where the Imu faces if that is far off."""
+    yaw, pitch = mounting_from_forward(f)
+    if found is None or abs(float(wrap(found.yaw - yaw))) < max(NEAR, 3 * found.sigma):
+        return f
+    return np.linalg.norm(f) * forward_b(found.yaw, pitch)
+
+
+def axes_reasons(found: Facing | None, nominal_yaw) -> tuple[Reason, ...]:
+    """Return IMU_AXES, or ODOMETER_REVERSED, where the Imu faces far from its nominal yaw, rad."""
+    if found is None:
+        return ()
+    nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
+    off = abs(float(wrap(found.yaw - nominal)))
+    way = WAYS[round(found.yaw / (np.pi / 2)) % 4]
+    seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
+    if nominal:
+        seen += f', nominal {np.rad2deg(nominal):+.0f}'
+    if off > BACKWARDS:
+        return (Reason(Code.ODOMETER_REVERSED, f'speeding up pushes the Imu {way} (yaw mounting '
+                       f'{seen}): positive counts mean backwards, the Imu faces the other way, or '
+                       'all was driven in reverse and the counter does not tell'),)
+    if off < FAR + 3 * found.sigma:
+        return ()
+    return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu {way} (yaw mounting {seen}): the '
+                   'body frame is not forward-left-up'),)

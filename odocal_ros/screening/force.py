@@ -1,0 +1,61 @@
+"""
+An Imu that sends turn rates only: a car's yaw rate on the bus, the gyro of a robot.
+
+The ground is then taken as level and the Imu as upright: gravity stands where an accelerometer
+would show it, so that all that follows needs no other case, and what that may be wrong by goes
+into level and scale.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.nav.integral import chunks
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import G
+
+TILT = 0.05          # rad of road and mounting, 1 sigma of each axis
+HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, which make a way longer
+NAME = 'hills'
+
+
+def felt(f_i) -> bool:
+    """Return whether any of (n, 3) forces as sent is one, or none has come yet."""
+    if not len(f_i):
+        return True
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        return any(not (np.isnan(f_i[rows]) | (f_i[rows] == 0)).all()
+                   for rows in chunks(len(f_i), f_i))
+
+
+def with_force(leg, config):
+    """
+    Return a leg whose Imu, where it sends no force, stands upright on level ground; and why.
+
+    None is sent where each value is zero or NaN (as REP-145's covariance[0] of -1 is read).
+    """
+    f_i = leg.imu.f_i
+    if felt(f_i):
+        return leg, ()
+    up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
+    gravity_i = np.tile(up_i * G / (config.imu.accel_scale or 1.0), (len(f_i), 1))
+    return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
+        Code.NO_ACCELEROMETER, 'the Imu sends turn rates but no acceleration: the scale is told '
+        'by gyro, counter and fixes, on ground taken as level; yaw and pitch mounting angle need '
+        'an accelerometer (yaw: or a heading from outside)'),)
+
+
+def upright(method, run):
+    """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
+    if run.inputs.felt:
+        return method
+    method = with_scale_error(method, run, NAME, dict.fromkeys(SCALES, HILLS))
+    # what NO_ACCELEROMETER says of the angles, with another remedy
+    said = {Code.PITCH_NOT_DETERMINED} | (
+        set() if run.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
+    return replace(
+        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
+            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
+            for name, e in method.estimates.items()})

@@ -1,0 +1,108 @@
+"""
+Odometer rows that came late: a pause, then rows in a burst that catch up.
+
+A counter without a header is stamped on the way: what holds a message up (a serial line, a busy
+machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm shows
+in the rows that came soonest; the others are put on it where the counts bear that out, else where
+the travel on both sides of a burst has them.
+"""
+
+import numpy as np
+
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.odometer_care import counter_steps
+
+WINDOW = 5.0        # s, within which some row comes on time
+LEAST = 0.004       # s of lateness, and
+SHARE = 0.1         # of an interval, that matter
+NAMED = 0.02        # s, and
+NAMED_SHARE = 0.3   # of an interval, that are worth a word
+SPAN = 5.0          # s over which the interval is taken
+STEADY = 0.005      # by which it is another than the median: rows are lost
+EVEN = 0.3          # share of the intervals that are within a quarter of the median
+BESIDE = 5          # rows to either side that tell where a row should be
+FITS = 0.4          # of what rows are off as sent
+COUNTS = 2.5        # by which a row may be off: rounding
+SHORT = 1.0         # s within which travel is as good as even
+FAST = 3.0          # times the speed beside: no wheel, so rows that catch up
+
+
+def on_time(samples, t, form, found, name='odometer'):
+    """
+    Return when rows were taken: (n,) s, late ones put back.
+
+    samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list that findings join.
+    """
+    if form.quantity == 'rate' or len(t) < 4 * BESIDE:
+        return t       # what a late speed adds comes out right by itself
+    step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
+            else samples.value[1:].astype(float))
+    travel = np.concatenate([[0.0], np.cumsum(step)])
+    whole = np.issubdtype(samples.value.dtype, np.integer)
+    usual = interval(t)
+    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < EVEN:
+        return t
+    true = _put_back(t, travel, usual, COUNTS if whole else 0.0)
+    late = t - true
+    named = late > max(NAMED, NAMED_SHARE * usual)
+    if named.any():
+        worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
+        found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
+                            f'came late, {max(times, 1)} time{"s" * (times > 1)}, by up to '
+                            f'{late[worst]:.3g} s at t = {t[worst]:.2f} s; put where they belong, '
+                            'between the rows beside'))
+    return true
+
+
+def interval(t):
+    """Return the sender's interval, s, lost and late rows notwithstanding."""
+    usual = float(np.median(np.diff(t)))
+    n = min(max(int(SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
+    mean = float(np.median(t[n:] - t[:-n])) / n
+    return mean if abs(mean - usual) < STEADY * usual else usual
+
+
+def _put_back(t, travel, usual, least):
+    """Return times with late rows put back."""
+    from scipy.ndimage import minimum_filter1d
+    rows = usual * np.arange(len(t))
+    ahead = int(WINDOW / usual) + 1
+    # those to come, not those before: a lost row sets the rhythm back
+    even = rows + minimum_filter1d(t - rows, ahead, origin=-(ahead // 2), mode='nearest')
+    late = t - even > max(LEAST, SHARE * usual)
+    off_sent, off_even = _off(t, travel), _off(even, travel)
+    true = t.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        about = slice(max(begin - BESIDE, 0), end + BESIDE)
+        sent, put = off_sent[about], off_even[about]
+        if np.abs(put).max() <= least or np.linalg.norm(put) < FITS * np.linalg.norm(sent):
+            true[begin:end] = even[begin:end]
+        elif begin > 0 and end < len(t):
+            true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
+    floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
+    return np.where((true > floor) | ~late, true, np.minimum(floor, t))
+
+
+def _off(t, travel):
+    """Return by how much each row's travel is off that of the rows some way before and after."""
+    k = np.arange(len(t))
+    before, after = np.maximum(k - BESIDE, 0), np.minimum(k + BESIDE, len(t) - 1)
+    share = (t - t[before]) / np.maximum(t[after] - t[before], 1e-9)
+    return travel - travel[before] - share * (travel[after] - travel[before])
+
+
+def _by_travel(t, travel, a, b, usual):
+    """Return the times of the rows between a and b, as sent where they do not catch up."""
+    rows = np.arange(a + 1, b)
+
+    def speed(first, last):
+        first, last = max(first, 0), min(last, len(t) - 1)
+        return abs(travel[last] - travel[first]) / max(t[last] - t[first], usual / 10)
+
+    beside = max(speed(a - BESIDE, a), speed(b, b + BESIDE))
+    if t[b] - t[a] > SHORT or not beside or speed(a + 1, b) < FAST * beside:
+        return t[rows]
+    # some rows of the burst are lost, so that its rhythm tells nothing
+    by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])
+    return np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))

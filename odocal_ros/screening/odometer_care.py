@@ -1,0 +1,170 @@
+"""
+Odometer rows that do not say what they seem to: false rows, hung counters, lost increments.
+
+False rows are dropped where the counter goes on beside them as if nothing had been; what cannot
+be known of the travel (a reset, a gap of speeds or increments) becomes a doubt of the budget.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.samples import take
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.glitches import speed_glitches
+
+ENOUGH = 20          # steps below which nothing is judged
+JUMP = 5.0           # times the 95th percentile of the moving rate: no motion
+EXCURSION = 30.0     # s after which a counter that comes back is no longer taken for the same
+MOST_JUMPS = 200     # beyond it the counter is not mended, but judged by the check
+GAP = 2.5            # median intervals: a message or more is missing
+BESIDE = 5           # steps beside a jump or a gap that tell the speed there
+MORE = 1.5           # times what rows tell: as long a way at speeds sent as zero is a dead band's
+LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
+
+
+def mended(samples, t, form, found, name='odometer'):
+    """Return rows without the false ones, increments with the false ones smoothed."""
+    if form.quantity == 'cumulative':
+        false = false_counts(t, samples.value, form.modulus)
+        if false.any():
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
+                                'counts hang or jump away and come back, first at '
+                                f't = {t[np.argmax(false)]:.2f} s; dropped'))
+        return take(samples, ~false), t[~false]
+    if form.quantity == 'increment':
+        false = speed_glitches(t, samples.value.astype(float))
+        if false.any():
+            good = np.interp(t, t[~false], samples.value[~false].astype(float))
+            kept = np.where(false, good, samples.value).astype(samples.value.dtype)
+            samples = replace(samples, value=kept)
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
+                                'increments stand alone far from their neighbours, first at '
+                                f't = {t[np.argmax(false)]:.2f} s; taken like those beside'))
+    return samples, t
+
+
+def counter_steps(value, modulus):
+    """Return the steps of a counter, rollover undone, as floats: (n,) to (n - 1,)."""
+    step = np.diff(value)
+    if np.issubdtype(value.dtype, np.integer) and 0 < modulus < 2**63:
+        half = modulus // 2
+        step = (step + half) % modulus - half
+    return step.astype(float)
+
+
+def false_counts(t, value, modulus):
+    """
+    Tell which rows of a counter are false: hung before a jump that catches up, or away and back.
+
+    t : (n,) s.   value : (n,) as sent.   Returns (n,) bool.
+    """
+    false = np.zeros(len(t), bool)
+    step = counter_steps(value, modulus)
+    if len(step) < ENOUGH or not step.any():
+        return false
+    dt = np.diff(t)
+    rate = step / np.maximum(dt, np.median(dt))
+    size = np.abs(rate)
+    top = float(np.percentile(size[size > 0], 95))
+    jumps = np.flatnonzero(size > max(JUMP * top, 3 / np.median(dt)))
+    if len(jumps) > MOST_JUMPS:
+        return false
+    done = -1
+    for j in jumps:
+        if j <= done:
+            continue
+        stall = _stall(step, j)
+        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= EXCURSION]
+        for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
+            net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
+            if _goes_on(t, net, rate, a, b) or a == j and _comes_back(t, net, step, a, b, top):
+                false[a + 1:b + 1] = True
+                done = b
+                break
+    return false
+
+
+def _goes_on(t, net, rate, a, b):
+    """Tell whether the counter after step b goes on from before step a at speeds as beside."""
+    length = t[b + 1] - t[a]
+    ways = [_usual(r) * length for r in (rate[max(0, a - BESIDE):a], rate[b + 1:b + 1 + BESIDE])]
+    slack = LOOSE * max(abs(w) for w in ways) + 3
+    return bool(min(ways) - slack <= net <= max(ways) + slack)
+
+
+def _comes_back(t, net, step, a, b, top):
+    """Tell whether a far jump at step a is taken back at step b, but for what may be motion."""
+    reach = 1.2 * top * (t[b + 1] - t[a]) + 3
+    return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
+
+
+def doubted(way: Travel, value, form):
+    """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
+    none = np.empty(0)
+    if len(way.t) < ENOUGH:
+        return way, none, none
+    dt, step = np.diff(way.t), np.diff(way.s)
+    usual = np.median(dt)
+    rate = step / np.maximum(dt, usual)
+    if form.quantity == 'cumulative':
+        sent = counter_steps(value, form.modulus)
+        odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
+        # a reset: of the travel since the last count nothing is known but the speeds beside
+        stall = [_stall(step, k) for k in odd]
+        lost = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
+                * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
+        return way, way.t[odd], np.array(lost) / np.sqrt(3)
+    odd = np.flatnonzero(dt > max(GAP * usual, 0.2))
+    before = np.array([_usual(rate[max(0, k - BESIDE):k]) for k in odd])
+    after = np.array([_usual(rate[k + 1:k + 1 + BESIDE]) for k in odd])
+    missing = dt[odd] - (usual if form.quantity == 'increment' else 0.0)
+    if form.quantity == 'increment' and len(odd):
+        step = step.copy()
+        step[odd] += (before + after) / 2 * missing
+        way = Travel(way.t, np.concatenate([[0.0], np.cumsum(step)]), way.quantum)
+    # speeds within a gap: anything between those beside it, and more the longer it is
+    spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
+        np.abs(before), np.abs(after)) / np.sqrt(3)
+    lost, sigma = way.t[odd], spread * missing
+    if form.quantity == 'rate':
+        hidden = np.copysign(_hidden(way, value), step)
+        at = np.flatnonzero(hidden)
+        way = replace(way, s=way.s + np.concatenate([[0.0], np.cumsum(hidden)]))
+        lost, sigma = np.r_[lost, way.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
+    return way, lost, sigma
+
+
+def _hidden(way, value):
+    """
+    Return how far the wheel rolls in each step at speeds that are sent as zero: (n - 1,).
+
+    In a dead band the speed goes on to zero, or comes from there, as it changed beside: it rolls
+    by v^2 / 2a, of which the mean of the two rows has half a step. A robot in a yard that stops
+    every ten metres loses per cent by it.
+    """
+    hidden, size = np.zeros(len(value) - 1), np.abs(value)
+    least = 2 * way.coarse.step if way.coarse else 0.0
+    for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
+        stops = size[edge + 1] == 0
+        rows = np.arange(edge, edge - BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
+                                                                          + BESIDE)
+        rows = rows[(rows >= 0) & (rows < len(size))]
+        v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
+        took = abs(way.t[rows[-1]] - way.t[rows[0]])
+        if v > least and change > 0 and took > 0:
+            told = v * (way.t[edge + 1] - way.t[edge]) / 2
+            whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
+            hidden[edge] = whole - told if whole > MORE * told else 0.0
+    return hidden
+
+
+def _stall(step, j):
+    """Return the first of the steps of zero that end at step j, j where there are none."""
+    moves = np.flatnonzero(step[:j])
+    return int(moves[-1]) + 1 if len(moves) else 0
+
+
+def _usual(rate):
+    return float(np.median(rate)) if len(rate) else 0.0

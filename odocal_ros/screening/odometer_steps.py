@@ -1,0 +1,39 @@
+"""An odometer's rows as steps of travel, as they come: rough, for what cannot wait."""
+
+import numpy as np
+
+from odocal_ros.data.samples import OdometerForm
+
+STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
+
+
+class Steps:
+    """Rows to steps, in odometer units; ``nav.odometer.travel`` does it with all rows at hand."""
+
+    def __init__(self, form: OdometerForm) -> None:
+        self.form = form
+        self._last: tuple | None = None
+
+    @property
+    def still(self) -> float:
+        """Return the travel up to which one that stands may seem to move."""
+        return STILL.get(self.form.scale_unit, 0.02)
+
+    def of(self, block):
+        """Return the step of each row since the row before, its stamp, ns, and its duration, s."""
+        stamps, values = block.stamp_ns, block.value
+        if self._last is not None:
+            stamps = np.r_[self._last[0], stamps]
+            values = np.r_[self._last[1], values]
+        self._last = (block.stamp_ns[-1:], block.value[-1:])
+        seconds = np.diff(stamps) * 1e-9
+        if self.form.quantity == 'increment':
+            steps = values[1:]
+        elif self.form.quantity == 'rate':
+            steps = values[1:] * seconds
+        else:
+            steps = np.diff(values)
+            if 0 < self.form.modulus < 2**63:
+                half = self.form.modulus // 2
+                steps = (steps + half) % self.form.modulus - half
+        return np.asarray(steps, dtype=np.float64), stamps[1:], seconds

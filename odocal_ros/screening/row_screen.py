@@ -1,0 +1,145 @@
+"""Rows of one topic made usable: finite, beyond no sensor, stamps that rise, no single spikes."""
+
+from bisect import bisect_left
+
+import numpy as np
+
+from odocal_ros.data.samples import take
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.glitches import (
+    about_clumps,
+    beyond,
+    DAMAGED,
+    imu_glitches,
+    SEVERAL,
+    speed_glitches,
+)
+
+LABEL = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+         'fix_velocity': 'fix velocity', 'heading': 'heading'}
+NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
+           'fix': Code.FIXES_UNUSABLE}
+
+
+def usable_rows(slot, leg, config, offset, found):
+    """
+    Return the rows of a topic that can be used, and their times from the start mark, s: (n,).
+
+    offset : s, added to the stamps.   found : takes what is wrong with the others.
+    """
+    sent = getattr(leg, slot)
+    good, wild = _finite(sent, slot, leg, found)
+    clean = sent if good.all() else take(sent, good)
+    order = _rising(clean, slot, leg, found)
+    clean = clean if order is None else take(clean, order)
+    t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset
+    form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
+    spikes = _spikes(slot, clean, t, form, config)
+    if spikes.any():
+        found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
+                            f'{LABEL[slot]} messages stand alone far from their neighbours, '
+                            f'first at t = {t[np.argmax(spikes)]:.2f} s; dropped'))
+        if not about_clumps(wild).any():        # else what is about them is left out already
+            at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
+            wild[at[spikes]] = True
+            spikes |= _damaged(wild, good, slot, found)[at]
+        clean, t = take(clean, ~spikes), t[~spikes]
+    if len(sent.stamp_ns) and not len(t) and slot in NOTHING:
+        found.append(Reason(NOTHING[slot], f'none of the {len(sent.stamp_ns)} {LABEL[slot]} '
+                            'messages is usable'))
+    return clean, t
+
+
+def _spikes(slot, samples, t, form, config):
+    if slot == 'imu':
+        return imu_glitches(t, samples.w_i, samples.f_i, config.imu)
+    if slot in ('odometer', 'odometer_right') and form.quantity == 'rate':
+        return speed_glitches(t, samples.value.astype(float))
+    return np.zeros(len(t), bool)
+
+
+def _where(samples, index, leg) -> str:
+    """Say where a row is, in seconds from the start mark (by arrival where it has no stamp)."""
+    stamp = samples.stamp_ns[index] if samples.stamp_ns[index] > 0 else samples.received_ns[index]
+    return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
+
+
+def _finite(samples, slot, leg, found):
+    """Tell which rows have a stamp and what a row needs, and which are beyond any sensor."""
+    needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
+    if slot in ('fix_velocity', 'heading'):
+        needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
+    stamped = samples.stamp_ns > 0
+    finite, wild = np.ones(len(stamped), bool), np.zeros(len(stamped), bool)
+    for name in needed:
+        column = getattr(samples, name)
+        odd = beyond(name, column)
+        finite &= ~odd
+        wild[odd] |= np.isfinite(column[odd]).all(axis=tuple(range(1, column.ndim)))
+    if slot == 'fix':
+        finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
+    for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
+                      (stamped & ~finite, 'hold NaN, Inf or a value beyond any sensor')):
+        if bad.any():
+            first = int(np.argmax(bad))
+            found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
+                                f'{LABEL[slot]} messages {what}, first at '
+                                f'{_where(samples, first, leg)}; dropped'))
+    good = stamped & finite
+    suspect = _damaged(wild, good, slot, found, min(DAMAGED * len(wild), SEVERAL))
+    return good & ~suspect, wild
+
+
+def _damaged(wild, good, slot, found, most=np.inf):
+    """Tell which rows are about clumps of wild ones, and say so: or of more than so many."""
+    suspect = about_clumps(wild)
+    if suspect.any() or wild.sum() > most:
+        found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
+                            'messages hold values beyond any sensor, or far from those beside '
+                            f'them; {int((suspect & good & ~wild).sum())} more about them were '
+                            'dropped too'))
+    return suspect
+
+
+def _rising(samples, slot, leg, found):
+    """Return which rows to keep, the most whose stamps rise strictly; None for all."""
+    stamp = samples.stamp_ns
+    step = np.diff(stamp)
+    if (step > 0).all():
+        return None
+    keep = _longest_rising(stamp)
+    same, back = int((step == 0).sum()), int((step < 0).sum())
+    first = int(np.argmax(step <= 0)) + 1
+    what = [f'{same} repeat the stamp before them'] * (same > 0)
+    what += [f'{back} time{"s" * (back > 1)} the stamps step back (by up to '
+             f'{-step.min() * 1e-9:.3g} s)'] * (back > 0)
+    found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not rise: '
+                        f'{" and ".join(what)}, first at {_where(samples, first, leg)}; '
+                        f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
+    return keep
+
+
+def _longest_rising(stamp):
+    """
+    Return the indices of a longest strictly rising subsequence (patience sorting).
+
+    Every row loses its place only to a larger number of others: one glitch into the future costs
+    one row, a clock stepped back costs the shorter side.
+    """
+    tails: list[int] = []
+    ends: list[int] = []
+    before = np.full(len(stamp), -1)
+    for i, value in enumerate(stamp.tolist()):
+        k = bisect_left(tails, value)
+        if k:
+            before[i] = ends[k - 1]
+        if k == len(tails):
+            tails.append(value)
+            ends.append(i)
+        else:
+            tails[k], ends[k] = value, i
+    keep, i = [], ends[-1]
+    while i >= 0:
+        keep.append(i)
+        i = int(before[i])
+    return np.array(keep[::-1])

@@ -1,0 +1,182 @@
+"""
+Wheels that do not count as wheels: one dead or hung, one that counts against the other.
+
+These are seen by the wheels themselves and the gyro, before any attitude or scale is known: with
+them the mean of both wheels is no travel, and whatever rests on it is wrong.
+"""
+
+import numpy as np
+
+from odocal_ros.nav.integral import integral_at
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.wheel_pair import pair, robust_fit, runs, TUKEY
+
+CELL = 0.5            # s
+STILL = 0.02          # of the other wheel's way: what still counts as not moving
+ROLLS = 0.1           # of the top speed, from where on a wheel rolls for certain
+HANG = 2.0            # s without a count while the other wheel rolls; shorter is slip
+COUNTS = 8            # the other wheel makes meanwhile, at least
+AGAINST = 1.5         # s of counting against the other wheel
+SURE = 5.0            # sigmas
+BIAS = 0.02           # of the top speed: what a gyro bias times the track width may be, 1 sigma
+SIDES = ('left', 'right')
+
+
+def broken_wheels(left, right, imu, between) -> tuple[Reason, ...]:
+    """
+    Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
+
+    Parameters
+    ----------
+    left, right : Travel
+        Of the wheels, scale units.
+    imu : (t, w_b, f_b)
+        (n,) s, (n, 3) rad/s, (n, 3) m/s^2, bias and all.
+    between : (2,)
+        The marks, s.
+
+    Returns
+    -------
+    Reasons, at most one of each code.
+
+    """
+    two = pair(left, right, imu, between, CELL)
+    if two is None:
+        return ()
+    steps = np.diff([two.left, two.right])          # (2, n)
+    way = np.abs(steps).sum(axis=1)
+    weak = int(np.argmin(way))
+    if way.max() <= COUNTS * two.quantum or way.max() == 0.0:
+        return ()                                   # neither moves: the odometer is still
+    if way[weak] <= STILL * way.max():
+        return (Reason(Code.WHEEL_DEAD, f'the {SIDES[weak]} wheel does not count '
+                       f'({way[weak]:.6g} against {way.max():.6g} of the '
+                       f'{SIDES[1 - weak]} one): the mean of both is no travel'),)
+    if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
+        return (Reason(Code.WHEEL_DEAD, 'the right wheel counts what the left one counts, to the '
+                       'last digit: one counter is sent twice'),)
+    held = [_held(two, steps, k) for k in (0, 1)]
+    hung = np.any(held, axis=0)
+    turn = np.diff(two.turn)
+    keep = two.known & ~hung & _rolling(steps, two.quantum).any(axis=0)
+    if keep.sum() < 10:
+        return _dead(two, steps, held)
+    A = np.stack([steps[0], turn, np.full(len(turn), CELL)], -1)
+    x, covariance = _line(A[keep], steps[1][keep], _floor(two, steps))
+    held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
+    return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0],
+                                               imu)
+
+
+def _line(A, y, floor):
+    """
+    Return what left wheel, turn and time make of the right wheel, and the covariance.
+
+    Two starts, since the faulty cells may be many: least squares, and the usual ratio of the
+    wheels without a turn; the one that leaves fewer cells over.
+    """
+    rolls = A[:, 0] != 0
+    usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
+    drift = BIAS * float(np.percentile(np.abs(y), 95)) / CELL
+    fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
+            for start in (None, (usual, 0.0, 0.0))]
+    scale = TUKEY * min(sigma for _, _, sigma in fits)
+    left_over = [np.minimum(1.0, ((y - A @ x) / scale)**2).sum() for x, _, _ in fits]
+    return fits[int(np.argmin(left_over))][:2]
+
+
+def _floor(two, steps):
+    return 0.3 * two.quantum + 1e-4 * float(np.median(np.abs(steps)))
+
+
+def _rolling(steps, quantum):
+    """Tell where each wheel rolls for certain: (2, n)."""
+    top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
+    return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
+
+
+def _held(two, steps, k):
+    """Tell in which cells wheel k stands, for HANG or longer, while the other one rolls."""
+    own, other = np.abs(steps[k]), np.abs(steps[1 - k])
+    still = two.known & (own <= STILL * other) & _rolling(steps, two.quantum)[1 - k]
+    for a, b in runs(still):
+        if (b - a) * CELL < HANG or other[a:b].sum() < COUNTS * two.quantum:
+            still[a:b] = False
+    return still
+
+
+def _not_pivoting(held, steps, A, x, k):
+    """Return the cells in which the wheel should have rolled, not been turned about."""
+    held = held.copy()
+    ratio, turn_part = x[0], A[:, 1:] @ x[1:]
+    for a, b in runs(held):
+        if k == 1:
+            there, alone = (A[a:b] @ x).sum(), ratio * steps[0][a:b].sum()
+        else:
+            there, alone = steps[1][a:b].sum() - turn_part[a:b].sum(), steps[1][a:b].sum()
+        if abs(there) < abs(alone) / 2:
+            held[a:b] = False
+    return held
+
+
+def _dead(two, steps, held):
+    """Return WHEEL_DEAD with where, for the wheel that stands longer."""
+    k = int(held[1].sum() > held[0].sum())
+    spans = runs(held[k])
+    if not len(spans):
+        return ()
+    first, last = spans[0][0], spans[-1][1]
+    other = np.abs(steps[1 - k])
+    lost = other[held[k]].sum()
+    after = np.abs(steps[k][last:]).sum() <= STILL * other[last:].sum() + two.quantum
+    within = np.abs(steps[k][first:]).sum() <= STILL * other[first:].sum() + two.quantum
+    begin = two.t[first]
+    if within:
+        where = f'from t = {begin:.1f} s on'
+    else:
+        where = f'{len(spans)} time{"s" * (len(spans) > 1)}, first from t = {begin:.1f} s for ' \
+                f'{(spans[0][1] - first) * CELL:.1f} s'
+        where += f', at last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
+            after and len(spans) > 1)
+    return (Reason(Code.WHEEL_DEAD, f'the {SIDES[k]} wheel does not count {where} while the '
+                   f'{SIDES[1 - k]} one goes on by {lost:.6g}: the mean of both is no travel'),)
+
+
+def _reversed(two, steps, expected, ratio, variance, imu):
+    """Return WHEEL_REVERSED where the right wheel goes against what left wheel and gyro say."""
+    if ratio < -SURE * np.sqrt(variance) and ratio < -0.1:
+        k = _against_imu(two, steps, imu)
+        which = (f'the {SIDES[k]} wheel counts down when the vehicle drives forward, the '
+                 f'{SIDES[1 - k]} one up' if k is not None else
+                 'one wheel counts up while the other counts down; the Imu does not tell which '
+                 'is right')
+        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is no travel'),)
+    rolling = _rolling(np.stack([expected, steps[1]]), two.quantum).all(axis=0)
+    against = two.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
+    spans = [(a, b) for a, b in runs(against) if (b - a) * CELL >= AGAINST]
+    if ratio <= 0 or not spans:
+        return ()
+    back = [-step[step < 0].sum() for step in steps]
+    unsigned = [k for k in (0, 1) if back[k] <= 3 * two.quantum + STILL * back[1 - k]]
+    which = (f'the {SIDES[unsigned[0]]} wheel counts up in reverse gear too' if len(unsigned) == 1
+             else 'one wheel counts up while the other counts down')
+    a, b = spans[0]
+    return (Reason(Code.WHEEL_REVERSED, f'{which}: {len(spans)} time{"s" * (len(spans) > 1)}, '
+                   f'first at t = {two.t[a]:.1f} s for {(b - a) * CELL:.1f} s'),)
+
+
+def _against_imu(two, steps, imu):
+    """Return the wheel whose speed changes against the Imu's x axis, None where that is unsure."""
+    t_imu, _, f_b = imu
+    push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
+    push = push - np.median(push)
+    score = [_correlation(np.diff(step), push) for step in steps]
+    if score[0] * score[1] < 0 and min(np.abs(score)) > SURE:
+        return int(np.argmin(score))
+    return None
+
+
+def _correlation(a, b):
+    """Return the correlation of two series about zero, in sigmas of chance."""
+    power = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / power * np.sqrt(len(a)) if power else 0.0

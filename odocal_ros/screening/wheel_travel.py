@@ -1,0 +1,82 @@
+"""Travel of one or two wheels: each counter mended by itself, then their mean."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.odometer import mean_travel, Travel, travel
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.late_rows import on_time
+from odocal_ros.screening.odometer_care import counter_steps, doubted, mended
+from odocal_ros.screening.wheel_counters import unrolled
+
+
+@dataclass(frozen=True, eq=False)
+class Wheels:
+    """Travel of the wheels, and what of it is in doubt."""
+
+    mean: Travel
+    left: Travel | None
+    right: Travel | None
+    doubt_t: NDArray[np.float64]        # (k,) s, where
+    doubt_sigma: NDArray[np.float64]    # (k,) scale units, how much
+
+
+def wheels(leg, config, rows, found) -> Wheels:
+    """
+    Return the travel of the wheels of a leg.
+
+    rows : callable, a slot's usable rows and their times, s.   found : list that findings join.
+    """
+    if not len(leg.odometer_right.stamp_ns):
+        samples, t = rows('odometer')
+        odometer = config.odometer
+        if odometer.left and odometer.right and len(t):
+            found.append(Reason(Code.WHEEL_DEAD, 'the right wheel sends no message between the '
+                                'marks: what follows is the left wheel alone'))
+        left, doubt_t, doubt = _one(samples, t, leg.form, config, found)
+        return Wheels(left, None, None, doubt_t, doubt)
+    form_right = leg.form_right or leg.form
+    samples, t = rows('odometer')
+    left, t_left, doubt_left = _one(samples, t, leg.form, config, found, 'left')
+    if _kind(form_right) != _kind(leg.form):
+        found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, 'the right wheel sends '
+                            f'{_words(form_right)}, the left one {_words(leg.form)}: they have '
+                            'no mean, so the left wheel is taken alone'))
+        return Wheels(left, None, None, t_left, doubt_left)
+    samples, t = rows('odometer_right')
+    if not len(t):
+        found.append(Reason(Code.WHEEL_DEAD, 'the right wheel sends no usable value between the '
+                            'marks: what follows is the left wheel alone'))
+        return Wheels(left, None, None, t_left, doubt_left)
+    right, t_right, doubt_right = _one(samples, t, form_right, config, found, 'right')
+    mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
+    return Wheels(mean, left, right, np.append(t_left, t_right),
+                  np.append(doubt_left, doubt_right) / 2)
+
+
+def _one(samples, t, form, config, found, side=''):
+    """Return a wheel's travel, and where and how much of it is in doubt."""
+    name = f"the {side} wheel's counter" if side else 'the counter'
+    doubt_t = doubt = np.empty(0)
+    if side and form.quantity == 'cumulative':
+        step = counter_steps(samples.value, form.modulus)
+        samples, why, doubt_t, doubt = unrolled(t, samples, step, side)
+        found.extend(why)
+    samples, t = mended(samples, t, form, found, f'{side} odometer'.strip())
+    t = on_time(samples, t, form, found, f'{side} odometer'.strip())
+    way, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
+    found.extend(reasons)
+    way, more_t, more = doubted(way, samples.value, form)
+    return way, np.append(doubt_t, more_t), np.append(doubt, more)
+
+
+def _kind(form):
+    return form.quantity, form.scale_unit
+
+
+def _words(form):
+    """Return what values a form means, for people."""
+    what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
+    return f'{what[form.quantity]} ({form.scale_unit})'

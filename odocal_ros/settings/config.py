@@ -1,0 +1,271 @@
+"""
+Settings: each one written once with its default, unit, range and meaning.
+
+ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and the README's table are all
+made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
+"""
+
+from dataclasses import dataclass
+import math
+
+from odocal_ros.settings.setting import setting, settings_of, with_settings  # noqa: F401  its other half
+
+GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
+HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
+FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
+           'report')
+NAN = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometerConfig:
+    type: str = setting('auto', ro=True, about="Message type 'pkg/msg/Type'; auto: taken from the "
+                        'first publisher seen, or the only candidate in a bag.')
+    field: str = setting('', ro=True, about='Dotted path to the value, with [i] or [name]; empty: '
+                         "the type's default.")
+    quantity: str = setting('auto', choices=('auto', 'cumulative', 'increment', 'rate'), ro=True,
+                            about='What the value is: a running count, the count since the last '
+                            "message, or a speed; auto: the type's default.")
+    wrap: int = setting(0, 'counts', 0, 2**62, ro=True, about='Counter modulus; 0: that of the '
+                        'integer type (65536 for 16 bits sent in an Int32).')
+    signed: bool = setting(True, ro=True, about='False for pulses without direction: reversing '
+                           'is then told from Imu and fixes, or rejects the leg.')
+    reversed: bool = setting(False, ro=True, about='Positive counts mean backwards.')
+    nominal_scale: float = setting(0.0, 'm/pulse, m/rad or 1', 0.0, 1e6, about='Scale factor as '
+                                   'configured, K0; 0: unknown for counts, 1 for speeds.')
+    max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Largest believable deviation '
+                                         'from the nominal scale; beyond it the verdict is '
+                                         'caution.')
+    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
+        'Wheel contact point in base_link (forward, left, up).'))
+    time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
+    # a bus and a middleware seldom deliver within less; u-blox asks for 10 ms or better
+    time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
+                                'sigma; matters in turns and at marks set in motion.')
+    left: str = setting('', ro=True, about="Left wheel: joint name, array index, or 'topic' when "
+                        'it has a topic of its own.')
+    right: str = setting('', ro=True, about="Right wheel: joint name, array index, or 'topic' "
+                         '(odometer_right).')
+    track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
+                                 'right wheel; 0: unknown.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuConfig:
+    grade: str = setting('consumer', choices=GRADES, about='Gyro and accelerometer quality; the '
+                         'figures below replace single ones.')
+    gyro_noise: float = setting(NAN, 'rad/s/sqrt(Hz)', 0.0, 1.0, about='White gyro noise; NaN: '
+                                "the grade's.")
+    gyro_bias: float = setting(NAN, 'rad/s', 0.0, 1.0, about='Turn-on gyro bias, 1 sigma; NaN: '
+                               "the grade's.")
+    gyro_bias_walk: float = setting(NAN, 'rad/s/sqrt(s)', 0.0, 1.0, about='Random walk of the '
+                                    "gyro bias; NaN: the grade's.")
+    accel_noise: float = setting(NAN, 'm/s^2/sqrt(Hz)', 0.0, 10.0, about='White accelerometer '
+                                 "noise; NaN: the grade's.")
+    accel_bias: float = setting(NAN, 'm/s^2', 0.0, 10.0, about='Turn-on accelerometer bias, 1 '
+                                "sigma; NaN: the grade's.")
+    accel_bias_walk: float = setting(NAN, 'm/s^2/sqrt(s)', 0.0, 10.0, about='Random walk of the '
+                                     "accelerometer bias; NaN: the grade's.")
+    gyro_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the gyro scale, '
+                                      "relative, 1 sigma; NaN: the grade's.")
+    accel_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the accelerometer '
+                                       "scale, relative, 1 sigma; NaN: the grade's.")
+    misalignment_sigma: float = setting(NAN, 'rad', 0.0, 0.1, about='By how much each axis of '
+                                        'gyro and accelerometer is off a right angle, 1 sigma; '
+                                        "NaN: the grade's.")
+    gyro_by_force_sigma: float = setting(NAN, 'rad/s/(m/s^2)', 0.0, 0.01, about='What a force '
+                                         'makes the gyro show (g-sensitivity), 1 sigma; NaN: '
+                                         "the grade's.")
+    gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on turn rates as sent: '
+                                '0.017453292519943295 for an Imu that sends deg/s.')
+    accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on specific force as sent: '
+                                 '9.80665 for an Imu that sends g.')
+    mounting_rpy: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad', -6.3, 6.3, ro=True, about=(
+        'Nominal rotation that takes the Imu frame to the body frame b (forward, left, up), fixed '
+        'axes roll, pitch, yaw.'))
+    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
+        'IMU position in base_link.'))
+    time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to Imu stamps.')
+    nominal_yaw: float = setting(NAN, 'rad', about='Yaw mounting angle expected; a result far '
+                                 'from it is a caution. NaN: not checked.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssConfig:
+    lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
+        'Antenna in base_link (10 cm is enough).'))
+    lever_arm_sigma: float = setting(0.1, 'm', 0.0, 10.0, about='Uncertainty of the antenna '
+                                     'position, each axis.')
+    time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
+    time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown latency of fixes, 1 sigma; '
+                                'matters at marks set in motion.')
+    min_status: int = setting(0, '', -1, 2, about='Least NavSatStatus of a fix that is used.')
+    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Horizontal 1 sigma beyond which a fix '
+                               'is not used; 0: off.')
+    default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes that '
+                                   'come without a covariance.')
+    correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Time over which fix errors stay '
+                                      'alike; 0: white; NaN: judged from the data.')
+    use_velocity: bool = setting(False, ro=True, about='Subscribe to GNSS velocity '
+                                 '(fix_velocity).')
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegConfig:
+    min_distance: float = setting(100.0, 'm', 1.0, 1e5, about='Shorter legs are rejected.')
+    min_speed: float = setting(2.78, 'm/s', 0.1, 50.0, about='A leg that never reaches it is a '
+                               'caution.')
+    max_yaw_rate: float = setting(0.02, 'rad/s', 0.0, 1.0, about='Turn rate up to which the '
+                                  'vehicle counts as driving straight.')
+    max_duration: float = setting(7200.0, 's', 10.0, 14400.0, about='A live leg longer than this '
+                                  'is stopped.')
+    max_gap: float = setting(0.5, 's', 0.05, 10.0, about='Longest gap in the Imu that a leg '
+                             'survives uncut.')
+    standstill: float = setting(2.0, 's', 0.2, 600.0, about='Shortest stop that counts as one.')
+    preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Seconds kept before the start mark.')
+    automatic: bool = setting(False, about='Legs begin and end by themselves, at standstills, '
+                              'else every leg.automatic_minutes; a change of the scale beyond 3 '
+                              'sigma is said.')
+    automatic_minutes: float = setting(10.0, 'min', 1.0, 120.0, about='Longest leg of '
+                                       'leg.automatic; half of it suffices where the vehicle '
+                                       'stands.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentConfig:
+    heading_source: str = setting('auto', choices=HEADING_SOURCES, about='Where the heading of '
+                                  "the IMU's x axis comes from.")
+    heading: float = setting(NAN, 'rad', about="Heading of the IMU's x axis at the start mark, "
+                             'clockwise from north (a compass quantity).')
+    heading_sigma: float = setting(0.0175, 'rad', 0.0, 3.2, about='Uncertainty of a fixed heading '
+                                   'and of sources that do not state theirs, 1 sigma.')
+    heading_offset: float = setting(0.0, 'rad', -6.3, 6.3, about='Added to the ENU yaw of the '
+                                    'heading topic.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceConfig:
+    start: tuple[float, ...] = setting((), 'deg, deg, m, m', about='Surveyed antenna position at '
+                                       'the start mark: latitude, longitude, ellipsoidal height, '
+                                       'sigma; empty: from fixes.')
+    end: tuple[float, ...] = setting((), 'deg, deg, m, m', about='The same at the end mark.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class WheelsConfig:
+    radius: float = setting(0.0, 'm', 0.0, 10.0, about='Nominal wheel radius; 0: unknown.')
+    pulses_per_revolution: float = setting(0.0, 'pulses', 0.0, 1e9, about='Pulses per turn of the '
+                                           'wheel; with the radius it gives the nominal scale.')
+    radius_range: float = setting(0.0, '1', 0.0, 0.9, about="Half of the range searched about "
+                                  "each wheel's nominal factor, relative: twice the stated error; "
+                                  '0: 0.05.')
+    heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half of the range searched about '
+                                   'the heading at the start; 0: twice its sigma, 10 deg where it '
+                                   'is not known.')
+    levels: int = setting(7, '', 1, 49, about='Levels of each parameter in the first search; 3 or '
+                          'more: the next odd prime power (zero is a level), an orthogonal array.')
+    robust: bool = setting(False, about='Weight fixes by their covariance and bound the pull of '
+                           'outliers in the search.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectionConfig:
+    kind: str = setting('leg', choices=('leg', 'gauss_krueger', 'utm'), about='Plane of the '
+                        'chord check: transverse Mercator about the leg, a Gauss-Krueger zone, or '
+                        'UTM.')
+    ellipsoid: str = setting('WGS84', choices=('WGS84', 'CGCS2000', 'Krassovsky'), about=(
+        'Ellipsoid of the plane.'))
+    central_meridian: float = setting(NAN, 'deg', about='Central meridian; NaN: the zone of the '
+                                      'leg.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictConfig:
+    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Asked relative sigma of the '
+                                     'scale factor.')
+    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw '
+                                   'mounting angle.')
+    min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='How far the scale '
+                                         'factor walks between legs, relative, 1 sigma (tyres).')
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig:
+    directory: str = setting('', about='Where results go; empty: odocal/ and the full name of '
+                             'the node in $ROS_HOME (~/.ros/odocal/calibrator)'
+                             '.')
+    autosave: bool = setting(True, about='Write the result files after every leg that is not '
+                             'rejected.')
+    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
+                                       'calibration.json.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalConfig:
+    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk for the journals of legs '
+                             '(journal/ under output.directory); the oldest go first. 0: no '
+                             'journal.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishConfig:
+    rate: float = setting(2.0, 'Hz', 0.1, 20.0, ro=True, about='Rate of the status message.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig:
+    base: str = setting('base_link', ro=True, frame=True,
+                        about='Vehicle frame in the files written.')
+    imu: str = setting('', ro=True, frame=True,
+                       about='Imu frame; empty: that of the Imu messages.')
+    local: str = setting('odocal_enu', ro=True, frame=True,
+                         about='Frame of the published paths.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdaterConfig:
+    period: float = setting(1.0, 's', 0.1, 60.0, ro=True, about='Period of /diagnostics.')
+    use_fqn: bool = setting(False, ro=True, about='Full node name in /diagnostics.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """All settings of the calibrator; see the module for how they are named."""
+
+    method: str = setting('auto', choices=(
+        'auto', 'two_point', 'wheels', 'smoother', 'all'), about=(
+        'Method whose figures are the result; auto: each value of the first of smoother, wheels '
+        '(with two counters) and two_point that has it; all: the same, wheels tried always.'))
+    vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: it stands in '
+                           'results and titles the report, and a result of another one is not '
+                           'restored.')
+    odometer: OdometerConfig = OdometerConfig()
+    imu: ImuConfig = ImuConfig()
+    gnss: GnssConfig = GnssConfig()
+    leg: LegConfig = LegConfig()
+    alignment: AlignmentConfig = AlignmentConfig()
+    reference: ReferenceConfig = ReferenceConfig()
+    wheels: WheelsConfig = WheelsConfig()
+    projection: ProjectionConfig = ProjectionConfig()
+    verdict: VerdictConfig = VerdictConfig()
+    output: OutputConfig = OutputConfig()
+    journal: JournalConfig = JournalConfig()
+    publish: PublishConfig = PublishConfig()
+    frames: FramesConfig = FramesConfig()
+    diagnostic_updater: UpdaterConfig = UpdaterConfig()
+
+
+SETTINGS = settings_of(Config)
+
+
+def value_of(config: Config, name: str):
+    """Return the value of a setting by its dotted name."""
+    for part in name.split('.'):
+        config = getattr(config, part)
+    return config
+
+
+def flat(config: Config) -> dict:
+    """Return every setting by its dotted name."""
+    return {name: value_of(config, name) for name in SETTINGS}

@@ -1,0 +1,191 @@
+"""
+Settings from ROS parameter files and from ``key=value``, read as the node reads them.
+
+A file means the same to ``odocal replay --config`` as to ``--params-file``: blocks are matched
+and taken in file order as rcl does it, and plain scalars are typed by rcl's rules, which are not
+those of YAML 1.1 (``1e-3`` is a number, ``1_000`` is text).
+"""
+
+from pathlib import Path
+import re
+
+from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.outside.limits import read_text
+from odocal_ros.outside.yaml_tree import composed
+from odocal_ros.settings.config import Config, SETTINGS, with_settings
+
+NODE = '/calibrator'
+PARAMETERS = 'ros__parameters'
+WANTED = "'/**', '/**/calibrator', '/calibrator' or 'calibrator'"
+# what a node knows besides our settings: left by ros2 param dump and by ~/save
+NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_description_service)$')
+TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
+FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
+WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
+LONGEST = 100        # characters of a number
+DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
+
+
+def read_config_file(path: Path) -> dict[str, object]:
+    """
+    Return the settings of a ROS parameter file by dotted name, each checked.
+
+    Raises
+    ------
+    BadUsage
+        The file cannot be read.
+    BadConfig
+        It is no parameter file, has no block for the calibrator, or holds an unknown setting or
+        a wrong value; the text tells file and line.
+
+    """
+    return _settings(Path(path), _root(Path(path)))
+
+
+def _root(path: Path):
+    """Return the root node of a parameter file."""
+    try:
+        return composed(read_text(path), str(path))
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot be read ({error.strerror}); check --config') from None
+    except UnicodeDecodeError:
+        raise BadConfig(f'{path}: not a text file; want a ROS parameter file (YAML)') from None
+
+
+def _settings(path: Path, root) -> dict[str, object]:
+    blocks = _blocks(root, '')
+    ours = [block for key, block in blocks.items() if _means_us(key)]
+    if not ours:
+        there = f'; it has {", ".join(blocks)}' if blocks else ''
+        raise BadConfig(f'{path}: no block for the calibrator{there}; want a top key {WANTED} '
+                        f'with {PARAMETERS} under it')
+    values: dict[str, object] = {}
+    for name, node in (pair for block in ours for part in block for pair in _leaves(part, '')):
+        if not NOT_OURS.match(name):
+            values[name] = _checked(name, _value(node), f'{path}, line {_line(node)}: ')
+    return values
+
+
+def read_journal_file(path: Path, block: str) -> tuple[dict[str, object], dict[str, str]]:
+    """Return the settings of a journal's file, and what a block of its own says, as text."""
+    root = _root(path)
+    about = list(_blocks(root, '').get(block, ()))
+    return _settings(path, root), {
+        name: node.value for part in about for name, node in _leaves(part, '')
+        if isinstance(node.value, str)}
+
+
+def parse_set(text: str) -> tuple[str, object]:
+    """
+    Return (name, value) of ``key=value``; the value is YAML, checked against its setting.
+
+    Raises
+    ------
+    BadUsage
+        There is no ``=``, or the value is no YAML.
+    BadConfig
+        The setting is unknown or the value wrong.
+
+    """
+    name, equals, value = text.partition('=')
+    name = name.strip()
+    if not equals or not name:
+        raise BadUsage(f'--set {text}: want key=value, as in --set leg.min_distance=50')
+    try:
+        node = composed(value, f'--set {name}')
+    except BadConfig as error:
+        raise BadUsage(str(error)) from None
+    if name in SETTINGS and SETTINGS[name].kind == 'str' and not _is_quoted(node):
+        return name, _checked(name, value.strip(), '--set ')      # a joint may be named 0 or on
+    where = '--set ' if name in SETTINGS else '--set: '           # then the setting's name
+    return name, _checked(name, '' if node is None else _value(node), where)
+
+
+def _is_quoted(node):
+    return node is not None and getattr(node, 'style', None) in ('"', "'")
+
+
+def _line(node):
+    return node.start_mark.line + 1
+
+
+def _pairs(node):
+    """Return the (key text, value node) pairs of a mapping, none of anything else."""
+    import yaml
+    if not isinstance(node, yaml.MappingNode):
+        return []
+    return [(key.value, value) for key, value in node.value]
+
+
+def _blocks(node, prefix) -> dict[str, list]:
+    """
+    Return the parameter mappings by node key; namespaces may be nested.
+
+    A key that comes again joins the block of its first appearance, as in rcl.
+    """
+    found: dict[str, list] = {}
+    for key, value in _pairs(node):
+        if key == PARAMETERS and prefix:
+            found.setdefault(prefix, []).append(value)
+        elif isinstance(key, str):
+            name = f'{prefix}/{key}' if prefix else key
+            for deeper, mappings in _blocks(value, name).items():
+                found.setdefault(deeper, []).extend(mappings)
+    return found
+
+
+def _means_us(key: str) -> bool:
+    """Return whether a node key, with the wildcards * and **, matches /calibrator."""
+    if len(key) > LONGEST:
+        return False
+    parts = {'**': r'(?:/\w+)*', '*': r'/\w+'}
+    pattern = ''.join(parts.get(p, '/' + re.escape(p)) for p in key.strip('/').split('/'))
+    return re.fullmatch(pattern, NODE) is not None
+
+
+def _leaves(node, prefix):
+    """Yield (dotted name, value node) of nested and dotted keys alike."""
+    import yaml
+    for key, value in _pairs(node):
+        name = f'{prefix}{key}'
+        if isinstance(value, yaml.MappingNode):
+            yield from _leaves(value, f'{name}.')
+        else:
+            yield name, value
+
+
+def _value(node):
+    import yaml
+    if isinstance(node, yaml.ScalarNode):
+        return node.value if _is_quoted(node) or node.style in ('|', '>') else scalar(node.value)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item) for item in node.value]
+    return {key: _value(value) for key, value in _pairs(node)}
+
+
+def scalar(text: str) -> bool | int | float | str:
+    """Return a plain scalar as rcl types it (measured on rcl 9.2)."""
+    if text in TRUE or text in FALSE:
+        return text in TRUE
+    if len(text) > LONGEST:
+        return text
+    if whole := WHOLE.fullmatch(text):
+        number = int(text, 16 if whole[1] else 8 if whole[2] else 10)
+        if -2**63 <= number < 2**63:
+            return number
+    dotted = DOTTED.fullmatch(text)
+    try:
+        return float(dotted[1] + dotted[2] if dotted else text) if '_' not in text else text
+    except ValueError:
+        return text
+
+
+def _checked(name, value, where):
+    try:
+        with_settings(Config(), {name: value})
+    except BadConfig as error:
+        hint = ''
+        if name in SETTINGS and SETTINGS[name].kind == 'str' and not isinstance(value, str):
+            hint = '; write it in quotes'
+        raise BadConfig(f'{where}{error}{hint}') from None
+    return SETTINGS[name].checked(value)

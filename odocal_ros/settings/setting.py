@@ -1,0 +1,133 @@
+"""One setting: how it is declared in a dataclass, and how a value for it is checked."""
+
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+import difflib
+from functools import cache
+import math
+from typing import Any, TypeVar
+
+from odocal_ros.errors import BadConfig
+from odocal_ros.outside.names import is_frame, one_line
+
+LARGEST = 1e9      # no setting in SI units means a number beyond it; sums with it stay finite
+AnyConfig = TypeVar('AnyConfig', bound=Any)     # a dataclass of settings and groups of them
+TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
+
+
+def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False,
+            frame=False) -> Any:
+    """
+    Declare a setting; NaN passes where the default is NaN.
+
+    ro : fixed at start-up.   frame : the name of a coordinate frame.
+    """
+    return field(default=default, metadata={
+        'unit': unit, 'low': low, 'high': high, 'about': about, 'choices': choices, 'ro': ro,
+        'frame': frame})
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting: what a parameter descriptor, a YAML line and a table row are made from."""
+
+    name: str
+    default: Any
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple
+    about: str
+    read_only: bool
+    frame: bool
+
+    @property
+    def kind(self) -> str:
+        """Return bool, int, float, str, floats or strs (lists)."""
+        if not isinstance(self.default, tuple):
+            return type(self.default).__name__
+        return 'strs' if self.choices else 'floats'
+
+    def checked(self, value):
+        """Return value as this setting's type, or raise BadConfig with what it wants."""
+        if isinstance(self.default, tuple):
+            if isinstance(value, str) or not hasattr(value, '__len__'):
+                raise BadConfig(f'{self.name}: {value!r} is not a list')
+            items = tuple(self._one(v, str if self.choices else float) for v in value)
+            lengths = (3,) if self.default else (0, 4)
+            if not self.choices and len(items) not in lengths:
+                raise BadConfig(f'{self.name}: {len(items)} values, want {lengths[-1]}')
+            return items
+        return self._one(value, type(self.default))
+
+    def _one(self, value, kind):
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not kind:
+            raise BadConfig(f'{self.name}: {value!r} is not {TYPES[kind]}')
+        if self.choices and value not in self.choices:
+            raise BadConfig(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
+        if kind is str:
+            self._check_text(value)
+        if kind in (int, float):
+            unset = kind is float and math.isnan(value)
+            if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
+                raise BadConfig(f'{self.name}: NaN is not a value')
+            if not unset and not math.isfinite(value):
+                raise BadConfig(f'{self.name}: {value} is not finite')
+            if kind is float and abs(value) > LARGEST:
+                raise BadConfig(f'{self.name} = {value:g}: want at most {LARGEST:g}')
+            below = self.low is not None and value < self.low
+            if below or self.high is not None and value > self.high:
+                unit = '' if self.unit == '1' else self.unit
+                raise BadConfig(f'{self.name} = {value:g}: want {self.low:g} to {self.high:g} '
+                                f'{unit}'.rstrip())
+        return value
+
+    def _check_text(self, value):
+        """Refuse what no name is: it would stand in files and on terminals."""
+        if one_line(value) != value:
+            raise BadConfig(f"{self.name}: '{one_line(value)}' has characters that cannot be seen")
+        # empty is one where that means something: as the default
+        if self.frame and not is_frame(value) and value != self.default:
+            raise BadConfig(f'{self.name}: {value!r} is no frame name; want letters, digits and '
+                            '_ . / -, no / at its beginning')
+
+
+def _settings(owner, prefix=''):
+    for f in fields(owner):
+        if is_dataclass(f.default):
+            yield from _settings(f.default, f'{prefix}{f.name}.')
+        else:
+            m = f.metadata
+            yield Setting(prefix + f.name, f.default, m['unit'], m['low'], m['high'],
+                          m['choices'], m['about'], m['ro'], m['frame'])
+
+
+@cache
+def settings_of(kind: type) -> dict[str, Setting]:
+    """Return the settings of a dataclass of settings by dotted name."""
+    return {s.name: s for s in _settings(kind())}
+
+
+def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
+    """
+    Return config with settings changed by dotted name, each checked.
+
+    Raises
+    ------
+    BadConfig
+        Unknown name (the nearest ones are told), wrong type, out of range.
+
+    """
+    groups: dict[str, dict] = {}
+    settings = settings_of(type(config))
+    for name, value in changes.items():
+        if name not in settings:
+            near = difflib.get_close_matches(name, settings, 3, 0.5)
+            hint = f'; did you mean {" or ".join(near)}?' if near else ''
+            raise BadConfig(f'no setting {name!r}{hint}')
+        group, _, leaf = name.rpartition('.')
+        groups.setdefault(group, {})[leaf] = settings[name].checked(value)
+    top = groups.pop('', {})
+    nested = {g: replace(getattr(config, g), **values) for g, values in groups.items()}
+    return replace(config, **top, **nested)

@@ -1,0 +1,129 @@
+"""Legs: how a stream was chopped and raced leaves no trace; what is kept of it."""
+
+from dataclasses import fields
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+from odocal_ros.data.leg import LegRecorder, SLOTS
+from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples, take
+from odocal_ros.errors import BadData
+
+S = 10**9
+START, STOP = 20 * S, 40 * S
+
+
+def topic(slot, rng):
+    """Return 60 s of one topic, from 1 s on, with some rows out of order and some unstamped."""
+    n = {'imu': 600, 'odometer': 300, 'fix': 60, 'heading': 30}[slot]
+    received = (1 + np.arange(n) * 60 // n) * S + np.arange(n)
+    stamp = received - 1000
+    stamp[rng.integers(0, n, 3)] = 0
+    stamp[5:7] = stamp[6:4:-1]
+    x = rng.standard_normal((n, 9))
+    x[n // 2, 0] = np.nan
+    if slot == 'imu':
+        return ImuSamples(stamp, received, x[:, :3], x[:, 3:6], x[:, 5:9], x[:, 0])
+    if slot == 'odometer':
+        return OdometerSamples(stamp, received, np.arange(n) * 7)
+    if slot == 'heading':
+        return HeadingSamples(stamp, received, x[:, :4], x[:, 4])
+    return FixSamples(stamp, received, x[:, 0], x[:, 1], x[:, 2], x.reshape(n, 3, 3),
+                      np.full(n, 2), np.zeros(n))
+
+
+def recorded(topics, order):
+    """Feed a recorder blocks in an order of (slot, first, last)."""
+    recorder = LegRecorder()
+    for slot, a, b in order:
+        recorder.feed(slot, take(topics[slot], slice(a, b)))
+    return recorder
+
+
+def rows(leg):
+    return {f'{slot}.{f.name}': getattr(getattr(leg, slot), f.name)
+            for slot in SLOTS for f in fields(getattr(leg, slot))}
+
+
+TOPICS = {slot: topic(slot, np.random.default_rng(7))
+          for slot in ('imu', 'odometer', 'fix', 'heading')}
+WHOLE = recorded(TOPICS, [(s, 0, 10**6) for s in TOPICS]).close(START, STOP, preroll=5.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_chopping_and_racing_leave_no_trace(data):
+    pieces = {}
+    for slot, block in TOPICS.items():
+        n = len(block.stamp_ns)
+        cuts = sorted(data.draw(st.sets(st.integers(1, n - 1), max_size=6), label=slot))
+        pieces[slot] = list(zip([0, *cuts], [*cuts, n], strict=True))
+    # each topic keeps its order, between topics anything goes
+    race = data.draw(st.permutations([s for s in pieces for _ in pieces[s]]), label='race')
+    queues = {slot: iter(p) for slot, p in pieces.items()}
+    recorder = recorded(TOPICS, [(slot, *next(queues[slot])) for slot in race])
+    if data.draw(st.booleans(), label='forget'):
+        recorder.forget_before(START - 5 * S)
+    if data.draw(st.booleans(), label='look'):
+        recorder.rows('imu')
+    leg = recorder.snapshot().close(START, STOP, preroll=5.0)
+    for name, column in rows(leg).items():
+        np.testing.assert_array_equal(column, rows(WHOLE)[name], err_msg=name)
+
+
+def test_the_preroll_is_cut_and_the_first_row_after_the_stop_is_kept():
+    leg = WHOLE
+    for slot in ('imu', 'odometer', 'fix', 'heading'):
+        block = getattr(leg, slot)
+        key = np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
+        assert key.min() >= START - 5 * S
+        assert np.sum(key > STOP) == 1, slot
+        every = np.where(TOPICS[slot].stamp_ns > 0, TOPICS[slot].stamp_ns,
+                         TOPICS[slot].received_ns)
+        assert key.max() == every[every > STOP].min()
+        assert len(key) == np.sum((every >= START - 5 * S) & (every <= key.max()))
+
+
+def test_a_row_without_a_stamp_is_placed_by_its_arrival():
+    stamp = np.array([10, 0, 12, 0, 30]) * S
+    received = np.array([10, 11, 12, 29, 30]) * S + 1
+    recorder = LegRecorder()
+    recorder.feed('odometer', OdometerSamples(stamp, received, np.arange(5)))
+    leg = recorder.close(11 * S, 20 * S, preroll=0.0)
+    # the row that arrived at 29 s is the first after the stop
+    assert leg.odometer.value.tolist() == [1, 2, 3]
+
+
+def test_how_late_a_leg_is_closed_leaves_no_trace():
+    early, late = LegRecorder(), LegRecorder()
+    for slot, block in TOPICS.items():
+        key = np.where(block.stamp_ns > 0, block.stamp_ns, block.received_ns)
+        early.feed(slot, take(block, key <= STOP + 3 * S))
+        late.feed(slot, block)
+    first, second = (rows(r.close(START, STOP, 5.0)) for r in (early, late))
+    for name, column in first.items():
+        np.testing.assert_array_equal(column, second[name], err_msg=name)
+
+
+def test_an_empty_recorder_gives_an_empty_leg():
+    leg = LegRecorder().close(START, STOP)
+    assert all(len(column) == 0 for column in rows(leg).values())
+
+
+def test_clearing_forgets_and_the_newest_stamp_is_the_last_fed():
+    recorder = recorded(TOPICS, [('imu', 0, 100)])
+    assert recorder.newest_ns('imu') == TOPICS['imu'].stamp_ns[99]
+    assert recorder.newest_ns('fix') == 0
+    recorder.clear()
+    assert recorder.newest_ns('imu') == 0
+    assert len(recorder.rows('imu').stamp_ns) == 0
+
+
+def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():
+    late = 10**9 * 86400 * 4000
+    recorder = LegRecorder()
+    recorder.feed('odometer', OdometerSamples([10, 20, 30 + late], [10, 20, 30 + late], [1, 2, 3]))
+    assert recorder.close(5, 25).odometer.value.tolist() == [1, 2]
+    with pytest.raises(BadData, match='the leg lasts 4000 days'):
+        recorder.close(5, 40 + late)

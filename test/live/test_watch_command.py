@@ -1,0 +1,65 @@
+"""One line to watch, typed topics to plot, and the panel of ``odocal watch``."""
+
+import math
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from bench import PATIENCE, ROOT, wait_for
+import pytest
+
+from odocal_ros.live.watch_command import NEEDS
+
+ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli', 'watch', '--once']
+
+
+def test_hint_and_values_are_latched_in_standard_types(start, connect):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import Float64, String
+    start('-p', 'result.scale_factor:=0.02', '-p', 'result.scale_factor_sigma:=0.00001', '-p',
+          'result.valid:=true')
+    client, heard = connect(), {}
+    client.until(state='waiting')
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for name, kind in (('hint', String), ('scale_factor', Float64),
+                       ('scale_factor_sigma', Float64), ('yaw_mounting_angle', Float64)):
+        client.node.create_subscription(
+            kind, f'/calibrator/{name}',
+            lambda message, name=name: heard.update({name: message.data}), latched)
+    wait_for(lambda: len(heard) == 4, 'latched values')     # to one who comes late
+    assert heard['hint'] == client.status['hint']
+    assert (heard['scale_factor'], heard['scale_factor_sigma']) == (0.02, 1e-5)
+    assert math.isnan(heard['yaw_mounting_angle'])
+
+
+def test_without_the_library_a_sentence_says_what_to_install(tmp_path):
+    (tmp_path / 'rich.py').write_text('raise ModuleNotFoundError("no", name="rich")\n')
+    ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
+                           env=os.environ | {'PYTHONPATH': f'{tmp_path}:{ROOT}'})
+    assert (ended.returncode, ended.stdout) == (2, '')
+    assert ended.stderr == f'odocal: odocal watch needs the package rich: {NEEDS["rich"]}\n'
+
+
+def test_the_panel_shows_a_running_node(start, connect):
+    rich = pytest.importorskip('rich')
+    start()
+    connect().until(state='waiting')
+    paths = os.pathsep.join([str(ROOT), str(Path(rich.__file__).parents[1])])
+    ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
+                           env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
+    assert ended.returncode == 0, ended.stderr
+    for words in ('/calibrator', 'waiting', 'no Imu on /imu/data', 'way', 'asked 1e+03'):
+        assert words in ended.stdout
+
+
+def test_the_bars_are_shares_of_what_is_asked():
+    pytest.importorskip('rich')
+    from odocal_ros.live.panel import shares
+    found = shares({'distance_m': '75.0', 'metres_to_least': '25.0', 'seconds_to_stand': '4.0',
+                    'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
+                    'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
+    assert {name: share for name, (share, _) in found.items()} == {
+        'way': 0.75, 'standing': 0.6, 'scale': 0.25, 'yaw': 0.0}
+    assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {
+        'computing': (0.4, '40 %')}

@@ -1,0 +1,100 @@
+"""Which joints are wheels: names of real robots, and names that tell nothing."""
+
+from dataclasses import replace
+
+from drives import drive, everything_said, settings
+import pytest
+
+from odocal_ros.messages.wheel_choice import choose
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+
+REAL = {
+    'turtlebot3': (['wheel_left_joint', 'wheel_right_joint'],
+                   ('wheel_left_joint', 'wheel_right_joint')),
+    'create3, with wheel drops': (
+        ['wheel_drop_left_joint', 'wheel_drop_right_joint', 'right_wheel_joint',
+         'left_wheel_joint'], ('left_wheel_joint', 'right_wheel_joint')),
+    'husky': (['front_left_wheel', 'front_right_wheel', 'rear_left_wheel', 'rear_right_wheel'],
+              ('rear_left_wheel', 'rear_right_wheel')),
+    'ackermann': (
+        ['front_left_steering_joint', 'front_right_steering_joint', 'front_left_wheel_joint',
+         'front_right_wheel_joint', 'rear_left_wheel_joint', 'rear_right_wheel_joint'],
+        ('rear_left_wheel_joint', 'rear_right_wheel_joint')),
+    'steered behind': (
+        ['rear_left_steering', 'rear_right_steering', 'rear_left_wheel', 'rear_right_wheel',
+         'front_left_wheel', 'front_right_wheel'], ('front_left_wheel', 'front_right_wheel')),
+    'short hands': (['FL_wheel', 'FR_wheel', 'RL_wheel', 'RR_wheel'], ('RL_wheel', 'RR_wheel')),
+    'spelt apart': (['wheel_f_l', 'wheel_f_r', 'wheel_b_l', 'wheel_b_r'],
+                    ('wheel_b_l', 'wheel_b_r')),
+    'mobile arm': (['l_wheel', 'r_wheel', 'left_gripper_finger', 'right_gripper_finger',
+                    'shoulder_pan_joint', 'elbow'], ('l_wheel', 'r_wheel')),
+    'tracks': (['leftTrack', 'rightTrack', 'flipper_left', 'flipper_right'],
+               ('leftTrack', 'rightTrack')),
+    'one word': (['leftwheel', 'rightwheel'], ('leftwheel', 'rightwheel')),
+    'unlike stems': (['left_wheel', 'right_motor_wheel'], ('left_wheel', 'right_motor_wheel')),
+    'a third one': (['wheel_left', 'wheel_right', 'wheel_rear'], ('wheel_left', 'wheel_right')),
+}
+
+
+@pytest.mark.parametrize('robot', REAL)
+def test_wheels_of_real_robots(robot):
+    names, pair = REAL[robot]
+    found = choose(names, len(names))
+    assert (found.keys, found.sides) == (pair, True)
+    assert pair[0] in found.about
+
+
+@pytest.mark.parametrize(('names', 'keys'), [
+    (['joint'], ('joint',)),
+    (['steering_joint', 'drive_joint'], ('drive_joint',)),
+    (['front_wheel', 'rear_wheel'], ('rear_wheel',)),       # the front wheel of a bicycle steers
+])
+def test_one_wheel(names, keys):
+    assert choose(names, len(names)).keys == keys
+
+
+@pytest.mark.parametrize('names', [['a', 'b'], ['motor_1', 'motor_2', 'mast'], []])
+def test_two_of_unknown_sides(names):
+    found = choose(names, len(names) or 2)
+    assert found.keys == tuple(names[:2] or '01')
+    assert not found.sides
+    assert 'the mean of' in found.about
+
+
+@pytest.mark.parametrize(('names', 'count'), [
+    (['wheel_1', 'wheel_2', 'wheel_3', 'wheel_4'], 4),
+    (['left_wheel_1', 'right_wheel_1', 'left_wheel_2', 'right_wheel_2'], 4),
+    (['left_wheel', 'l_wheel', 'right_wheel'], 3),
+    (['shoulder', 'elbow', 'wrist'], 3), (['steering'], 1), (['a', 'a'], 2), ([], 4), ([], 0)])
+def test_what_cannot_be_told_is_not_guessed(names, count):
+    assert isinstance(choose(names, count), str)
+
+
+def test_a_long_list_is_cut():
+    assert 'and 88 more' in choose([f'j{k}' for k in range(100)], 100)
+
+
+def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
+    made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
+    leg = made.leg()
+    blind = replace(leg, form=replace(leg.form, sides=False, chosen='the mean is taken'))
+    config = settings(made, method='auto')
+    result = calibrate(blind, config)
+    assert 'wheels' not in result.methods
+    assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is taken'
+    both = calibrate(leg, config)
+    assert 'wheels' in both.methods
+    # named, but a straight way does not tell whether rightly
+    assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('no turn tells')
+    assert result.methods['two_point'].estimates['scale_factor'].value == \
+        both.methods['two_point'].estimates['scale_factor'].value
+
+
+def test_a_dead_wheel_of_unknown_side_is_still_seen():
+    made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
+    leg = made.leg()
+    dead = replace(leg.odometer_right, value=leg.odometer_right.value * 0)
+    result = calibrate(replace(leg, odometer_right=dead, form=replace(leg.form, sides=False)),
+                       settings(made))
+    assert Code.WHEEL_DEAD in everything_said(result)

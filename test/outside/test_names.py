@@ -1,0 +1,156 @@
+"""Names from outside in every format: what was sent is shown, nothing of it is acted on."""
+
+from dataclasses import replace
+from pathlib import Path
+import shlex
+import subprocess
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from odocal_ros.calib.result import Calibration, Estimate, LegResult
+from odocal_ros.errors import BadConfig
+from odocal_ros.output import ros_files
+from odocal_ros.output.files import as_json
+from odocal_ros.output.frames import framed
+from odocal_ros.output.leg_table import leg_table, LEGS
+from odocal_ros.outside import names as outside
+from odocal_ros.outside.yaml_text import parameters, value_text
+from odocal_ros.reasons import Code
+from odocal_ros.settings.config import Config, with_settings
+
+ATTACKS = ["imu$(command 'touch x')", '$(env HOME)', 'a b', '-x', "x'; touch x; '", '`touch x`',
+           'imu\ntouch x', 'imu\x1b[2J', 'imu --', 'a"b', 'a: b', '<imu>', 'x' * 300, 'imü',
+           'imu\udcff', 'imu\u202e', '#', '/', '//']
+BAGS = ['drive\ntouch x', 'drive\x1b]0;title\x07', 'drive -->', 'drive\udcff', 'drive ---x',
+        'drive\r', 'drive\u2028x: 1', '$(command x)']
+
+
+def calibration():
+    """Return one that writes every file a frame is in."""
+    found = {'scale_factor': Estimate(0.05, 1e-6, 'm/pulse'), 'scale_ratio':
+             Estimate(1.25, 1e-5, '1'), 'yaw_mounting_angle': Estimate(0.1, 1e-4, 'rad')}
+    found |= {f'gyro_bias_{a}': Estimate(1e-5, 1e-6, 'rad/s') for a in 'xyz'}
+    leg = LegResult(0, 10**11, 900.0, 100.0, 5, 5, 5, 0, (), {}, bag='drive', C_bi=None)
+    return Calibration((), found, {}, (leg,), (0.0, 0.0, 0.05, 0.999), (0.0, 0.0, 0.1))
+
+
+def texts(frame='imu_link', bag='drive', config=None):
+    made, config = framed(calibration(), config or Config(), frame)
+    inputs = [{'bag': bag, 'sha256': None, 'topics': {}}]
+    content = as_json(made, config, inputs, '2026-01-02T03:04:05+00:00')
+    return made, ros_files.texts(made, config, content)
+
+
+@pytest.mark.parametrize('frame', ATTACKS)
+def test_a_frame_that_ros_would_not_take_is_replaced_and_said(frame):
+    made, written = texts(frame)
+    assert [r.code for r in made.reasons] == [Code.FRAME_REPLACED]
+    assert 'imu_link is written' in made.reasons[0].text
+    assert made.reasons[0].text.isprintable()
+    assert written == texts('imu_link')[1]
+
+
+def test_frames_that_ros_takes_pass_and_a_slash_of_ros_1_goes():
+    for frame in ('imu_link', 'car/imu-top.1', '3dm_gx5'):
+        made, written = texts(frame)
+        assert made.reasons == ()
+        assert f'--child-frame-id {frame}\n' in written['imu_transform.txt']
+    made, written = texts('/imu')
+    assert [r.code for r in made.reasons] == [Code.FRAME_REPLACED]
+    assert '--child-frame-id imu\n' in written['imu_transform.txt']
+    assert texts('')[0].reasons == ()
+
+
+def test_a_frame_that_is_set_goes_before_the_one_sent():
+    config = with_settings(Config(), {'frames.imu': 'top'})
+    made, written = texts('$(command x)', config=config)
+    assert made.reasons == ()
+    assert '--child-frame-id top\n' in written['imu_transform.txt']
+
+
+@pytest.mark.parametrize('frame', [*ATTACKS, '/base_link'])
+@pytest.mark.parametrize('name', ['frames.base', 'frames.imu', 'frames.local'])
+def test_a_setting_that_is_no_frame_is_refused(name, frame):
+    with pytest.raises(BadConfig, match=name) as error:
+        with_settings(Config(), {name: frame})
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize('name', ['odometer.field', 'odometer.left', 'output.directory'])
+def test_text_that_cannot_be_seen_is_no_setting(name):
+    for text in ('a\nb', 'a\x1b[2J', 'a\x00', 'a\udcff', 'a\u202eb'):
+        with pytest.raises(BadConfig, match='cannot be seen'):
+            with_settings(Config(), {name: text})
+    assert with_settings(Config(), {name: "ü $(x) 'y'"})
+
+
+def test_the_name_of_a_node_has_no_sign_that_ros_refuses():
+    node = ElementTree.fromstring(texts('car/imu-top.1')[1]['imu_transform.launch.xml'])[0]
+    assert node.attrib['name'] == 'base_link_to_car_imu_top_1'
+
+
+@pytest.mark.parametrize('bag', BAGS)
+def test_the_name_of_a_bag_stays_within_its_comment(bag):
+    _, written = texts(bag=bag)
+    plain = texts()[1]
+    for name, text in written.items():
+        text.encode()
+        assert len(text.splitlines()) == len(plain[name].splitlines()), name
+        assert text.replace('\n', '').isprintable(), name
+        if name.endswith('.yaml'):
+            assert yaml.safe_load(text) == yaml.safe_load(plain[name])
+        if name.endswith(('.xml', '.urdf')):
+            assert (ElementTree.canonicalize(text) == ElementTree.canonicalize(plain[name]))
+        if name == 'imu_transform.txt':
+            assert shlex.split(text, comments=True) == shlex.split(plain[name], comments=True)
+
+
+def test_words_come_to_a_command_as_they_are():
+    words = ['a b', "it's", '$(touch x)', '`x`', '', '-', 'ü']
+    out = subprocess.run(['bash', '-c', f'printf "%s\\0" {outside.for_shell(words)}'], text=True,
+                         stdout=subprocess.PIPE, check=True).stdout
+    assert out.split('\0')[:-1] == words
+
+
+def test_launch_substitutes_nothing():
+    text = outside.for_launch(["$(command 'x')", '"', '\\'])
+    # launch's grammar: $( begins a substitution unless a backslash stands before it
+    assert '$(' not in text.replace('\\$(', '')
+    assert text.replace('\\\\', '').count('"') == text.count('\\"')
+
+
+@pytest.mark.parametrize('text', ['0', 'on', '1e5', '.nan', 'a: b', '#', "it's", '"', '\\', '',
+                                  'ü', '😀', '- x', '{a}', 'x ' * 200])
+def test_text_in_yaml_is_read_back_as_text(text):
+    assert yaml.safe_load(value_text(text)) == text
+    assert '\n' not in value_text(text)
+    assert yaml.safe_load(parameters({'a': {'b': text}})) == {
+        '/**': {'ros__parameters': {'a': {'b': text}}}}
+
+
+def test_a_terminal_shows_control_characters_and_keeps_the_style_of_the_verdict():
+    assert outside.for_terminal('\x1b[1;32mACCEPTED\x1b[0m\na\x1b[2Jb\rc\x9b') == (
+        '\x1b[1;32mACCEPTED\x1b[0m\na\\x1b[2Jb\\rc\\x9b')
+    assert outside.one_line('a\nb\udcff') == 'a\\nb\\udcff'
+
+
+def test_all_commands_print_through_one_door():
+    folder = Path(outside.__file__).parent / 'offline'
+    users = {path.name for path in folder.glob('*.py') if 'print(' in path.read_text()}
+    # simulate: the share of its own work, which overwrites itself
+    assert users == {'say.py', 'simulate.py'}
+
+
+def test_no_cell_of_a_spreadsheet_is_a_formula():
+    made = calibration()
+    legs = (replace(made.legs[0], bag='=cmd|x!A1'), *made.legs)
+    rows = leg_table(replace(made, legs=legs), Config(), {})[LEGS].splitlines()
+    assert rows[1].startswith("1,'=cmd")
+    assert rows[2].startswith('2,drive,')
+
+
+def test_a_frame_that_nobody_names_leaves_all_as_it_is():
+    made = calibration()
+    assert framed(made, Config(), '') == (made, Config())

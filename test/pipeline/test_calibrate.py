@@ -1,0 +1,245 @@
+"""The pipeline as a whole: pure, honest over many drives, and never fooled for long."""
+
+from dataclasses import replace
+
+from drives import (
+    changed,
+    drive,
+    errors_in_sigmas,
+    everything_said,
+    LOW_RATES,
+    rejecting,
+    settings,
+    shifted,
+)
+import numpy as np
+import pytest
+
+from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.samples import take
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import with_settings
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+
+
+@pytest.fixture(scope='module')
+def town():
+    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+
+
+def test_the_same_leg_gives_the_same_result_to_the_last_bit(made):
+    first, second = (calibrate(made.leg(), settings(made)) for _ in range(2))
+    assert first.methods['two_point'].estimates == second.methods['two_point'].estimates
+    assert first.reasons == second.reasons
+    np.testing.assert_array_equal(first.track_n, second.track_n)
+
+
+def test_a_recorded_leg_gives_what_the_whole_drive_gives(made):
+    """Pre-roll cut, topics raced, closed late: no digit changes."""
+    recorder = LegRecorder()
+    for slot in ('fix', 'odometer', 'imu'):
+        block = getattr(made.leg(), slot)
+        for first in range(0, len(block.stamp_ns), 997):
+            recorder.feed(slot, take(block, slice(first, first + 997)))
+    leg = recorder.close(made.truth.start_ns, made.truth.stop_ns)
+    results = [calibrate(x, settings(made)) for x in (leg, made.leg())]
+    a, b = (r.methods['two_point'].estimates for r in results)
+    assert a == b
+
+
+def test_the_counts_of_a_result_are_those_of_the_leg(made):
+    leg = made.leg()
+    result = calibrate(leg, settings(made))
+    assert (result.start_ns, result.stop_ns) == (leg.start_ns, leg.stop_ns)
+    assert result.duration == pytest.approx((leg.stop_ns - leg.start_ns) * 1e-9)
+    assert result.distance == pytest.approx(made.truth.distance, rel=0.02)     # rough scale
+    assert result.imu_samples == len(leg.imu.stamp_ns)
+    # fixes between the marks, each at 0.2 s and 3 ms, half a second of slack at each side
+    assert abs(result.fixes - (result.duration + 0.5) * 5) <= 3
+    assert result.rejected_fixes == 0
+
+
+def test_notes_of_the_door_are_kept_and_weigh(made):
+    note = Reason(Code.BAG_TRUNCATED, '3 s are missing at the end')
+    result = calibrate(made.leg(), settings(made), notes=(note,))
+    assert note in result.reasons
+    assert result.verdict.value == 'caution'
+
+
+def test_a_holdout_checks_what_the_fit_has_not_seen(made):
+    result = calibrate(made.leg(), settings(made), holdout=True)
+    # the last fifth by the nominal scale is 6.1 % short; fixes of 1.5 m, each axis, on top
+    short = 0.061 * 0.2 * made.truth.distance
+    assert result.before.max == pytest.approx(short, abs=4 * 1.5)
+    assert result.before.rms > result.after.rms + 1.0
+    assert result.after.rms < 4.0
+    assert all(abs(z) < 5 for z in errors_in_sigmas(result, made.truth).values())
+
+
+def test_the_check_shows_the_correction(made):
+    result = calibrate(made.leg(), settings(made))
+    assert result.before.max > 0.05 * made.truth.distance
+    assert result.after.rms == pytest.approx(1.5 * np.sqrt(2), rel=0.15)
+    assert result.after.max < 5 * 1.5 * np.sqrt(2)
+
+
+def test_several_legs_of_one_vehicle(made):
+    others = [drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=s,
+                    start_ns=s * 10**12)
+              for s in (5, 6, 7, 8)]
+    legs = [calibrate(d.leg(), settings(d)) for d in others]
+    whole = combine(legs, settings(made))
+    one = legs[0].methods['two_point'].estimates
+    assert Code.LEGS_DISAGREE not in {r.code for r in whole.reasons}
+    assert whole.estimates[SCALE].sigma == pytest.approx(one[SCALE].sigma / 2, rel=0.25)
+    # the heading given is one and the same
+    assert 1e-3 < whole.estimates[YAW].sigma < one[YAW].sigma
+    assert abs(whole.estimates[SCALE].value - made.truth.scale) < 4 * whole.estimates[SCALE].sigma
+
+
+def test_a_bad_leg_among_good_ones_is_left_out(made):
+    good = calibrate(made.leg(), settings(made))
+    bad = calibrate(replace(made.leg(), odometer=changed(
+        made.odometer, value=lambda a: a * 0)), settings(made))
+    whole = combine([good, bad], settings(made))
+    assert whole.estimates[SCALE].value == good.methods['two_point'].estimates[SCALE].value
+    assert whole.verdict.value == 'caution'
+    assert any(r.text.startswith('leg 2: rejected and not used: the fixes move')
+               for r in whole.reasons)
+
+
+@pytest.mark.parametrize(('option', 'value'), [
+    ('outliers', 0.05), ('outages', ((70.0, 90.0), (100.0, 104.0))), ('slip_walk', 0.01),
+    ('two_wheels', True), ('odometer', 'speed'), ('odometer', 'angle'), ('roll', 0.05),
+    ('heading_sigma', 0.002), ('orientation_sigma', 0.002), ('imu_lever_arm', (1.0, 0.4, 0.5))])
+def test_what_drives_are_like(option, value):
+    made = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=9,
+                 **{option: value})
+    own = option in ('heading_sigma', 'orientation_sigma')
+    result = calibrate(made.leg(), settings(made, heading_sigma=None if own else 1e-3))
+    z = errors_in_sigmas(result, made.truth)
+    assert set(z) == {SCALE, YAW, PITCH}
+    assert not rejecting(result), everything_said(result)
+    assert all(abs(x) < 5 for x in z.values()), z
+
+
+def test_moving_the_marks_within_the_standstills_changes_little(made):
+    """Both marks stand: the same travel, the same fixes but for those outside."""
+    config = settings(made)
+    base = calibrate(made.leg(), config).methods['two_point'].estimates[SCALE]
+    for start, stop in ((-10.0, 0.0), (0.0, -15.0), (-40.0, -30.0)):
+        moved = calibrate(shifted(made.leg(), start=start, stop=stop), config)
+        e = moved.methods['two_point'].estimates[SCALE]
+        assert abs(e.value - base.value) < 0.5 * base.sigma
+
+
+@pytest.mark.parametrize(('grade', 'noise'), [('tactical', 'white'), ('industrial', 'correlated')])
+def test_sigmas_are_honest_over_many_drives(grade, noise):
+    """
+    60 drives: errors over sigmas have unit spread, and 95 % lie within 1.96.
+
+    A mean square of 60 strays by sqrt(2 / 60) = 0.18, a share of 95 % by 2.8 %; four of those
+    each way, and for correlated errors, whose sigma is itself judged from the leg, 1.3 times.
+    The large run is benchmarks/two_point_monte_carlo.py.
+    """
+    runs, z, slack = 60, [], 1.0 if noise == 'white' else 1.3
+    for seed in range(runs):
+        made = simulate(SimOptions(scenario='straight', duration=190.0, seed=seed,
+                                   imu_grade=grade, fix_noise=noise, **LOW_RATES))
+        error = 1e-3 * np.random.default_rng(seed).standard_normal()
+        config = with_settings(settings(made), {
+            'alignment.heading': float(made.truth.heading + error), 'verdict.max_yaw_sigma': 1.0,
+            'imu.misalignment_sigma': 0.0})      # the axes of this Imu are square
+        z.append(list(errors_in_sigmas(calibrate(made.leg(), config), made.truth).values()))
+    z = np.array(z)
+    assert z.shape == (runs, 3)
+    rms, stray = np.sqrt((z**2).mean(axis=0)), 4 * np.sqrt(2 / runs)
+    assert (rms < slack * np.sqrt(1 + stray)).all(), rms
+    assert (rms > np.sqrt(1 - stray) / slack).all(), rms
+    assert ((np.abs(z) < 1.96 * slack).mean(axis=0) >= 0.95 - 4 * 0.028).all()
+    assert (np.abs(z.mean(axis=0)) < 4 / np.sqrt(runs) * slack).all()      # nor is there a bias
+
+
+class Corruption:
+    """Faults that real recordings have, drawn by a seed."""
+
+    COLUMNS = {'imu': ('w_i', 'f_i'), 'odometer': ('value',),
+               'fix': ('latitude', 'longitude', 'height', 'covariance_n', 'status')}
+
+    def __init__(self, seed):
+        self.rng, self.what = np.random.default_rng(seed), []
+
+    def leg(self, leg):
+        for _ in range(self.rng.integers(1, 4)):
+            slot = str(self.rng.choice(list(self.COLUMNS)))
+            leg = replace(leg, **{slot: self._one(slot, getattr(leg, slot))})
+        return leg
+
+    def _one(self, slot, samples):
+        rng, n = self.rng, len(samples.stamp_ns)
+        kind = str(rng.choice(['drop', 'repeat', 'shuffle', 'late block', 'nan', 'huge', 'hang',
+                               'no stamp', 'set clock', 'false stamp']))
+        first, length = int(rng.integers(n)), int(rng.choice([1, 2, 20, 200]))
+        rows = slice(first, min(first + length, n))
+        self.what.append(f'{slot} {kind} {rows.start}:{rows.stop}')
+        order = np.arange(n)
+        if kind == 'drop':
+            return take(samples, np.delete(order, order[rows]))
+        if kind == 'repeat':
+            return take(samples, np.sort(np.concatenate([order, order[rows]])))
+        if kind == 'shuffle':
+            order[rows] = rng.permutation(order[rows])
+            return take(samples, order)
+        if kind == 'late block':
+            return take(samples, np.concatenate([np.delete(order, order[rows]), order[rows]]))
+        if kind == 'no stamp':
+            return changed(samples, stamp_ns=lambda a: a.__setitem__(rows, 0))
+        jump = int(rng.choice([10**6, 10**8, 10**10, -10**8, -10**10]))
+        if kind == 'set clock':
+            return changed(samples, stamp_ns=lambda a: a.__setitem__(
+                slice(first, None), a[first:] + jump))
+        if kind == 'false stamp':
+            return changed(samples, stamp_ns=lambda a: a.__setitem__(rows, a[rows] + jump))
+        return changed(samples, **{str(rng.choice(self.COLUMNS[slot])):
+                                   lambda a: self._values(kind, a, rows)})
+
+    def _values(self, kind, a, rows):
+        whole = a.dtype != float
+        if kind == 'hang':
+            a[rows] = a[rows.start]
+        elif kind == 'nan' and not whole:
+            a[rows] = np.nan
+        else:
+            big = float(self.rng.choice([1e4, 1e6, 1e18, 1e300]))
+            rows = slice(rows.start, rows.start + 2) if a.ndim == 2 else rows
+            a[rows] = int(min(big, 9e18)) if whole else big
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(('which', 'runs'), [('straight', 80), ('town', 40)])
+def test_nothing_raises_and_nothing_wrong_is_accepted(made, town, which, runs):
+    """120 corrupted legs: an accepted one is within six sigmas, a rejected one says why."""
+    it = made if which == 'straight' else town
+    config, verdicts = settings(it), []
+    for seed in range(runs):
+        fault = Corruption(seed)
+        leg = fault.leg(it.leg())
+        result = calibrate(leg, config)
+        whole = combine([result], config)
+        verdicts.append(whole.verdict.value)
+        if verdicts[-1] == 'rejected':
+            assert rejecting(result), fault.what
+        if verdicts[-1] == 'accepted':
+            z = errors_in_sigmas(result, it.truth)
+            assert all(abs(x) < 6 for x in z.values()), (seed, fault.what, z)
+    # the faults are such that most legs can still be used
+    assert verdicts.count('accepted') > runs / 2, verdicts
+    assert verdicts.count('rejected') > 3

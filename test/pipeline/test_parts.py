@@ -1,0 +1,97 @@
+"""A leg cut where the Imu was silent: its parts tell what a leg without the gap would."""
+
+from dataclasses import replace
+
+from drives import drive, seconds, settings
+import numpy as np
+import pytest
+
+from odocal_ros.data.samples import take
+from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.pipeline.parts import calibrate_parts, parts_of
+from odocal_ros.reasons import Code, Verdict
+
+SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=5)
+
+
+def silent(leg, *gaps):
+    """Return the leg with no Imu rows within some spans, s since the start mark."""
+    t, keep = seconds(leg, leg.imu), np.ones(len(leg.imu.stamp_ns), bool)
+    for begin, end in gaps:
+        keep &= (t < begin) | (t >= end)
+    return replace(leg, imu=take(leg.imu, keep))
+
+
+def of(leg, *gaps):
+    return [((p.start_ns - leg.start_ns) * 1e-9, (p.stop_ns - leg.start_ns) * 1e-9)
+            for p in parts_of(silent(leg, *gaps), 0.5)]
+
+
+def test_gaps_are_steps_beyond_a_limit_or_the_rhythm():
+    t = np.array([0.0, 1.0, 2.0, 5.0, 6.0])
+    np.testing.assert_array_equal(gaps_longer(t, 1.5), [(2.0, 5.0)])
+    assert len(gaps_in_rhythm(t)) == 0                  # too few to have one
+    t = np.r_[np.arange(20.0), 25.5]
+    np.testing.assert_array_equal(gaps_in_rhythm(t), [(19.0, 25.5)])
+
+
+def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
+    leg = made.leg()
+    stop = (leg.stop_ns - leg.start_ns) * 1e-9
+    assert parts_of(leg, 0.5) == [leg]
+    assert of(leg, (50.0, 50.4)) == [(0.0, stop)]
+    row = 0.0201      # s, of the Imu
+    assert of(leg, (50.0, 53.0), (120.0, 121.0)) == [
+        (0.0, pytest.approx(50.0, abs=row)), (pytest.approx(53.0, abs=row),
+                                              pytest.approx(120.0, abs=row)),
+        (pytest.approx(121.0, abs=row), stop)]
+    # silent until the stop mark: what came before is left
+    assert of(leg, (stop - 5.0, stop + 100.0)) == [(0.0, pytest.approx(stop - 5.0, abs=row))]
+    # silent before the start mark: the leg itself, but nothing from before the gap
+    (one,) = parts_of(silent(leg, (-8.0, -3.0)), 0.5)
+    assert (one.start_ns, one.stop_ns) == (leg.start_ns, leg.stop_ns)
+    assert seconds(leg, one.imu).min() == pytest.approx(-3.0, abs=row)
+
+
+def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
+    leg = made.leg()
+    # an Imu without errors of scale and axes, as it is simulated: of another, a part may believe
+    # that there are none where the other cannot tell, and the wider belief counts for both
+    config = settings(made, heading_sigma=None, method='smoother', verdict__max_yaw_sigma=0.0087,
+                      verdict__max_scale_sigma=0.001, imu__accel_scale_sigma=0.0,
+                      imu__misalignment_sigma=0.0, imu__gyro_by_force_sigma=0.0)
+    cut = silent(leg, (130.0, 133.0))
+    alone = calibrate(cut, config)
+    assert Code.IMU_GAP in {r.code for r in alone.reasons}
+    told = []
+    results = calibrate_parts(cut, config, progress=lambda share, stage: told.append(share))
+    assert len(results) == 2
+    assert told == sorted(told)
+    whole = combine(results, config)
+    assert whole.verdict is Verdict.ACCEPTED
+    assert [r.text for r in whole.reasons if r.code is Code.LEG_CUT][0].startswith(
+        'leg 1: this is the leg from 0.0 to 1')
+    for name, true in ((SCALE, made.truth.scale), (YAW, made.truth.yaw)):
+        e = whole.estimates[name]
+        assert abs(e.value - true) < 4 * e.sigma, name
+        assert e.sigma < min(one.methods['smoother'].estimates[name].sigma
+                             for one in results), name
+
+
+def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):
+    config = settings(made, heading_sigma=None, method='smoother')
+    stop = (made.leg().stop_ns - made.leg().start_ns) * 1e-9
+    dead = silent(made.leg(), (3.0, stop - 3.0))
+    (only,) = calibrate_parts(dead, config)
+    assert Code.IMU_GAP in {r.code for r in only.reasons}
+    full = silent(made.leg(), *((t, t + 2.0) for t in np.arange(5.0, stop, 8.0)))
+    assert parts_of(full, 0.5) == [full]        # one that stutters is not cut to pieces
+    (only,) = calibrate_parts(full, config)
+    assert only.verdict is Verdict.REJECTED
+    assert Code.IMU_GAP in {r.code for r in only.reasons}

@@ -1,0 +1,106 @@
+"""The smoother as a member of the pipeline."""
+
+from drives import drive, settings
+import numpy as np
+import pytest
+
+from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.pipeline.smoother_run import _late_path
+from odocal_ros.reasons import Verdict
+
+SIGMAS = 4.0     # 1 in 16 000 of a normal error; the seed is fixed
+ASKED = {'method': 'smoother', 'heading_sigma': None}      # no heading from outside
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=240.0, imu_grade='industrial', seed=11)
+
+
+@pytest.fixture(scope='module')
+def held(made):
+    return calibrate(made.leg(), settings(made, **ASKED), holdout=True)
+
+
+def test_scale_yaw_and_pitch_come_without_a_heading(made, held):
+    found = held.methods['smoother'].estimates
+    for name, true in (('scale_factor', made.truth.scale), ('yaw_mounting_angle', made.truth.yaw),
+                       ('pitch_mounting_angle', made.truth.pitch)):
+        assert abs(found[name].value - true) < SIGMAS * found[name].sigma, name
+    assert held.methods['two_point'].estimates['yaw_mounting_angle'].value is None
+
+
+def test_the_fifth_held_back_is_met_by_dead_reckoning_with_the_values_found(made, held):
+    assert held.after.rms < held.before.rms / 4
+    whole = calibrate(made.leg(), settings(made, **ASKED))
+    assert whole.methods['smoother'].estimates['scale_factor'].value \
+        != held.methods['smoother'].estimates['scale_factor'].value
+
+
+def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held):
+    whole = combine([held], settings(made, **ASKED))
+    assert whole.estimates['yaw_mounting_angle'].method == 'smoother'
+    assert whole.verdict is Verdict.ACCEPTED
+    assert 'NO_STANDSTILL' not in {r.code.name for r in whole.reasons}
+
+
+def test_auto_takes_it_and_computes_two_point_beside_it(made):
+    told = []
+    leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None),
+                    progress=lambda share, stage: told.append((share, stage)))
+    # how far it is, pass by pass, and never all before the end
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[0] == 0
+    assert 0.8 < shares[-1] < 1
+    assert list(dict.fromkeys(stage for _, stage in told)) == ['two_point', 'smoother', 'tracks']
+    assert len(told) > 8
+    assert set(leg.methods) == {'smoother', 'two_point'}
+    assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
+
+
+def test_all_says_of_each_method_why_it_gives_nothing(made):
+    leg = calibrate(made.leg(), settings(made, method='all', heading_sigma=None))
+    (why,) = leg.methods['wheels'].reasons[-1:]
+    assert 'two wheels' in why.text
+    assert leg.verdict is Verdict.ACCEPTED
+
+
+def test_before_and_after_differ_in_what_is_calibrated_and_not_in_the_gyros_drift():
+    """One is the other turned by the yaw and stretched by the ratio, but for level and lever."""
+    made = drive(scenario='town', duration=240.0, imu_grade='consumer', seed=13)
+    leg = calibrate(made.leg(), settings(made, **ASKED))
+    found = leg_estimates(leg)
+    before, after = (x[:, 0] + 1j * x[:, 1] for x in (
+        leg.track_before_n - leg.track_before_n[0], leg.track_n - leg.track_n[0]))
+    c = np.vdot(after, before) / np.vdot(after, after)
+    assert abs(c) == pytest.approx(1 / found['scale_ratio'].value, rel=1e-3)
+    assert np.angle(c) == pytest.approx(found['yaw_mounting_angle'].value, abs=2e-3)
+    assert np.abs(before - c * after).max() < 1e-3 * np.abs(after).max()
+    # a piece as configured ends |c - 1| of its chord away, and no chord is longer than its piece
+    (first, *_) = leg.per_distance
+    assert first.after < first.before < np.hypot(abs(c - 1) * first.length, 2 * first.after)
+
+
+def test_dead_reckoning_as_calibrated_allows_for_a_delay_of_the_fixes():
+    """A late fix lies behind by delay times speed: at rest nowhere, at 15 m/s by 4.5 m."""
+    late = drive(scenario='town', duration=240.0, imu_grade='tactical', fix_noise='rtk',
+                 fix_delay=0.3, seed=12)
+    leg = calibrate(late.leg(), settings(late, **ASKED))
+    evidence = leg.evidence
+    assert leg.methods['smoother'].estimates['gnss_delay'].value == pytest.approx(0.3, abs=0.02)
+    behind = 0.3 * evidence.speed.max()
+    assert behind > 3.0
+    assert leg.after.max < behind / 3
+    assert np.nanmax(np.abs(evidence.sections.ratio - 1)) < 0.003
+
+
+def test_the_path_runs_on_for_the_delay_beyond_the_data():
+    t = np.linspace(0.0, 10.0, 101)
+    track = dead_reckon(t, np.tile([0.0, 0.0, 0.0, 1.0], (101, 1)), Travel(t, 5.0 * t, 0.0))
+    path = _late_path(track, np.array([2.0, 0.0, 0.0]), np.zeros(3), -0.3)
+    assert path(np.array([0.0, 4.0, 9.9, 10.0]))[:, 0] == pytest.approx([3.0, 43.0, 102.0, 103.0])
+    assert path(np.array(12.0))[0] == pytest.approx(103.0), 'no farther than the delay'

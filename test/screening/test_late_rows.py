@@ -1,0 +1,121 @@
+"""Odometer messages that came late in bursts: put back, said, and not taken for slip."""
+
+from dataclasses import replace
+
+from drives import drive, everything_said, settings
+import numpy as np
+import pytest
+
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
+from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.reasons import Code
+from odocal_ros.screening.late_rows import COUNTS
+from odocal_ros.screening.screen import screen
+
+SLIP_M, SLIP_S = 0.5, 200.0
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='town', duration=400.0, imu_grade='industrial', odometer_rate=50.0,
+                 seed=8)
+
+
+def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
+    """Return rows with arrivals as a line has them that stops now and then, and which it held."""
+    t = (samples.stamp_ns - samples.stamp_ns[0]) * 1e-9
+    free = np.where(t % every_s < how_long_s, t - t % every_s + how_long_s, t)
+    for k in range(1, len(free)):        # one after the other
+        free[k] = max(free[k], free[k - 1] + drain_s)
+    stamps = samples.stamp_ns[0] + np.round(free * 1e9).astype(np.int64)
+    return OdometerSamples(stamps, stamps, samples.value), free - t > drain_s
+
+
+def spun(made, samples):
+    """Return rows of a wheel that turns half a metre more within half a second."""
+    t = (samples.stamp_ns - made.leg().start_ns) * 1e-9
+    more = SLIP_M / made.truth.scale * np.clip((t - SLIP_S) / 0.5, 0.0, 1.0)
+    return replace(samples, value=samples.value + np.round(more).astype(np.int64))
+
+
+def of_smoother(made, samples):
+    leg = replace(made.leg(), odometer=samples)
+    result = calibrate(leg, settings(made, heading_sigma=None, method='smoother'))
+    return result.methods['smoother'], everything_said(result)
+
+
+@pytest.mark.parametrize(('how_long_s', 'drain_s'), [(0.12, 1e-4), (0.12, 0.01), (1.5, 0.012)],
+                         ids=['at once', 'slow line', 'starved'])
+def test_late_rows_are_put_where_they_were_taken(made, how_long_s, drain_s):
+    late, held = held_up(made.odometer, how_long_s=how_long_s, drain_s=drain_s)
+    inputs, found = screen(replace(made.leg(), odometer=late), settings(made))
+    sent, _ = screen(made.leg(), settings(made))
+    assert len(inputs.travel.t) == len(sent.travel.t)
+    moving = np.abs(np.gradient(sent.travel.s, sent.travel.t)) * made.truth.scale > 2.0
+    at = held & moving
+    assert at.sum() > 50
+    assert np.abs(inputs.travel.t - sent.travel.t)[at].max() < 0.003      # they were 0.12 s late
+    np.testing.assert_array_equal(inputs.travel.s, sent.travel.s)
+    text, = (r.text for r in found if r.code is Code.ODOMETER_LATE)
+    worst = float(text.split('by up to ')[1].split(' s')[0])
+    assert how_long_s - 0.03 < worst <= how_long_s
+
+
+def test_late_rows_are_no_slip(made):
+    late, _ = held_up(made.odometer)
+    method, said = of_smoother(made, late)
+    assert Code.ODOMETER_LATE in said
+    assert Code.WHEEL_SLIP not in said
+    straight, _ = of_smoother(made, made.odometer)
+    a, b = (m.estimates['scale_factor'] for m in (method, straight))
+    assert abs(a.value - b.value) < 0.1 * b.sigma
+    assert a.sigma == pytest.approx(b.sigma, rel=0.05)
+
+
+def test_a_slip_between_late_rows_is_found(made):
+    late, _ = held_up(spun(made, made.odometer))
+    method, said = of_smoother(made, late)
+    assert Code.ODOMETER_LATE in said
+    assert Code.WHEEL_SLIP in said
+    largest = method.details['slips'][0]
+    assert largest['metres'] == pytest.approx(SLIP_M, rel=0.25)
+    assert largest['t'] - 1.5 < SLIP_S < largest['t'] + largest['duration'] + 1.5
+
+
+def test_lost_rows_within_a_burst(made):
+    """A queue that runs over: of a burst some rows are lost, and its rhythm tells nothing."""
+    late, held = held_up(made.odometer)
+    lost = held & (np.arange(len(held)) % 3 == 0)
+    inputs, _ = screen(replace(made.leg(), odometer=take(late, ~lost)), settings(made))
+    straight, _ = screen(made.leg(), settings(made))
+    raw = (take(late, ~lost).stamp_ns - made.leg().start_ns) * 1e-9
+    off = np.abs(inputs.travel.s - straight.travel.at(inputs.travel.t)).max() * made.truth.scale
+    as_sent = np.abs(inputs.travel.s - straight.travel.at(raw)).max() * made.truth.scale
+    assert as_sent > 1.0
+    assert off < 0.3 * as_sent
+
+
+def test_increments_that_are_late_are_not_lost(made):
+    """Half a second of silence is a lost increment, unless what comes makes up for it."""
+    form = OdometerForm('increment', 0, 'm/pulse')
+    steps = replace(made.odometer, value=np.diff(made.odometer.value,
+                                                 prepend=made.odometer.value[:1]))
+    late, _ = held_up(steps, how_long_s=0.5)
+    inputs, found = screen(replace(made.leg(), odometer=late, form=form), settings(made))
+    straight, _ = screen(replace(made.leg(), odometer=steps, form=form), settings(made))
+    assert inputs.travel.s[-1] == straight.travel.s[-1]
+    assert not len(inputs.doubt_t)
+    assert {r.code for r in found} == {Code.ODOMETER_LATE}
+
+
+def test_fresh_counts_at_odd_times_stay_where_they_are(made):
+    """A sender that is busy and then reads what the counter is at: stamps and counts agree."""
+    t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
+    kept = (t % 15.0 > 0.12) | (np.arange(len(t)) % 7 == 0)
+    odd = take(made.odometer, kept)
+    inputs, _ = screen(replace(made.leg(), odometer=odd), settings(made))
+    sent = (odd.stamp_ns - made.leg().start_ns) * 1e-9
+    truth, _ = screen(made.leg(), settings(made))
+    off = np.abs(inputs.travel.s - truth.travel.at(inputs.travel.t))
+    assert off.max() <= COUNTS + 0.5
+    assert (inputs.travel.t <= sent).all()

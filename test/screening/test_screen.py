@@ -1,0 +1,386 @@
+"""Screening: what is dropped, what is said of it, and that the rest is used."""
+
+from dataclasses import replace
+
+from drives import changed, drive, seconds, settings
+import numpy as np
+import pytest
+
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import join, no_fix, no_imu, no_odometer, OdometerForm, take
+from odocal_ros.reasons import Code
+from odocal_ros.screening.screen import screen
+from odocal_ros.settings.config import Config, with_settings
+
+MS = 10**6
+
+
+@pytest.fixture(scope='module')
+def made():
+    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+
+
+@pytest.fixture(scope='module')
+def leg(made):
+    return made.leg()
+
+
+def said(leg, config=None):
+    inputs, found = screen(leg, config or Config())
+    return inputs, {r.code: r.text for r in found}, [r.text for r in found]
+
+
+def test_fixes_screened_by_a_setting_name_it_and_are_no_gap(leg):
+    poor = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(100, 300), 25 * np.eye(3)))
+    _, found = screen(replace(leg, fix=poor), Config())
+    (reason,) = found
+    assert reason.code is Code.BAD_ROWS_DROPPED
+    assert '200 with sigma above 3 m' in reason.text
+    assert 'gnss.max_sigma' in reason.remedy
+
+
+def test_a_clean_leg_is_used_to_the_last_row(leg):
+    inputs, codes, _ = said(leg)
+    assert codes == {}
+    assert len(inputs.t_imu) == len(leg.imu.stamp_ns)
+    assert len(inputs.travel.t) == len(leg.odometer.stamp_ns)
+    assert len(inputs.t_fix) == len(leg.fix.stamp_ns)
+    assert inputs.fixes_rejected == 0
+    np.testing.assert_array_equal(inputs.w_b, leg.imu.w_i)
+
+
+@pytest.mark.parametrize(('slot', 'column', 'label'), [
+    ('imu', 'w_i', 'Imu'), ('imu', 'f_i', 'Imu'), ('fix', 'latitude', 'fix')])
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, 1e200])
+def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, label, value):
+    bad = changed(getattr(leg, slot), **{column: lambda a: a.__setitem__(slice(40, 43), value)})
+    inputs, _, texts = said(replace(leg, **{slot: bad}))
+    t = seconds(leg, bad)[40]
+    if slot == 'fix' and value == 1e200:
+        assert texts == [f'3 of {len(bad.stamp_ns)} fixes are not used: 3 at no real position']
+    else:
+        assert texts == [f'3 of {len(bad.stamp_ns)} {label} messages hold NaN, Inf or a value '
+                         f'beyond any sensor, first at t = {t:.2f} s; dropped']
+    kept = inputs.t_imu if slot == 'imu' else inputs.t_fix
+    assert len(kept) == len(bad.stamp_ns) - 3
+    assert np.isfinite(inputs.w_b).all()
+    assert np.isfinite(inputs.f_b).all()
+
+
+def test_rows_without_a_stamp_are_dropped_and_found_by_arrival(leg):
+    bad = changed(leg.odometer, stamp_ns=lambda a: a.__setitem__(slice(100, 105), 0))
+    inputs, codes, texts = said(replace(leg, odometer=bad))
+    t = (leg.odometer.received_ns[100] - leg.start_ns) * 1e-9
+    assert texts[0] == (f'5 of {len(bad.stamp_ns)} odometer messages have no stamp (zero or '
+                        f'negative), first at t = {t:.2f} s; dropped')
+    assert len(inputs.travel.t) == len(bad.stamp_ns) - 5
+    assert inputs.travel.s[-1] == leg.odometer.value[-1] - leg.odometer.value[0]
+
+
+def test_one_stamp_in_the_future_costs_one_row(leg):
+    bad = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(500, a[500] + 3600 * 10**9))
+    inputs, codes, _ = said(replace(leg, imu=bad))
+    assert len(inputs.t_imu) == len(bad.stamp_ns) - 1
+    assert '1 of' in codes[Code.STAMPS_NOT_RISING]
+    assert 'step back' in codes[Code.STAMPS_NOT_RISING]
+    assert Code.CLOCKS_DIFFER not in codes
+
+
+def test_a_clock_set_back_costs_the_shorter_side_and_is_named(leg):
+    n, at = len(leg.imu.stamp_ns), 4000
+    bad = changed(leg.imu, stamp_ns=lambda a: a.__setitem__(slice(at, None), a[at:] - 2 * 10**9))
+    inputs, _, texts = said(replace(leg, imu=bad))
+    # two seconds of stamps come twice: 100 rows of 50 Hz, those of one side
+    assert n - len(inputs.t_imu) == 100
+    assert (np.diff(inputs.t_imu) > 0).all()
+    assert sum('the Imu clock was set by -2.000 s during the leg' in x for x in texts) == 1
+
+
+def test_rows_out_of_order_are_no_clock_that_was_set(leg):
+    order = np.arange(len(leg.imu.stamp_ns))
+    order[3000:3200] = np.random.default_rng(1).permutation(order[3000:3200])
+    inputs, codes, _ = said(replace(leg, imu=take(leg.imu, order)))
+    assert set(codes) == {Code.STAMPS_NOT_RISING}
+    assert (np.diff(inputs.t_imu) > 0).all()
+
+
+def test_duplicates_are_used_once(leg):
+    twice = join([take(leg.fix, slice(0, 200)), take(leg.fix, slice(150, None))])
+    again = take(leg.fix, np.repeat(np.arange(len(leg.fix.stamp_ns)), 2))
+    for fix, repeats in ((twice, 50), (again, len(leg.fix.stamp_ns))):
+        inputs, codes, _ = said(replace(leg, fix=fix))
+        np.testing.assert_array_equal(inputs.geodetic[:, 0], leg.fix.latitude)
+        assert f'{repeats} of {len(fix.stamp_ns)} messages dropped' in codes[
+            Code.STAMPS_NOT_RISING]
+
+
+def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
+    """A node in simulated time that stands still for 8 s of 10 has them all at the same time."""
+    def queued(samples):
+        t = seconds(leg, samples)
+        late = np.where(t % 10 < 8, t - t % 10 + 8, t)
+        return replace(samples, received_ns=leg.start_ns + np.round(late * 1e9).astype(np.int64))
+    slots = {slot: queued(getattr(leg, slot)) for slot in ('imu', 'odometer', 'fix')}
+    assert Code.CLOCKS_DIFFER not in said(replace(leg, **slots))[1]
+    slots['fix'] = replace(slots['fix'], stamp_ns=slots['fix'].stamp_ns + 700_000_000)
+    assert 'the fix stamps are +0.7' in said(replace(leg, **slots))[1][Code.CLOCKS_DIFFER]
+
+
+@pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
+                                               ('fix', 'gnss.time_offset')])
+@pytest.mark.parametrize('late', [0.8, -0.8])
+def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, setting, late):
+    other = changed(getattr(leg, slot), stamp_ns=lambda a: a + round(late * 1e9))
+    moved = replace(leg, **{slot: other})
+    _, codes, _ = said(moved)
+    seen = float(codes[Code.CLOCKS_DIFFER].split('are ')[1].split(' s')[0])
+    assert abs(seen - late) < 0.055       # fixes take 0.05 s to arrive, which looks the same
+    assert f'to {setting}' in codes[Code.CLOCKS_DIFFER]
+    inputs, codes, _ = said(moved, with_settings(Config(), {setting: -late}))
+    assert Code.CLOCKS_DIFFER not in codes
+    t = inputs.travel.t if slot == 'odometer' else inputs.t_fix
+    np.testing.assert_allclose(t, seconds(leg, getattr(leg, slot)), atol=1e-9)
+
+
+def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
+    far = changed(leg.fix, stamp_ns=lambda a: a - 3600 * 10**9)
+    _, codes, _ = said(replace(leg, fix=far))
+    assert '-3600.0' in codes[Code.CLOCKS_DIFFER]
+    assert 'time_offset' not in codes[Code.CLOCKS_DIFFER]
+
+
+def test_the_imus_own_offset_moves_the_others_since_marks_are_imu_stamps(leg):
+    inputs, _, _ = said(leg, with_settings(Config(), {'imu.time_offset': 0.25}))
+    np.testing.assert_allclose(inputs.travel.t, seconds(leg, leg.odometer) - 0.25, atol=1e-9)
+    np.testing.assert_allclose(inputs.t_fix, seconds(leg, leg.fix) - 0.25, atol=1e-9)
+    np.testing.assert_allclose(inputs.t_imu, seconds(leg, leg.imu), atol=1e-9)
+
+
+@pytest.mark.parametrize(('slot', 'empty', 'code'), [
+    ('imu', no_imu, Code.NO_IMU), ('odometer', no_odometer, Code.NO_ODOMETER),
+    ('fix', no_fix, Code.NO_FIX)])
+def test_a_topic_that_never_came_is_named(leg, slot, empty, code):
+    _, codes, _ = said(replace(leg, **{slot: empty()}))
+    assert code in codes
+    assert code.gravity.value == 'rejected'
+
+
+def test_an_empty_leg_screens_to_nothing_without_a_fault():
+    inputs, codes, _ = said(Leg(start_ns=10**18, stop_ns=10**18 + 10**9))
+    assert {Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX} <= set(codes)
+    assert len(inputs.t_imu) == len(inputs.travel.t) == len(inputs.t_fix) == 0
+
+
+def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
+    def lost(fix, rows):
+        return changed(fix, status=lambda a: a.__setitem__(rows, -1),
+                       latitude=lambda a: a.__setitem__(rows, np.nan),
+                       longitude=lambda a: a.__setitem__(rows, np.nan))
+    n = len(leg.fix.stamp_ns)
+    inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(0, 9))))
+    assert codes == {Code.BAD_ROWS_DROPPED: f'9 of {n} fixes are not used: 9 with status below 0'}
+    assert inputs.fixes_rejected == 9
+    inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(None))))
+    assert codes == {
+        Code.FIXES_UNUSABLE: f'{n} of {n} fixes are not used: {n} with status below 0'}
+    assert len(inputs.t_fix) == 0
+    # asked for, even a fix that is none is no position
+    inputs, codes, _ = said(replace(leg, fix=lost(leg.fix, slice(0, 9))),
+                            with_settings(Config(), {'gnss.min_status': -1}))
+    assert len(inputs.t_fix) == n - 9
+    assert np.isfinite(inputs.geodetic).all()
+
+
+@pytest.mark.parametrize(('columns', 'text'), [
+    ({'latitude': 0.0, 'longitude': 0.0}, '4 at no real position'),
+    ({'latitude': 2.0}, '4 at no real position'),
+    ({'longitude': 1.0}, '4 at no real position'),      # half a world from the others
+    ({'height': 1e6}, '4 at no real position'),
+    ({'status': -1}, '4 with status below 0')])
+def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
+    bad = changed(leg.fix, **{k: lambda a, v=v: a.__setitem__(slice(70, 74), v)
+                              for k, v in columns.items()})
+    inputs, codes, _ = said(replace(leg, fix=bad))
+    assert codes[Code.BAD_ROWS_DROPPED].endswith(text)
+    assert inputs.fixes_rejected == 4
+
+
+@pytest.mark.parametrize('how', ['zero', 'nan', 'inf', 'negative', 'type'])
+def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, how):
+    if how == 'type':
+        bad = changed(leg.fix, covariance_type=lambda a: a * 0)
+    else:
+        value = {'zero': 0.0, 'nan': np.nan, 'inf': np.inf, 'negative': -1.0}[how]
+        bad = changed(leg.fix, covariance_n=lambda a: a * 0 + value)
+    n = len(bad.stamp_ns)
+    inputs, codes, _ = said(replace(leg, fix=bad),
+                            with_settings(Config(), {'gnss.default_sigma': 4.0}))
+    assert codes[Code.COVARIANCE_UNKNOWN] == (
+        f'{n} of {n} fixes come without a usable covariance; taken as 4 m (gnss.default_sigma)')
+    np.testing.assert_array_equal(inputs.covariance_n[5], np.diag([16.0, 16.0, 64.0]))
+    assert len(inputs.t_fix) == n         # unknown is not above gnss.max_sigma
+
+
+def test_a_height_without_a_variance_leaves_the_level_part_standing(leg):
+    bad = changed(leg.fix, covariance_n=lambda a: a.__setitem__((slice(None), 2, 2), np.nan))
+    inputs, codes, _ = said(replace(leg, fix=bad))
+    assert codes == {}
+    np.testing.assert_array_equal(inputs.covariance_n[:, :2, :2], leg.fix.covariance_n[:, :2, :2])
+    np.testing.assert_allclose(inputs.covariance_n[:, 2, 2], 4 * leg.fix.covariance_n[:, 0, 0])
+
+
+def test_poor_fixes_are_left_out_by_the_limit_and_zero_takes_it_off(leg):
+    bad = changed(leg.fix, covariance_n=lambda a: a.__setitem__(slice(20, 26), np.eye(3) * 25.0))
+    inputs, codes, _ = said(replace(leg, fix=bad))
+    assert codes[Code.BAD_ROWS_DROPPED].endswith('6 with sigma above 3 m')
+    assert inputs.fixes_rejected == 6
+    inputs, codes, _ = said(replace(leg, fix=bad), with_settings(Config(), {'gnss.max_sigma': 0}))
+    assert codes == {}
+    assert inputs.fixes_rejected == 0
+
+
+@pytest.mark.parametrize(('slot', 'label'), [('odometer', 'odometer'), ('fix', 'fix')])
+def test_a_gap_far_beyond_a_topics_own_rhythm_is_a_note(leg, slot, label):
+    t = seconds(leg, getattr(leg, slot))
+    keep = (t < 30) | (t > 42)
+    _, codes, _ = said(replace(leg, **{slot: take(getattr(leg, slot), keep)}))
+    assert set(codes) == {Code.TOPIC_GAP}
+    assert codes[Code.TOPIC_GAP].startswith(f'{label} gap of 12.')
+    assert Code.TOPIC_GAP.gravity.value == 'accepted'
+
+
+@pytest.mark.parametrize(('length', 'size'), [(1, 50.0), (2, 5.0), (5, 10.0), (15, 3.0)])
+def test_a_burst_of_false_rates_is_left_out(leg, length, size):
+    rows = slice(4000, 4000 + length)
+    bad = changed(leg.imu, w_i=lambda a: a.__setitem__((rows, 2), size))
+    inputs, codes, _ = said(replace(leg, imu=bad))
+    assert f'{length} of' in codes[Code.BAD_ROWS_DROPPED]
+    assert 'stand alone' in codes[Code.BAD_ROWS_DROPPED]
+    assert np.abs(inputs.w_b).max() < 0.1
+
+
+@pytest.mark.parametrize(('slot', 'name', 'axis', 'size'), [
+    ('w_i', 'w_b', 2, 0.05), ('w_i', 'w_b', 0, -0.7), ('f_i', 'f_b', 1, 20.0)])
+def test_one_row_off_by_what_a_sensor_might_say_is_left_out(leg, slot, name, axis, size):
+    """In 0.1 s, 0.4 rad/s turned a track by 2 deg: a scale 13 sigmas off was accepted."""
+    def off(column):
+        column[[4000, 5000, 6001], axis] += size
+    inputs, codes, _ = said(replace(leg, imu=changed(leg.imu, **{slot: off})))
+    assert '3 of' in codes[Code.BAD_ROWS_DROPPED]
+    rows = np.delete(getattr(said(leg)[0], name), [4000, 5000, 6001], axis=0)
+    assert np.array_equal(getattr(inputs, name), rows)
+
+
+def test_hard_driving_is_no_glitch():
+    """
+    A robot that spins up by 10 rad/s^2 to 2 rad/s and stops as hard keeps all rows.
+
+    At 50 Hz that is 0.2 rad/s from row to row, a quarter of the least bound of a glitch.
+    """
+    made = drive(scenario='straight', duration=200.0, imu_grade='consumer', seed=6)
+    leg = made.leg()
+    t = seconds(leg, leg.imu)
+    spin = np.clip(10 * (t - 50.0), 0, 2) - np.clip(10 * (t - 50.3), 0, 2)
+    bad = changed(leg.imu, w_i=lambda a: a.__setitem__((slice(None), 2), a[:, 2] + spin))
+    inputs, codes, _ = said(replace(leg, imu=bad))
+    assert Code.BAD_ROWS_DROPPED not in codes
+    assert len(inputs.t_imu) == len(t)
+
+
+def test_a_gyro_that_hangs_while_the_wheels_roll_is_a_gap(leg):
+    t = seconds(leg, leg.imu)
+    hung = slice(np.searchsorted(t, 60.0), np.searchsorted(t, 64.0))
+    bad = changed(leg.imu, w_i=lambda a: a.__setitem__(hung, a[hung.start]))
+    _, codes, _ = said(replace(leg, imu=bad))
+    assert codes[Code.IMU_GAP].startswith('the gyro repeats one value for 3.98 s at t = 60.00 s')
+    # at rest a quantised gyro may well repeat itself
+    rest = slice(np.searchsorted(t, -30.0), np.searchsorted(t, -20.0))
+    bad = changed(leg.imu, w_i=lambda a: a.__setitem__(rest, a[rest.start]))
+    assert Code.IMU_GAP not in said(replace(leg, imu=bad))[1]
+
+
+class TestOdometerCare:
+    """False counts, lost increments: the travel stays that of the true counter."""
+
+    @staticmethod
+    def travelled(leg):
+        return said(leg)[0].travel
+
+    @pytest.mark.parametrize('value', [0, -50_000, 2**62, 10**9])
+    @pytest.mark.parametrize('length', [1, 20, 300])
+    def test_a_counter_that_jumps_away_and_back_is_mended(self, leg, value, length):
+        rows = slice(2000, 2000 + length)
+        bad = changed(leg.odometer, value=lambda a: a.__setitem__(rows, value))
+        inputs, codes, _ = said(replace(leg, odometer=bad))
+        assert Code.COUNTER_RESET not in codes
+        true = self.travelled(leg)
+        assert inputs.travel.s[-1] == true.s[-1]
+        assert 'hang or jump away' in codes[Code.BAD_ROWS_DROPPED]
+        assert inputs.doubt_sigma.sum() == 0
+
+    @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s
+    def test_a_counter_that_hangs_and_catches_up_is_mended(self, leg, first):
+        rows = slice(first, first + 150)
+        bad = changed(leg.odometer, value=lambda a: a.__setitem__(rows, a[first]))
+        inputs, codes, _ = said(replace(leg, odometer=bad))
+        assert Code.COUNTER_RESET not in codes
+        assert inputs.travel.s[-1] == self.travelled(leg).s[-1]
+
+    def test_a_reset_is_bridged_and_leaves_a_doubt_that_covers_it(self, leg):
+        at = 2000     # 12 m/s
+        bad = changed(leg.odometer, value=lambda a: a.__setitem__(slice(at, None), a[at:] - a[at]))
+        inputs, codes, _ = said(replace(leg, odometer=bad))
+        assert 'a reset, not motion' in codes[Code.COUNTER_RESET]
+        error = inputs.travel.s[-1] - self.travelled(leg).s[-1]
+        speed = 12.0 / drive(scenario='straight', duration=200.0, imu_grade='tactical',
+                             seed=5).options.scale
+        # one interval at the speed beside it, uniform between none and two of it
+        np.testing.assert_allclose(inputs.doubt_sigma, speed * 0.05 / np.sqrt(3), rtol=0.05)
+        assert abs(error) < 3 * inputs.doubt_sigma[0]
+
+    def test_lost_increments_are_bridged_at_the_speed_beside(self, leg):
+        step = np.diff(leg.odometer.value, prepend=leg.odometer.value[:1])
+        form = OdometerForm('increment', 0, 'm/pulse')
+        whole = replace(leg, odometer=changed(leg.odometer, value=lambda a: step), form=form)
+        keep = np.ones(len(step), bool)
+        keep[2000:2040] = False
+        inputs, codes, _ = said(replace(whole, odometer=take(whole.odometer, keep)))
+        lost = step[2000:2040].sum()
+        error = inputs.travel.s[-1] - self.travelled(whole).s[-1]
+        # the speed is even there: but for rounding of counts at each side, nothing is lost
+        assert abs(error) < 0.01 * lost
+        assert abs(error) < 3 * inputs.doubt_sigma[0] < 0.2 * lost
+        np.testing.assert_allclose(self.travelled(whole).s[-1], self.travelled(leg).s[-1])
+
+    def test_a_speed_that_jumps_is_left_out(self):
+        made = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
+                     odometer='speed')
+        bad = changed(made.odometer, value=lambda a: a.__setitem__([2500, 2900], [90.0, -40.0]))
+        inputs, codes, _ = said(replace(made.leg(), odometer=bad))
+        assert codes[Code.BAD_ROWS_DROPPED].startswith('2 of')
+        np.testing.assert_allclose(inputs.travel.s[-1], self.travelled(made.leg()).s[-1],
+                                   rtol=1e-6)
+
+
+def test_two_wheels_give_their_mean(made):
+    two = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
+                two_wheels=True)
+    inputs, codes, _ = said(two.leg(), settings(two))
+    assert codes == {}
+    np.testing.assert_allclose(
+        inputs.travel.s[-1], (inputs.travel_left.s[-1] + inputs.travel_right.s[-1]) / 2)
+    _, codes, _ = said(replace(two.leg(), odometer_right=changed(
+        two.odometer_right, stamp_ns=lambda a: a * 0)))
+    assert Code.NO_ODOMETER in codes
+
+
+@pytest.mark.parametrize('q', [1e200, np.nan, 5e-324, 0.0, 7.0])
+@pytest.mark.parametrize('variance', [0.01, np.nan, 1e300])
+def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
+    bad = changed(leg.imu, q_ni=lambda a: a.__setitem__(slice(40, 60), q),
+                  yaw_variance=lambda a: a.__setitem__(slice(40, 60), variance))
+    with np.errstate(all='raise'):
+        inputs, _, _ = said(replace(leg, imu=bad))
+    assert not np.isfinite(inputs.yaw_variance[40:60]).any()
+    assert np.abs(np.nan_to_num(inputs.q_ni)).max() <= 7.0
+    assert len(inputs.t_imu) == len(leg.imu.stamp_ns)

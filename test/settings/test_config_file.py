@@ -1,0 +1,218 @@
+"""Settings from files and from --set: the same as the node reads, one sentence when wrong."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import pytest
+
+from odocal_ros.errors import BadConfig, BadUsage, OdocalError
+from odocal_ros.settings.config import Config, SETTINGS, value_of, with_settings
+from odocal_ros.settings.config_file import parse_set, read_config_file, scalar
+
+BLOCK = '/**/calibrator:\n  ros__parameters:\n'
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes a parameter file."""
+    def file(text):
+        path = tmp_path / 'params.yaml'
+        path.write_text(text, encoding='utf-8')
+        return path
+    return file
+
+
+@pytest.mark.parametrize('key', ['/**', '/**/calibrator', '/calibrator', 'calibrator', '/*'])
+def test_every_key_that_means_the_node_is_taken(write, key):
+    values = read_config_file(write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n'))
+    assert values == {'leg.min_distance': 50.0}
+
+
+@pytest.mark.parametrize('key', ['/car1/calibrator', 'imu_driver', '/**/driver', '/calibrator2'])
+def test_blocks_of_other_nodes_are_named_not_taken(write, key):
+    path = write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n')
+    with pytest.raises(BadConfig, match=r'no block for the calibrator; it has .*want a top key'):
+        read_config_file(path)
+
+
+def test_later_blocks_win_and_a_key_that_comes_again_keeps_its_place(write):
+    part = '  ros__parameters:\n    leg.min_distance: '
+    one = write(f'calibrator:\n{part}1.0\n/**:\n{part}2.0\n')
+    assert read_config_file(one) == {'leg.min_distance': 2.0}
+    again = write(f'/**:\n{part}2.0\ncalibrator:\n{part}1.0\n/**:\n{part}5.0\n')
+    assert read_config_file(again) == {'leg.min_distance': 1.0}
+
+
+def test_nested_and_dotted_names_mix(write):
+    values = read_config_file(write(
+        BLOCK + '    leg: {min_distance: 50.0}\n    leg.min_speed: 1.0\n    method: all\n'
+        '    gnss:\n      lever_arm: [1, 0, 0.5]\n'))
+    assert values == {'leg.min_distance': 50.0, 'leg.min_speed': 1.0, 'method': 'all',
+                      'gnss.lever_arm': (1.0, 0.0, 0.5)}
+
+
+def test_whole_numbers_become_doubles_where_the_setting_is_one(write):
+    values = read_config_file(write(BLOCK + '    leg.min_distance: 50\n'))
+    assert type(values['leg.min_distance']) is float
+
+
+def test_what_the_node_itself_leaves_in_a_dump_is_passed_over(write):
+    values = read_config_file(write(
+        BLOCK + '    use_sim_time: true\n    result: {scale_factor: .nan, valid: false}\n'
+        '    qos_overrides:\n      /imu/data:\n        subscription: {depth: 10}\n'
+        '    start_type_description_service: true\n    method: all\n'))
+    assert values == {'method': 'all'}
+
+
+@pytest.mark.parametrize(('text', 'error', 'match'), [
+    ('    leg.min_distnace: 5.0\n', BadConfig,
+     r'line 3: no setting .* did you mean leg.min_distance'),
+    ('    leg: {min_distance: far}\n', BadConfig, "line 3: leg.min_distance: 'far' is not a num"),
+    ('\n    leg.min_distance: 0.0\n', BadConfig, 'line 4: leg.min_distance = 0: want 1 to 1'),
+    ('    gnss.lever_arm: [1.0, 2.0]\n', BadConfig, 'line 3: gnss.lever_arm: 2 values, want 3'),
+    ('    gnss.lever_arm: [[1.0], 2.0, 3.0]\n', BadConfig, r'\[1.0\] is not a number'),
+    ('    odometer.left: 0\n', BadConfig, 'write it in quotes'),
+    ('    method: [all\n', BadConfig, 'line 4: not valid YAML: '),
+    ('    method: "a\x07b"\n', BadConfig, 'not valid YAML: '),
+])
+def test_what_is_wrong_is_told_with_its_line(write, text, error, match):
+    with pytest.raises(error, match=match) as caught:
+        read_config_file(write(BLOCK + text))
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', ['', 'just words\n', '- 1\n', 'leg:\n  min_distance: 5.0\n'])
+def test_a_file_of_something_else_is_refused(write, text):
+    with pytest.raises(BadConfig, match='no block for the calibrator'):
+        read_config_file(write(text))
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path):
+    with pytest.raises(BadUsage, match='No such file'):
+        read_config_file(tmp_path / 'nowhere.yaml')
+    with pytest.raises(BadUsage, match='Is a directory'):
+        read_config_file(tmp_path)
+    (tmp_path / 'latin').write_bytes(b'/**: \xff\xfe')
+    with pytest.raises(BadConfig, match='not a text file'):
+        read_config_file(tmp_path / 'latin')
+
+
+@pytest.mark.parametrize(('text', 'name', 'value'), [
+    ('leg.min_distance=50', 'leg.min_distance', 50.0),
+    ('leg.max_gap=1e-1', 'leg.max_gap', 0.1),
+    ('gnss.lever_arm=[1, 0, 0.5]', 'gnss.lever_arm', (1.0, 0.0, 0.5)),
+    ('output.formats=[params]', 'output.formats', ('params',)),
+    ('output.formats=[]', 'output.formats', ()),
+    ('reference.start=[]', 'reference.start', ()),
+    ('odometer.left=0', 'odometer.left', '0'),
+    ("odometer.left='on'", 'odometer.left', 'on'),
+    ('odometer.field=data[1]', 'odometer.field', 'data[1]'),
+    ('frames.imu=', 'frames.imu', ''),
+    ('odometer.signed=false', 'odometer.signed', False),
+    ('verdict.min_legs=3', 'verdict.min_legs', 3),
+    (' method = all ', 'method', 'all'),
+])
+def test_set_takes_yaml_and_gives_the_settings_type(text, name, value):
+    got = parse_set(text)
+    assert got == (name, value)
+    assert type(got[1]) is type(value)
+
+
+def test_set_takes_nan_where_a_setting_may_be_unset():
+    assert math.isnan(parse_set('imu.nominal_yaw=nan')[1])
+    with pytest.raises(BadConfig, match='NaN is not a value'):
+        parse_set('leg.min_distance=.nan')
+
+
+@pytest.mark.parametrize(('text', 'error', 'match'), [
+    ('leg.min_distance', BadUsage, 'want key=value'),
+    ('=5', BadUsage, 'want key=value'),
+    ('gnss.lever_arm=[1, 2', BadUsage, 'not valid YAML'),
+    ('leg.min_dist=5', BadConfig, "^--set: no setting 'leg.min_dist'; did you mean leg.min_dist"),
+    ('imu.gyro_scale=-1', BadConfig, '^--set imu.gyro_scale = -1: want 0 to 1000$'),
+    ('imu.gyro_noise=-1', BadConfig, 'want 0 to 1 rad/s/sqrt'),
+    ('leg.min_distance=', BadConfig, 'is not a number'),
+    ('verdict.min_legs=2.5', BadConfig, 'is not a whole number'),
+    ('leg.max_gap={a: 1}', BadConfig, 'is not a number'),
+    ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: want at most 1e.09'),
+    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'want at most'),
+])
+def test_set_says_what_is_wrong(text, error, match):
+    with pytest.raises(error, match=match) as caught:
+        parse_set(text)
+    assert '\n' not in str(caught.value)
+    assert isinstance(caught.value, OdocalError)
+
+
+def test_file_then_set_is_the_order(write):
+    config = with_settings(Config(), read_config_file(write(
+        BLOCK + '    leg.min_distance: 50.0\n    leg.min_speed: 1.0\n')))
+    config = with_settings(config, dict([parse_set('leg.min_distance=70')]))
+    assert config.leg.min_distance == 70.0
+    assert config.leg.min_speed == 1.0
+    assert config.leg.max_gap == Config().leg.max_gap
+
+
+SCALARS = ['true', 'yes', 'Y', 'on', 'off', 'no', 'n', '3', '+3', '-3', '0x10', '010', '08', '0',
+           '1.', '.5', '1e3', '1E-3', '-1.5e-7', '1_000', '1_0.5', '.nan', '.NaN', 'nan', 'NaN',
+           '.inf', '-.inf', 'inf', '1:30', '~', 'null', 'text', "'3.0'", '"on"', '1e', 'e3', '--1']
+BLOCKS = {
+    'a wildcard after the node wins': ['calibrator', '/**'],
+    'the node after a wildcard wins': ['/**', 'calibrator'],
+    'a key that comes again keeps its place': ['/**', 'calibrator', '/**'],
+    'four ways to say it': ['/calibrator', '/**/calibrator', '/*', 'calibrator'],
+    'others are passed over': ['/**', '/car/calibrator', 'driver', '/*/calibrator'],
+}
+READ_BY_ROS = """
+import json, sys, rclpy
+from rclpy.node import Node
+rclpy.init(args=['--ros-args', '--params-file', sys.argv[1]])
+node = Node('calibrator', automatically_declare_parameters_from_overrides=True)
+print(json.dumps({k: repr(p.value) for k, p in node._parameters.items()}))
+rclpy.shutdown()
+"""
+
+
+def read_by_ros(path) -> dict[str, str]:
+    """Return what a node named calibrator gets from a parameter file, as reprs."""
+    out = subprocess.run([sys.executable, '-c', READ_BY_ROS, str(path)], check=True, text=True,
+                         capture_output=True, env=os.environ).stdout
+    return json.loads(out)
+
+
+@pytest.mark.parametrize('keys', BLOCKS.values(), ids=BLOCKS)
+def test_blocks_count_as_they_do_for_a_node(write, keys):
+    pytest.importorskip('rclpy')
+    path = write(''.join(
+        f'{key}:\n  ros__parameters:\n    leg.min_distance: {n}.0\n    leg.max_gap: 0.{n}\n'
+        for n, key in enumerate(keys, 1)))
+    by_ros = read_by_ros(path)
+    assert {k: repr(v) for k, v in read_config_file(path).items()} == {
+        k: by_ros[k] for k in ('leg.min_distance', 'leg.max_gap')}
+
+
+def test_namespaces_may_be_nested(write):
+    path = write('/**:\n  calibrator:\n    ros__parameters:\n      leg.min_distance: 5.0\n')
+    assert read_config_file(path) == {'leg.min_distance': 5.0}
+
+
+def test_plain_values_are_typed_as_ros_types_them(write):
+    pytest.importorskip('rclpy')
+    path = write('/**:\n  ros__parameters:\n' + ''.join(
+        f'    s{i}: {text}\n' for i, text in enumerate(SCALARS)))
+    by_ros = {k: v for k, v in read_by_ros(path).items() if k[1:].isdigit()}
+    ours = {f's{i}': repr(text[1:-1] if text[0] in '\'"' else scalar(text))
+            for i, text in enumerate(SCALARS)}
+    assert ours == by_ros
+
+
+def test_the_shipped_file_holds_every_setting_at_its_default():
+    from tools.settings_page import ROOT
+    values = read_config_file(ROOT / 'config' / 'calibrator.yaml')
+    assert list(values) == list(SETTINGS)
+    default = Config()
+    for name, value in values.items():
+        assert repr(value) == repr(value_of(default, name)), name
