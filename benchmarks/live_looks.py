@@ -38,7 +38,8 @@ def look(leg, config, state, before_ns, now_ns):
         rows = getattr(leg, slot)
         thinned.feed(slot, take(rows, (rows.stamp_ns > before_ns) & (rows.stamp_ns <= now_ns)))
     try:
-        seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config, smoother=smoother)
+        seen = forecast_of(thinned.leg(leg.start_ns), thinned.fix_rate(), config,
+                           smoother=smoother)
     except OdocalError:
         seen = None
     return seen, time.thread_time() - begin, smoother.once_s

@@ -15,16 +15,20 @@ Time     stamp_ns is int64 header time; t is float seconds since the start mark
 Words    mark: a point the operator names; leg: what lies between two; track: the path dead
          reckoned; chord: straight line between a leg's ends; scale factor: metres of travel per
          pulse; fix: a GNSS position; pre-roll: samples kept before the start mark
-Modules  config, errors, reasons, samples, leg, messages   what everybody speaks
-         nav      earth, projection, rotations, alignment, strapdown, odometer, dead reckoning
-         calib    methods, their error budget, verdict, combination of legs
-         pipeline one pure function from leg to result
-         apply    a calibration at work, sample by sample
-         paper    the tables of source A, computed
-         sim      drives with known truth        bagio    the only place of rosbags
-         live     the node, the only place of rclpy       offline  the odocal command
-         output   files written
-Flow     messages -> samples -> leg -> pipeline.calibrate -> result -> status, YAML, JSON
+Rooms    data       samples and legs         settings   what may be set, grades
+         outside    names, YAML, files from and to others
+         messages   from bytes to samples    bagio      bags; the only place of rosbags
+         screening  what of it is usable     nav        strapdown, odometer, dead reckoning
+         calib      methods, budgets, verdict, legs combined
+         patent     the search of CN104359492A; paper: the tables of Shi et al. 2015
+         pipeline   one pure function from leg to result
+         plan       what a drive will tell; foresee: the same while it is driven
+         apply      a calibration at work, sample by sample
+         sim        drives with known truth  output     files, report, words
+         live       the nodes, the only place of rclpy
+         offline    the odocal command
+Flow     messages -> data.samples -> data.leg -> screening -> pipeline.calibrate -> calib.result
+         -> status, YAML, JSON
 """
 
 __version__ = '0.1.0'

@@ -13,18 +13,27 @@ PACKAGE = Path(odocal_ros.__file__).parent
 HEAVY = ('rclpy', 'rosbags', 'yaml', 'matplotlib', 'scipy', 'pyproj', 'tqdm')
 ROS = {'rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
        'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
-# what a folder may use of the package besides what everybody may
-COMMON = {'samples', 'config', 'errors', 'reasons'}
-MAY_USE = {'nav': {'nav'}, 'calib': {'nav', 'calib', 'leg', 'grades'}}
-NEVER = {'live': {'offline', 'sim'}, 'offline': {'live'}, 'sim': {'live', 'calib', 'pipeline'},
-         'output': {'live', 'offline', 'bagio'}, 'bagio': {'live', 'offline', 'pipeline', 'calib'},
-         'messages': {'live', 'offline', 'pipeline', 'nav', 'calib', 'sim', 'output'},
-         'pipeline': {'live', 'offline', 'bagio', 'output', 'messages', 'sim'},
-         'paper': {'live', 'offline', 'bagio', 'output', 'messages'},
-         'align': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'},
-         'leg_run': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper'},
-         'apply': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'},
-         'screen': {'live', 'offline', 'bagio', 'output', 'messages', 'sim', 'paper', 'pipeline'}}
+# the rooms in the order of the data, and what each uses of those above it; all: errors, reasons
+ROOMS = {
+    'outside': '', 'data': '',
+    'settings': 'outside',
+    'messages': 'data settings',
+    'bagio': 'messages outside',
+    'nav': 'data',
+    'screening': 'data nav settings',
+    'calib': 'data nav screening settings',
+    'patent': 'nav',
+    'pipeline': 'calib data nav patent screening settings',
+    'plan': 'calib data nav screening settings',
+    'foresee': 'calib data nav pipeline plan screening settings',
+    'apply': 'calib data nav settings',
+    'sim': 'data nav settings',
+    'paper': 'calib nav pipeline settings sim',
+    'output': 'calib nav outside paper pipeline settings',
+    'live': 'apply bagio calib data foresee messages output outside pipeline settings',
+    'offline': 'bagio calib data messages nav output outside paper pipeline plan screening '
+               'settings sim'}
+COMMON = {'errors', 'reasons'}
 
 
 def _modules():
@@ -56,9 +65,9 @@ def _own_parts(path):
 
 @pytest.mark.parametrize('module', [
     'odocal_ros.pipeline.calibrate', 'odocal_ros.calib.two_point', 'odocal_ros.nav.strapdown',
-    'odocal_ros.data.leg', 'odocal_ros.messages.decode', 'odocal_ros.settings.config_file', 'odocal_ros.output.files',
-    'odocal_ros.output.summary', 'odocal_ros.bagio.read', 'odocal_ros.offline.replay',
-    'odocal_ros.apply.odometry'])
+    'odocal_ros.data.leg', 'odocal_ros.messages.decode', 'odocal_ros.settings.config_file',
+    'odocal_ros.output.files', 'odocal_ros.output.summary', 'odocal_ros.bagio.read',
+    'odocal_ros.offline.replay', 'odocal_ros.apply.odometry'])
 def test_imports_at_the_top_stay_light(module):
     probe = f'import {module}, sys; print([m for m in {HEAVY} if m in sys.modules])'
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
@@ -85,24 +94,24 @@ def test_rosbags_is_imported_in_bagio_only():
     assert users == {'bagio'}
 
 
-@pytest.mark.parametrize('part', sorted(MAY_USE))
-def test_the_inner_parts_use_only_what_lies_further_in(part):
-    used = {(p.name, own) for p in _modules() if _part(p) == part for own in _own_parts(p)}
-    assert used, f'nothing in {part} was looked at'
-    assert {(name, own) for name, own in used if own not in MAY_USE[part] | COMMON} == set()
+@pytest.mark.parametrize('room', ROOMS)
+def test_a_room_uses_what_the_table_says(room):
+    used = {own for p in _modules() if _part(p) == room for own in _own_parts(p)}
+    assert used - COMMON - {room} == set(ROOMS[room].split())
 
 
-@pytest.mark.parametrize('part', sorted(NEVER))
-def test_parts_that_must_not_see_each_other_do_not(part):
-    looked_at = [p for p in _modules() if _part(p) == part]
-    assert looked_at
-    assert {(p.name, own) for p in looked_at for own in _own_parts(p) & NEVER[part]} == set()
+def test_the_rooms_stand_in_order_and_nothing_else_lies_beside_them():
+    order = list(ROOMS)
+    for room, used in ROOMS.items():      # so that there is no way back
+        assert all(order.index(other) < order.index(room) for other in used.split()), room
+    assert {_part(p) for p in _modules()} == set(ROOMS) | COMMON | {'__init__'}
+    for common in COMMON:
+        assert not _own_parts(PACKAGE / f'{common}.py')
 
 
 def test_the_pure_parts_ask_no_clock_and_open_nothing():
     pure = [p for p in _modules() if _part(p) in (
-        'nav', 'calib', 'pipeline', 'align', 'screen', 'row_screen', 'apply', 'parts', 'automatic',
-        'odometer_steps')]
+        'nav', 'screening', 'calib', 'patent', 'pipeline', 'plan', 'apply')]
     assert len(pure) > 10
     for path in pure:
         tree = ast.parse(path.read_text(encoding='utf-8'))

@@ -1,5 +1,5 @@
 """
-Pages made from settings/config.py and reasons.py: config/*.yaml, docs/reasons.md, the README's tables.
+Pages made from the settings and reasons: config/*.yaml, docs/reasons.md, the README's tables.
 
 ``python -m tools.settings_page`` tells whether they agree with the code, ``--write`` makes
 them agree. A test says so too.

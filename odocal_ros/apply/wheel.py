@@ -1,8 +1,8 @@
 """
 The travel of one wheel as its rows come: rollover undone, resets bridged, what is lost doubted.
 
-A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``); a stream has only its past,
-and a scale that is known: what no vehicle does in the time is no travel.
+A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``); a stream has
+only its past, and a scale that is known: what no vehicle does in the time is no travel.
 """
 
 from collections import deque

@@ -1,0 +1,1 @@
+"""Bags read and written, whole or damaged: the only place of rosbags."""

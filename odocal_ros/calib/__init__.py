@@ -1,0 +1,1 @@
+"""The methods, their error budgets, their verdict, legs combined."""

@@ -2,9 +2,9 @@
 Samples: what the sensors said, as frozen arrays, one row or a million.
 
 Rows stand in order of arrival and hold what was sent, NaN and stale stamps included;
-``screening/screen.py`` decides what is usable. ``stamp_ns`` is the header stamp (arrival where a message
-has none), ``received_ns`` the arrival (bag time, or the middleware's source stamp): it is used
-to compare clocks and never enters a result.
+``screening/screen.py`` decides what is usable. ``stamp_ns`` is the header stamp (arrival where a
+message has none), ``received_ns`` the arrival (bag time, or the middleware's source stamp): it
+is used to compare clocks and never enters a result.
 """
 
 from dataclasses import dataclass, fields

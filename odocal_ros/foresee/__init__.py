@@ -1,0 +1,1 @@
+"""What a leg will tell while it is driven, on few of its rows; without ROS."""

@@ -71,8 +71,8 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
     levels = problem.first_levels.but(**last.levels.values)
     first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
-    return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors, first,
-                   spread)
+    return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors,
+                     first, spread)
 
 
 def _reckoned(state: State, problem: Problem) -> State:

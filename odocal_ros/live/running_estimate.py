@@ -45,7 +45,7 @@ class RunningEstimate:
         self._pause_until = 0.0
 
     def begin(self, recorder: LegRecorder, start_ns: int, config: Config) -> None:
-        """RunningEstimate a leg that starts at a mark; ``recorder`` holds what came so far."""
+        """Watch a leg that starts at a mark; ``recorder`` holds what came so far."""
         self.end()
         self._config, self._before = config, recorder
         self._look_from(start_ns, recorder.form)
@@ -124,8 +124,8 @@ class RunningEstimate:
             self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')
 
 
-def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns: int, config: Config,
-          over: threading.Event, smoother: SmootherSoFar,
+def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns: int,
+          config: Config, over: threading.Event, smoother: SmootherSoFar,
           ) -> tuple[Forecast | None, tuple[Reason, ...], float, Exception | None]:
     """
     Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.

@@ -1,0 +1,1 @@
+"""From bytes to samples: CDR, message types, what of a message is the counter."""

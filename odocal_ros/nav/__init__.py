@@ -1,0 +1,1 @@
+"""Earth, projection, rotations, strapdown, odometer, dead reckoning, standstills."""

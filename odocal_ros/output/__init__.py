@@ -1,0 +1,1 @@
+"""Files, report and words of a result."""

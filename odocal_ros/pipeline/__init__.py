@@ -1,0 +1,1 @@
+"""From a leg to its result, pure: prepare, align, reckon, methods, check, combination."""

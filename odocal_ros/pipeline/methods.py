@@ -8,12 +8,12 @@ from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
+from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.slow_slip import held
 from odocal_ros.pipeline.smoother_run import smoother
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.pipeline.wheels_run import wheels
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.force import upright
 
 # in order of running; two_point, the operator's own marks, is always computed and shown
 METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}

@@ -1,0 +1,1 @@
+"""What a drive will tell before it is driven."""

@@ -2,8 +2,8 @@
 An Imu that sends turn rates only: a car's yaw rate on the bus, the gyro of a robot.
 
 The ground is then taken as level and the Imu as upright: gravity stands where an accelerometer
-would show it, so that all that follows needs no other case, and what that may be wrong by goes
-into level and scale.
+would show it, so that all that follows needs no other case; what that may be wrong by goes into
+the level (``pipeline/align.py``) and the scale (``pipeline/no_force.py``).
 """
 
 from dataclasses import replace
@@ -12,13 +12,10 @@ import numpy as np
 
 from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
 
 TILT = 0.05          # rad of road and mounting, 1 sigma of each axis
-HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, which make a way longer
-NAME = 'hills'
 
 
 def felt(f_i) -> bool:
@@ -45,17 +42,3 @@ def with_force(leg, config):
         Code.NO_ACCELEROMETER, 'the Imu sends turn rates but no acceleration: the scale is told '
         'by gyro, counter and fixes, on ground taken as level; yaw and pitch mounting angle need '
         'an accelerometer (yaw: or a heading from outside)'),)
-
-
-def upright(method, run):
-    """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
-    if run.inputs.felt:
-        return method
-    method = with_scale_error(method, run, NAME, dict.fromkeys(SCALES, HILLS))
-    # what NO_ACCELEROMETER says of the angles, with another remedy
-    said = {Code.PITCH_NOT_DETERMINED} | (
-        set() if run.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
-    return replace(
-        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
-            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
-            for name, e in method.estimates.items()})

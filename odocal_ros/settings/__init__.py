@@ -1,0 +1,1 @@
+"""What may be set, its limits and defaults; Imu grades."""

@@ -1,0 +1,1 @@
+"""Drives with known truth: roads, vehicles, sensors and their errors."""

@@ -456,8 +456,8 @@ def said(forecast, **more):
      '0.498); call ~/stop_leg'),
     (Forecast(GOOD, NO_YAW), 0.0, 'enough: scale 430 ppm (asked 1000); yaw: no drive brings it '
      'below its heading (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
-    (Forecast(replace(MORE, metres=None, why='no 20 km more bring it to what is asked'), YAW), 10.0,
-     'scale 1820 ppm: no 20 km more bring it to what is asked; enough: yaw 0.286 deg (asked '
+    (Forecast(replace(MORE, metres=None, why='no 20 km more bring it to what is asked'), YAW),
+     10.0, 'scale 1820 ppm: no 20 km more bring it to what is asked; enough: yaw 0.286 deg (asked '
      '0.498); call ~/stop_leg'),
     (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; 240 m more '
      'bring it to the asked 1000 ppm; yaw: no drive brings it below its heading (1 deg)'),

@@ -1,0 +1,23 @@
+"""What a method's result is doubted by where the Imu sent no force: ``screening/force.py``."""
+
+from dataclasses import replace
+
+from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
+from odocal_ros.reasons import Code
+
+HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, which make a way longer
+NAME = 'hills'
+
+
+def upright(method, run):
+    """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
+    if run.inputs.felt:
+        return method
+    method = with_scale_error(method, run, NAME, dict.fromkeys(SCALES, HILLS))
+    # what NO_ACCELEROMETER says of the angles, with another remedy
+    said = {Code.PITCH_NOT_DETERMINED} | (
+        set() if run.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
+    return replace(
+        method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
+            name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e
+            for name, e in method.estimates.items()})
