@@ -30,7 +30,7 @@ def run(name, options, seed):
     """Print one line of figures."""
     from odocal_ros.calib.smoother import smooth, smoother_leg
     from odocal_ros.nav.standstill import standstills
-    from odocal_ros.pipeline.leg_run import LegRun
+    from odocal_ros.screening.placed import place
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -44,10 +44,10 @@ def run(name, options, seed):
                                       for key, v in keys.items()})
     leg = drive.leg()
     inputs, _ = screen(leg, config)
-    prepared = LegRun(leg, inputs, config, [], None)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, prepared.rough,
+    placed = place(inputs, config)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                         config.leg.standstill)
-    ready = smoother_leg(inputs, config, prepared.origin, prepared.fixes_n, spans, prepared.rough)
+    ready = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
     t2, cpu = time.perf_counter(), time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result = smooth(ready, config)

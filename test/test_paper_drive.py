@@ -32,14 +32,14 @@ def config(paper):
 @pytest.fixture(scope='module')
 def own(paper, config):
     """Return the alignment that the leg itself gives, with the true attitude in it."""
-    from odocal_ros.pipeline import leg_run
+    from odocal_ros.pipeline import prepare
     kept = []
-    align = leg_run.align
-    leg_run.align = lambda *args: kept.append(align(*args)) or kept[-1]
+    align = prepare.align
+    prepare.align = lambda *args: kept.append(align(*args)) or kept[-1]
     try:
         calibrate(paper.leg(), config)
     finally:
-        leg_run.align = align
+        prepare.align = align
     alignment = kept[0][0]
     o = paper.options
     t = np.array([alignment.t + (paper.truth.start_ns - o.start_ns) * 1e-9])

@@ -52,15 +52,3 @@ def share(relative, sign='') -> str:
     """Return a relative figure as people say it: in ppm, or in per cent from one on."""
     return f'{100 * relative:{sign}.1f} %' if abs(relative) >= 0.01 else (
         f'{1e6 * relative:{sign}.0f} ppm')
-
-
-def nominal_scale(config, unit) -> float:
-    """Return K0: as configured, from the wheel's size, or 1 for speeds; 0 unknown."""
-    if config.odometer.nominal_scale:
-        return config.odometer.nominal_scale
-    wheels = config.wheels
-    if unit == 'm/pulse' and wheels.radius and wheels.pulses_per_revolution:
-        return 2 * np.pi * wheels.radius / wheels.pulses_per_revolution
-    if unit == 'm/rad' and wheels.radius:
-        return wheels.radius
-    return 1.0 if unit == '1' else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from odocal_ros.calib.choice import deciding
 from odocal_ros.pipeline.align import HEADING_LIMIT
-from odocal_ros.pipeline.leg_run import METHODS
+from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.plan.alignment import plan_alignment
 from odocal_ros.plan.drive import from_rates
 from odocal_ros.settings.config import Config, with_settings

@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from odocal_ros.calib.choice import choose, deciding
-from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.ability import stated_variance, with_heading
@@ -26,10 +25,10 @@ from odocal_ros.foresee.smoother_forecast import (
 )
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.wheels_so_far import sources_of, with_wheels
-from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.plan.drive import AT_REST, PlannedDrive
 from odocal_ros.plan.leg_profile import fix_figures, profile_of
 from odocal_ros.plan.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
@@ -146,11 +145,7 @@ def _heading_found(leg: Leg, config: Config) -> Config:
 def _quantum(leg: Leg, config: Config) -> float:
     """Return the size of a count, m; raise BadData while metres are not known at all."""
     inputs, _ = screen(leg, config)
-    geodetic = np.nan_to_num(inputs.geodetic)
-    fixes_n = Origin(*geodetic[0].tolist()).to_n(geodetic)
-    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    scale = (rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma)
-             or nominal_scale(config, inputs.scale_unit))
+    scale = place(inputs, config).rough
     if not scale:   # what the profile takes instead, 1, would promise far too much
         raise BadData('how far a count reaches is not known yet: drive on, or set '
                       'odometer.nominal_scale')

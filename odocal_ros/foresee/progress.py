@@ -15,6 +15,7 @@ from odocal_ros.nav.earth import radii
 from odocal_ros.screening.force import felt
 from odocal_ros.screening.odometer_steps import Steps
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_scale
 
 FASTEST = 100.0        # m/s: what goes faster is a counter reset
 SPEED_NS = 1_000_000_000   # speeds are taken over that long, or longer
@@ -24,19 +25,13 @@ CLOCK_LIMIT = 0.5      # s
 CLOCK_ROWS = 10
 
 
-def nominal_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
+def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
     """Return m per unit of the odometer as well as it is known, 0 where it is not."""
     if np.isfinite(found) and found > 0:
         return float(found)
-    if config.odometer.nominal_scale > 0:
+    if form is None:
         return config.odometer.nominal_scale
-    if form is None or form.scale_unit == '1':
-        return 1.0 if form else 0.0
-    turn = config.wheels.radius
-    if form.scale_unit == 'm/rad':
-        return turn
-    pulses = config.wheels.pulses_per_revolution
-    return 2 * np.pi * turn / pulses if pulses else 0.0
+    return nominal_scale(config, form.scale_unit)
 
 
 class Travel:
@@ -185,7 +180,7 @@ class Progress:
         self.clocks.feed(slot, block)
         self._last[slot] = block
         if slot == 'odometer' and form is not None:
-            self._scale = nominal_scale(config, form, found_scale)
+            self._scale = known_scale(config, form, found_scale)
             self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
         elif slot == 'fix':
             travel = self._travel.get('odometer')

@@ -31,8 +31,8 @@ from odocal_ros.foresee.smoother_warm_start import carried, rows_of, WarmStart
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.calibrate import turned_over
-from odocal_ros.pipeline.leg_run import LegRun
 from odocal_ros.screening.facing import axes_reasons, facing
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
@@ -127,20 +127,21 @@ class SmootherSoFar:
             raise BadData(few.text)
         found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
         _refuse_unusable(found)
-        run = LegRun(leg, turned_over(inputs) if z_down else inputs, config, [], None)
-        if not run.rough:
+        inputs = turned_over(inputs) if z_down else inputs
+        placed = place(inputs, config)
+        if not placed.rough:
             raise BadData('how far a count reaches is not known yet')
-        inputs = run.inputs
         _refuse_unusable(axes_reasons(
-            facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, run.rough),
+            facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, placed.rough),
             config.imu.nominal_yaw))
-        if vars(run.origin) != (self._origin and vars(self._origin)):
-            self._origin, self._last = run.origin, None
-        spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, run.rough,
+        if vars(placed.origin) != (self._origin and vars(self._origin)):
+            self._origin, self._last = placed.origin, None
+        spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                             config.leg.standstill)
         # a way beyond the odometer's last row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
-        view = smoother_leg(inputs, config, run.origin, run.fixes_n, spans, run.rough, t_stop)
+        view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
+                            placed.rough, t_stop)
         fixes = ((view.t_fix >= view.t_begin) & (view.t_fix <= view.t_stop)).sum()
         few = too_little(int(fixes), float(view.t_imu[-1] - view.t_begin))
         if few:

@@ -52,7 +52,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
-    drive = survey_drive(inputs, config.odometer.nominal_scale, config.leg.standstill)
+    drive = survey_drive(inputs, config)
     way, chord = way_and_chord(drive.fixes_n)
     driven = _driven(inputs, drive)
     found['drive'] = {

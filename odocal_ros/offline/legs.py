@@ -7,11 +7,11 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
 
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
@@ -221,11 +221,7 @@ def _stops(recorder, first, last, config):
     inputs, _ = screen(whole, config)
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None
-    geodetic = np.nan_to_num(inputs.geodetic)
-    fixes_n = Origin(*(float(x) for x in geodetic[0])).to_n(geodetic)
-    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma)
-    scale = scale or config.odometer.nominal_scale or 1.0
+    scale = place(inputs, config).rough or 1.0
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
     metres = np.interp(spans, inputs.travel.t, way) if len(spans) else np.empty((0, 2))

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import white_noise
-from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
 
 STRAIGHT = 0.97      # chord over way: a stretch at least this straight suits the two-point method
 POINTS = 600         # fixes looked at for straight stretches, evenly taken
@@ -37,19 +38,14 @@ class Drive:
     fastest: float
 
 
-def survey_drive(inputs: Inputs, nominal_scale: float, shortest: float) -> Drive:
-    """Return the drive that screened inputs show; ``shortest``: least standstill, s."""
-    fixes_n, sigma = np.empty((0, 3)), 2.5
-    if len(inputs.t_fix):
-        geodetic = np.nan_to_num(inputs.geodetic)
-        fixes_n = Origin(*(float(x) for x in geodetic[0])).to_n(geodetic)
-        sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) or nominal_scale or None
-    if inputs.scale_unit == '1':
-        scale = scale or 1.0
+def survey_drive(inputs: Inputs, config: Config) -> Drive:
+    """Return the drive that screened inputs show."""
+    placed = place(inputs, config)
+    fixes_n, sigma, scale = placed.fixes_n, placed.fix_sigma, placed.rough or None
     stops, slowest, fastest = np.empty((0, 2)), 0.0, 0.0
     if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
-        stops = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale or 1.0, shortest)
+        stops = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale or 1.0,
+                            config.leg.standstill)
         t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - AT_SPEED, AT_SPEED / 2)
         if scale and len(t):
             speed = np.abs(inputs.travel.at(t + AT_SPEED) - inputs.travel.at(t)) * scale / AT_SPEED

@@ -2,12 +2,12 @@
 
 from math import tau
 
-from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.file_head import head
 from odocal_ros.output.summary import known
 from odocal_ros.outside.yaml_text import parameters
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_scale
 
 CONTROLLERS = 'ros2_controllers.yaml'
 # controllers that take the radius itself, and their parameter for it

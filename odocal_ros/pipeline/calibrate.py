@@ -15,7 +15,8 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
-from odocal_ros.pipeline.leg_run import leg_result, LegRun
+from odocal_ros.pipeline.leg_run import leg_result, run_leg
+from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
@@ -54,19 +55,21 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     LegResult; a leg that cannot be calibrated says why in its reasons.
 
     """
-    inputs, reasons, run = _begun(leg, config, alignment, notes, holdout)
-    if run is None:
+    progress = progress or (lambda share, stage: None)
+    inputs, reasons, usable = _screened(leg, config, notes)
+
+    def result_of(inputs, reasons):
+        prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
+        return leg_result(leg, inputs, found) if prepared is None else run_leg(prepared, progress)
+
+    if not usable:
         return leg_result(leg, inputs, reasons)
-    told = [*reasons]
-    run.progress = progress or run.progress
-    result = run.result()
+    result = result_of(inputs, reasons)
     back, scale = _reversed(result, inputs)
     if not len(back):
         return result
-    told += said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)
-    again = LegRun(leg, inputs.mirrored(back), config, told, alignment, holdout)
-    again.progress = run.progress
-    return again.result()
+    return result_of(inputs.mirrored(back), (
+        *reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
 
 
 def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
@@ -75,28 +78,26 @@ def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
 
     A leg that is not over may be given: what more of a drive cures is left out.
     """
-    _, reasons, run = _begun(leg, config)
-    if run is not None:
-        run.examine()
+    inputs, reasons, usable = _screened(leg, config)
+    if usable:
+        _, reasons = prepare(leg, inputs, config, reasons)
     return tuple(r for r in reasons
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
-def _begun(leg, config, alignment=None, notes=(), holdout=False):
-    """Return inputs, what they say (a list that the run adds to), and the run, None without."""
+def _screened(leg, config, notes=()):
+    """Return inputs, what is said of them, and whether a leg can be made of them."""
     inputs, found = screen(leg, config)
-    reasons = [*notes, *found]
+    reasons = (*notes, *found)
     missing = _missing(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
-        return inputs, reasons + [r for r in missing if r.code not in seen], None
+        return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
-    reasons += with_axes(sanity, inputs)
+    reasons += tuple(with_axes(sanity, inputs))
     if z_down:
         inputs = turned_over(inputs)
-    if UNUSABLE & {r.code for r in sanity}:
-        return inputs, reasons, None
-    return inputs, reasons, LegRun(leg, inputs, config, reasons, alignment, holdout)
+    return inputs, reasons, not UNUSABLE & {r.code for r in sanity}
 
 
 def _reversed(result, inputs):

@@ -11,32 +11,32 @@ WORTH = 5e-4        # of the scale: half a step that is worth a word
 COARSE = 0.2        # m, a count that is
 
 
-def half_step(run) -> float:
+def half_step(inputs) -> float:
     """
     Return how much of the way half a step of the speed is, 0.0 where there are no steps.
 
     Speeds sent are too low by that on the mean where the sender truncates, by nothing where it
     rounds, and the grid does not say which.
     """
-    coarse = _coarse(run.inputs)
+    coarse = _coarse(inputs)
     if coarse is None:
         return 0.0
-    pick = (coarse.t >= 0.0) & (coarse.t <= run.inputs.t_stop) & (coarse.value != 0)
+    pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
     mean = float(np.abs(coarse.value[pick]).mean()) if pick.any() else 0.0
     return coarse.step / 2 / mean if mean else 0.0
 
 
-def held_steps(method, run):
+def held_steps(method, prepared):
     """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
-    size = half_step(run)
+    size = half_step(prepared.inputs)
     if method.name not in ADDED_UP or not size:
         return method
-    return with_scale_error(method, run, NAME, dict.fromkeys(SCALES, size), shared=True)
+    return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, size), shared=True)
 
 
-def coarse_reasons(run) -> list[Reason]:
+def coarse_reasons(inputs, placed) -> list[Reason]:
     """Say that speed or counts come in coarse steps."""
-    inputs, K, size = run.inputs, run.nominal or run.rough, half_step(run)
+    K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
     if count > COARSE:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '

@@ -5,13 +5,14 @@ from dataclasses import replace
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
-from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.judge import judge
 from odocal_ros.calib.one_vehicle import unlike_legs
 from odocal_ros.calib.result import Calibration, Estimate, MethodResult
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_scale
 
 PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
 # the same of legs that are combined on their border: all of them may tell what none does

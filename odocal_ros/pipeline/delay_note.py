@@ -10,25 +10,25 @@ HIDDEN = 0.25       # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
-def delay_notes(run, seen) -> list[Reason]:
+def delay_notes(prepared, seen) -> list[Reason]:
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
     Parameters
     ----------
-    run : LegRun
-        Prepared.
+    prepared : PreparedLeg
+        The leg.
     seen : dict
         'gnss' or 'odometer' -> by how many s its stamps are late, with what is set, and sigma.
 
     """
-    speed = _speed(run)
+    speed = _speed(prepared)
     notes = []
     for name, (late, sigma) in seen.items():
         way = abs(late) * speed
-        if not (abs(late) > SURE * sigma and way > max(LEAST, HIDDEN * run.fix_sigma)):
+        if not (abs(late) > SURE * sigma and way > max(LEAST, HIDDEN * prepared.fix_sigma)):
             continue
-        set_to = getattr(run.config, name).time_offset
+        set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
             Code.DELAY_SEEN, f'the stamps of the {WHAT[name]} are {abs(late):.3f} s '
             f'(+-{sigma:.3f} s) {"late" if late > 0 else "early"} against the other sensors: '
@@ -38,16 +38,10 @@ def delay_notes(run, seen) -> list[Reason]:
     return notes
 
 
-def note_delays(run, seen) -> None:
-    """Put the notes among the leg's reasons, in place of those of a method before."""
-    run.reasons = [r for r in run.reasons if r.code is not Code.DELAY_SEEN]
-    run.reasons += delay_notes(run, seen)
-
-
-def _speed(run) -> float:
+def _speed(prepared) -> float:
     """Return the speed driven, m/s: nine tenths of the leg are slower."""
-    travel = run.inputs.travel
-    grid = np.arange(max(0.0, travel.t[0]), min(run.inputs.t_stop, travel.t[-1]), 1.0)
+    travel = prepared.inputs.travel
+    grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)
     if len(grid) < 2:
         return 0.0
-    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90)) * run.rough
+    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90)) * prepared.rough

@@ -1,4 +1,7 @@
-"""The methods of a leg: their order, and what becomes of one that breaks."""
+"""The methods of a leg: each a pure function of it, and what becomes of one that breaks."""
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -6,42 +9,85 @@ from odocal_ros.calib.failed import failed
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
+from odocal_ros.calib.wheels.unseen import with_unseen
+from odocal_ros.data.samples import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
+from odocal_ros.pipeline.delay_note import delay_notes
+from odocal_ros.pipeline.method_run import MethodRun
 from odocal_ros.pipeline.no_force import upright
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.slow_slip import held
 from odocal_ros.pipeline.smoother_run import smoother
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.pipeline.wheels_run import wheels
 from odocal_ros.reasons import Code, Reason
 
-# in order of running; two_point, the operator's own marks, is always computed and shown
+# as they are shown; two_point, the operator's own marks, is always computed
 METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
 # what each gives where it refuses: (inputs, reason) to MethodResult
 UNKNOWN = {'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
            'wheels': wheels_refused,
            'smoother': lambda inputs, why: smoother_refused((why,), inputs.scale_unit)}
+# methods that begin with the alignment: what it had to say is said of them
+ALIGNED = ('two_point', 'wheels')
 
 
-def run_method(name, run):
+def run_methods(names, prepared: PreparedLeg, begun: Callable) -> dict[str, MethodRun]:
     """
-    Run a method on a leg; what breaks in it costs this method, not the leg.
+    Run methods on a leg; what breaks in one costs this method, not the leg.
 
-    run : LegRun, prepared.   Returns MethodResult, and the antenna's path, None where refused.
+    names : in any order.   begun : called with the name of each before it runs, returns what to
+    call with the passes that it has made.
+
+    Returns
+    -------
+    What each found and, in its sigmas, what the others found of the wheels.
+
     """
-    found = len(run.reasons)
+    runs = {}
+    for name in names:
+        passed = begun(name)
+        let_go(*vars(prepared.leg.imu).values())
+        runs[name] = _guarded(name, prepared, lambda name=name, passed=passed: METHODS[name](
+            prepared, passed))
+    slips = prepared.wheel_slips
+    for run in runs.values():
+        slips = with_unseen(slips, run.slips)
+    return {name: _guarded(name, prepared, lambda run=run: _doubted(run, prepared, slips))
+            for name, run in runs.items()}
+
+
+def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
+    """Return what methods found of the data, each said once, the delays by the best of them."""
+    found: list[Reason] = []
+    delays: dict[str, tuple] = {}
+    for name in METHODS:
+        if name in runs:
+            found += runs[name].found
+            delays = delays if runs[name].delays is None else runs[name].delays
+    return found + delay_notes(prepared, delays)
+
+
+def _doubted(run, prepared, slips) -> MethodRun:
+    """Return a method's run with the errors that its own model does not hold."""
+    result = upright(held_steps(held(run.result, prepared, slips), prepared), prepared)
+    about = prepared.about_alignment if result.name in ALIGNED else ()
+    about += prepared.of_ends if result.name == 'two_point' else ()
+    return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
+
+
+def _guarded(name, prepared, work) -> MethodRun:
+    inputs = prepared.inputs
     try:
         # what runs away is told by the number that is none, not by warnings and what follows
         with np.errstate(over='raise', divide='raise', invalid='raise'):
-            method, path = METHODS[name](run)
-            return upright(held_steps(held(method, run), run), run), path
+            return work()
     except (OdocalError, MemoryError):
         raise
     except FloatingPointError as error:
-        del run.reasons[found:]
-        return UNKNOWN[name](run.inputs, Reason(
+        return MethodRun(UNKNOWN[name](inputs, Reason(
             Code.NOT_CONVERGED, f'{name} ran away from any number ({error}); samples are wild or '
-            'missing')), None
-    except Exception as error:
-        del run.reasons[found:]       # what it said of the data may be as wrong
-        return failed(lambda why: UNKNOWN[name](run.inputs, why), name, error), None
+            'missing')))
+    except Exception as error:      # what it said of the data may be as wrong: nothing of it stays
+        return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))

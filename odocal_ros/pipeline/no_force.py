@@ -9,14 +9,14 @@ HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, whic
 NAME = 'hills'
 
 
-def upright(method, run):
+def upright(method, prepared):
     """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
-    if run.inputs.felt:
+    if prepared.inputs.felt:
         return method
-    method = with_scale_error(method, run, NAME, dict.fromkeys(SCALES, HILLS))
+    method = with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, HILLS))
     # what NO_ACCELEROMETER says of the angles, with another remedy
     said = {Code.PITCH_NOT_DETERMINED} | (
-        set() if run.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
+        set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})
     return replace(
         method, reasons=tuple(r for r in method.reasons if r.code not in said), estimates={
             name: replace(e, value=None, sigma=None) if name == 'pitch_mounting_angle' else e

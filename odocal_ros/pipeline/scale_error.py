@@ -12,14 +12,14 @@ WHEELS = ('scale_factor_left', 'scale_factor_right')
 SCALES = ('scale_factor', 'scale_ratio', *WHEELS)
 
 
-def with_scale_error(method, run, name, relative, shared=False):
+def with_scale_error(method, prepared, name, relative, shared=False):
     """
     Return a method's result with an error in the sigmas of its scales.
 
     Parameters
     ----------
-    method, run : MethodResult, LegRun
-        The result, and the leg, prepared.
+    method, prepared : MethodResult, PreparedLeg
+        The result, and the leg.
     name : str
         Of the source.
     relative : dict
@@ -37,7 +37,7 @@ def with_scale_error(method, run, name, relative, shared=False):
                  for name_, e in method.estimates.items()}
     row = {name_: relative.get(name_, 0.0) * (method.estimates[name_].value or 0.0)
            for name_ in method.parameters} | {'shared': shared}
-    judged = [r for r in judge(estimates, run.nominal, run.config)
+    judged = [r for r in judge(estimates, prepared.nominal, prepared.config)
               if r.code is Code.SCALE_SIGMA_TOO_LARGE]
     return replace(
         method, estimates=estimates, sources=(*method.sources, Source(name, effects, shared)),

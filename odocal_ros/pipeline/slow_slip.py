@@ -14,21 +14,20 @@ NAME = 'slow_wheel_slip'
 STEP = 8.0          # s: method wheels takes a slip for a step, which a longer one is not
 
 
-def held(method, run):
+def held(method, prepared, slips):
     """
     Return a method's result with the slip of one wheel in its sigmas, as it was without any.
 
-    method : MethodResult.   run : LegRun, prepared.
+    method : MethodResult.   prepared : PreparedLeg.   slips : WheelSlips, of all that was found.
     """
-    slips = run.wheel_slips
     # halves of the way half the change apart in the mean of the wheels: the mean is a quarter off
     mean, wheel = abs(slips.change) / 4, abs(slips.change) / 2
-    if run.distance > 0:
-        part = float(np.linalg.norm(_not_held(method, slips))) / run.distance
+    if prepared.distance > 0:
+        part = float(np.linalg.norm(_not_held(method, slips))) / prepared.distance
         mean, wheel = float(np.hypot(mean, part / 2)), float(np.hypot(wheel, part))
     if not mean:
         return method
-    return with_scale_error(method, run, NAME,
+    return with_scale_error(method, prepared, NAME,
                             dict.fromkeys(SCALES, mean) | dict.fromkeys(WHEELS, wheel))
 
 

@@ -9,55 +9,52 @@ from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.delay_note import note_delays
-from odocal_ros.pipeline.tracks import as_configured, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
 
 NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
 ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
 
 
-def smoother(run):
+def smoother(ready, passed) -> MethodRun:
     """
     Run the smoother on a leg.
 
-    run : LegRun, prepared.
+    ready : PreparedLeg.   passed : called with the passes made.
 
-    Returns
-    -------
-    MethodResult, and the antenna's Paths by the smoother's own attitude, the calibrated one with
-    all values found, delays and lever arms too; t is as the fixes stamp it. None where refused.
-
+    The Paths are by the smoother's own attitude, the calibrated one with all values found, delays
+    and lever arms too; t is as the fixes stamp it.
     """
-    if not run.inputs.felt:
-        return refused((NOT_FELT,), run.inputs.scale_unit), None
-    leg = smoother_leg(run.inputs, run.config, run.origin, run.fixes_n, run.spans, run.rough,
-                       run.t_fit)
+    if not ready.inputs.felt:
+        return MethodRun(refused((NOT_FELT,), ready.inputs.scale_unit))
+    leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
+                       ready.rough, ready.t_fit)
     passes = count(1)
-    method = smooth(leg, run.config, lambda *_: run.passed(next(passes)))
+    method = smooth(leg, ready.config, lambda *_: passed(next(passes)))
     if method.estimates['scale_factor'].value is None:
-        return method, None
+        return MethodRun(method)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
-    note_delays(run, {name: (e.value, e.sigma) for name, e in delays.items()
-                      if e.value is not None})
+    seen = {name: (e.value, e.sigma) for name, e in delays.items() if e.value is not None}
     # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
     late = {name: e.value or 0.0 for name, e in delays.items()}
-    travel = run.inputs.travel
-    epochs = _attitude(run, method.details)
+    travel = ready.inputs.travel
+    epochs = _attitude(ready, method.details)
     track = dead_reckon(*epochs, replace(travel, t=travel.t - late['odometer']))
-    lever_b, f = _lever(method.estimates, run.config), method.details['f']
-    before = run.path(as_configured(run, f, method.estimates), dead_reckon(*epochs, travel))
-    return method, Paths(before, _late_path(track, f, lever_b, late['gnss']))
+    lever_b, f = _lever(method.estimates, ready.config), method.details['f']
+    before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(*epochs, travel))
+    return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
+                     delays=seen)
 
 
-def _attitude(run, details):
+def _attitude(ready, details):
     """
     Return the smoother's attitude at the Imu's rate: t (m,) s, q_nb (m, 4).
 
     Between keyframes the gyros turn it; where they end, beyond the fixes fitted, by them alone.
     """
     t_key, C_nb = details['key_t'], details['key_C_nb']
-    t, q_nb = run.attitude_from(t_key[0], quat_from_matrix(C_nb[0]), details['gyro_bias'])
+    t, q_nb = ready.attitude_from(t_key[0], quat_from_matrix(C_nb[0]), details['gyro_bias'])
     off = quat_multiply(quat_from_matrix(C_nb), quat_conjugate(quat_at(t_key, t, q_nb)))
     return t, quat_multiply(quat_at(t, t_key, off), q_nb)
 

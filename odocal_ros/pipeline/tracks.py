@@ -1,8 +1,5 @@
 """The tracks of a leg, as configured and as calibrated, and how far they stray from the fixes."""
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import numpy as np
 
 from odocal_ros.calib.check import stray, track_check
@@ -16,19 +13,7 @@ FAR = 20.0              # times the usual distance from the track: an outlier be
 TRACK_ROWS = 5000       # of a track kept in a result
 
 
-class Paths(NamedTuple):
-    """
-    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
-
-    Both have one attitude, and the fit's angles where it determines none: they differ in what
-    the calibration changes and in nothing else.
-    """
-
-    before: Callable
-    after: Callable
-
-
-def as_configured(run, f, estimates):
+def as_configured(ready, f, estimates):
     """
     Return f = K0 d0 of the settings, (3,) m per unit of travel.
 
@@ -38,81 +23,91 @@ def as_configured(run, f, estimates):
     told = {name for name, e in estimates.items() if e.value is not None}
     angles = [0.0 if name in told else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
-    return (run.nominal or run.rough) * forward_b(*angles)
+    return (ready.nominal or ready.rough) * forward_b(*angles)
 
 
-def near(run, path, pin, between):
-    """Tell which fixes do not lie absurdly far from a path that fits: (k,) bool."""
-    if not between.any():
-        return between
-    off = np.hypot(*stray(path, pin, (run.inputs.t_fix, run.fixes_n))[:, :2].T)
-    usual = max(float(np.median(off[between])), run.fix_sigma)
-    far = off > FAR * usual
-    if (far & between).any() and not any('off the track' in r.text for r in run.reasons):
-        run.reasons.append(Reason(
-            Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes '
-            f'lie more than {FAR * usual:.0f} m off the track; not used in the check'))
-    return ~far
-
-
-def tracks(run, paths) -> dict:
+def near(ready, path, pin, between):
     """
-    Return the tracks, checks and evidence of a leg as fields of its result.
+    Tell which fixes do not lie absurdly far from a path that fits.
 
-    run : LegRun, aligned and reckoned; takes the reason if the correction makes it worse.
-    paths : Paths
+    Returns
+    -------
+    (k,) bool, and what is to be said of the others, a tuple.
+
+    """
+    if not between.any():
+        return between, ()
+    off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
+    usual = max(float(np.median(off[between])), ready.fix_sigma)
+    far = off > FAR * usual
+    found = (Reason(
+        Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes '
+        f'lie more than {FAR * usual:.0f} m off the track; not used in the check'),)
+    return ~far, found if (far & between).any() else ()
+
+
+def tracks(ready, paths) -> tuple[dict, tuple[Reason, ...]]:
+    """
+    Return the tracks, checks and evidence of a leg as fields of its result, and what they say.
+
+    ready : PreparedLeg.   paths : Paths.
     """
     before, after = paths
-    start = _start(run, after)
+    start = _start(ready, after)
     if start is None:
-        return {}
-    t = run.track.t[::max(1, len(run.track.t) // TRACK_ROWS)]
+        return {}, ()
+    t = ready.track.t[::max(1, len(ready.track.t) // TRACK_ROWS)]
     more = {name: start.position_n + path(t) - path(np.array(start.t))
             for name, path in (('track_before_n', before), ('track_n', after))}
-    more |= {'origin': (run.origin.latitude, run.origin.longitude, run.origin.height)}
-    pin, between, way = _checked(run, after, start)
-    more['reference_n'] = run.fixes_n[between]
+    more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
+    pin, between, way, found = _checked(ready, after, start)
+    more['reference_n'] = ready.fixes_n[between]
     if pin is None or between.sum() < FEWEST_FIXES:
-        return more
-    fixes = run.inputs.t_fix[between], run.fixes_n[between]
+        return more, found
+    fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
     more |= {name: track_check(stray(path, pin, fixes), way)
              for name, path in (('before', before), ('after', after))}
-    relative = (np.interp(fixes[0], *driven(run)),
+    relative = (np.interp(fixes[0], *driven(ready)),
                 *(stray(path, pin, fixes) for path in paths))
     more['per_distance'] = per_distance(*relative)
-    run.reasons += check_worse(*relative, bool(run.nominal))
-    kept = near(run, after, start, between)
-    return more | {'evidence': evidence(run.leg, run.inputs, run.track, run.fixes_n, kept, start,
-                                        paths, run.config, run.t_fit)}
+    kept, far = near(ready, after, start, between)
+    found += (*check_worse(*relative, bool(ready.nominal)), *far)
+    return more | {'evidence': evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept,
+                                        start, paths, ready.config, ready.t_fit)}, found
 
 
-def check_of(run, path) -> dict:
-    """Return the check of a method's own path as an entry of its details, empty without one."""
-    start = _start(run, path)
-    pin, between, way = _checked(run, path, start) if start else (None, np.zeros(1, bool), 0.0)
+def check_of(ready, path) -> tuple[dict, tuple[Reason, ...]]:
+    """Return the check of a method's own path as an entry of its details, and what it says."""
+    start = _start(ready, path)
+    if start is None:
+        return {}, ()
+    pin, between, way, found = _checked(ready, path, start)
     if pin is None or between.sum() < FEWEST_FIXES:
-        return {}
-    check = track_check(stray(path, pin, (run.inputs.t_fix[between], run.fixes_n[between])), way)
+        return {}, found
+    fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
+    check = track_check(stray(path, pin, fixes), way)
     return {'check': {name: getattr(check, name) for name in (
-        'rms', 'max', 'mean', 'end', 'percent_of_distance')}}
+        'rms', 'max', 'mean', 'end', 'percent_of_distance')}}, found
 
 
-def _start(run, path):
-    return run.mark(max(0.0, float(run.track.t[0]), float(run.inputs.travel.t[0])), path, 'start')
+def _start(ready, path):
+    begin = max(0.0, float(ready.track.t[0]), float(ready.inputs.travel.t[0]))
+    return ready.mark(begin, path, 'start')
 
 
-def _checked(run, path, start):
-    """Return where the path is pinned, which fixes it is held against, the way in m."""
-    pin, begin, end = start, start.t, run.t_fit
-    if run.holdout:
-        pin, begin, end = run.mark(run.t_fit, path), run.t_fit, run.inputs.t_stop
-    between = (run.inputs.t_fix >= begin) & (run.inputs.t_fix <= end)
+def _checked(ready, path, start):
+    """Return where the path is pinned, which fixes it is held against, the way in m; reasons."""
+    pin, begin, end, found = start, start.t, ready.t_fit, ()
+    if ready.holdout:
+        pin, begin, end = ready.mark(ready.t_fit, path), ready.t_fit, ready.inputs.t_stop
+    between = (ready.inputs.t_fix >= begin) & (ready.inputs.t_fix <= end)
     if pin is not None:
-        between &= near(run, path, pin, between)
-    a, b = np.interp([begin, end], *driven(run))
-    return pin, between, b - a
+        inside, found = near(ready, path, pin, between)
+        between &= inside
+    a, b = np.interp([begin, end], *driven(ready))
+    return pin, between, b - a, found
 
 
-def driven(run):
+def driven(ready):
     """Return times of the track, s, and the way driven until then, m."""
-    return run.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s)))) * run.rough
+    return ready.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s)))) * ready.rough

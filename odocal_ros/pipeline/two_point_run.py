@@ -19,90 +19,89 @@ from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
 from odocal_ros.nav.rotations import matrix_from_quat
-from odocal_ros.pipeline.tracks import as_configured, near, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.tracks import as_configured, near
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import toward
 
 NAMES = ('start', 'end')
 
 
-def two_point(run):
+def two_point(ready, passed=None) -> MethodRun:
     """
     Run the two-point method on a leg.
 
-    run : LegRun, aligned and reckoned; what is found of the data joins its reasons.
-
-    Returns
-    -------
-    MethodResult, and the antenna's Paths; None where refused.
-
+    ready : PreparedLeg.   passed : not called, it makes no passes.
     """
-    return TwoPointRun(run).result()
+    return TwoPointRun(ready).result()
 
 
 class TwoPointRun:
     """The method on its way over one leg."""
 
-    def __init__(self, run):
-        self.run, self.inputs, self.config, self.track = run, run.inputs, run.config, run.track
-        self.reasons = []
+    def __init__(self, ready):
+        self.ready, self.inputs = ready, ready.inputs
+        self.config, self.track = ready.config, ready.track
+        self.reasons, self.found = [], []       # of the method, and of the data
 
     def result(self):
         """Return the method's result and the path."""
         chord = self._chord()
-        refused = tuple(self.reasons) if chord is None else refusal(chord, self.run.rough)
+        refused = tuple(self.reasons) if chord is None else refusal(chord, self.ready.rough)
         if refused:
-            return unsolved(refused, self.inputs.scale_unit), None
+            return MethodRun(unsolved(refused, self.inputs.scale_unit), found=tuple(self.found))
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
         between = (t_fix >= chord.start.t) & (t_fix <= chord.end.t)
-        between &= near(self.run, self.run.path(f), chord.start, between)
+        inside, far = near(self.ready, self.ready.path(f), chord.start, between)
+        between &= inside
+        self.found += far
         factor = np.ones(3)
         if between.sum() >= 3:
             chord, factor = self._judged(chord, f, between)
         chord = replace(chord, slips=self._slips(chord, solve(chord, factor[2])[0]))
-        method = fit(chord, self.run.nominal, self.inputs.scale_unit, self.inputs.travel.quantum,
+        method = fit(chord, self.ready.nominal, self.inputs.scale_unit, self.inputs.travel.quantum,
                      factor, self.config)
         self._reversed(chord)
         method = replace(method, reasons=(*method.reasons, *self.reasons, *judge(
-            method.estimates, self.run.nominal, self.config)))
+            method.estimates, self.ready.nominal, self.config)))
         f = method.details['f']
-        return method, Paths(*map(self.run.path, (
-            as_configured(self.run, f, method.estimates), f)))
+        paths = Paths(*map(self.ready.path, (as_configured(self.ready, f, method.estimates), f)))
+        return MethodRun(method, paths, tuple(self.found))
 
     def _slips(self, chord, f):
         """Return slips of the mean between the marks, s and m; name those not named already."""
         if not self.inputs.felt:
             return np.empty(0), np.empty(0)
         t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
-                             toward(self.run.facing, f), self.run.origin.latitude,
+                             toward(self.ready.facing, f), self.ready.origin.latitude,
                              rounding(self.inputs.travel))
-        one = self.run.wheel_slips      # of one wheel: half of it goes into the mean
+        one = self.ready.wheel_slips      # of one wheel: half of it goes into the mean
         known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
         held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
-        self.run.reasons += slip_reason(t[held], size[held])
+        self.found += slip_reason(t[held], size[held])
         inside = (one.t >= chord.start.t) & (one.t <= chord.end.t)
         return np.append(t[held], one.t[inside]), np.append(size[held], one.size[inside] / 2)
 
     def _chord(self):
         """Return the chord between the marks, or None and say why."""
-        run, track, travel = self.run, self.track, self.inputs.travel
+        ready, track, travel = self.ready, self.track, self.inputs.travel
         ends = (max(0.0, float(track.t[0]), float(travel.t[0])),
-                min(run.t_fit, float(track.t[-1]), float(travel.t[-1])))
-        path = run.path(np.array([run.rough, 0.0, 0.0]))
-        marks = [run.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True)]
+                min(ready.t_fit, float(track.t[-1]), float(travel.t[-1])))
+        path = ready.path(np.array([ready.rough, 0.0, 0.0]))
+        marks = [ready.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True)]
         for mark, name in zip(marks, NAMES, strict=True):
             if mark is None:
                 self.reasons.append(Reason(Code.NO_FIX, f'no usable fix at the {name} mark'))
         if None in marks:
             return None
-        chord = Chord(track, run.origin, *marks, run.lever_b, self._velocity_change(marks),
-                      run.alignment, (self.inputs.doubt_t, self.inputs.doubt_sigma))
+        chord = Chord(track, ready.origin, *marks, ready.lever_b, self._velocity_change(marks),
+                      ready.alignment, (self.inputs.doubt_t, self.inputs.doubt_sigma))
         if not all(m.standing or m.surveyed for m in marks):     # the fit moves with the solution
-            if refusal(chord, run.rough):
+            if refusal(chord, ready.rough):
                 return chord
-            path = run.path(solve(chord, np.inf)[0])
-            marks = [run.mark(m.t, path, name) for m, name in zip(marks, NAMES, strict=True)]
+            path = ready.path(solve(chord, np.inf)[0])
+            marks = [ready.mark(m.t, path, name) for m, name in zip(marks, NAMES, strict=True)]
             chord = replace(chord, start=marks[0], end=marks[1])
         return chord
 
@@ -119,18 +118,18 @@ class TwoPointRun:
 
     def _judged(self, chord, f, between):
         """Return the chord with honest marks, the factor on fix sigmas; judge the track."""
-        run = self.run
-        fixes = self.inputs.t_fix[between], run.fixes_n[between]
+        ready = self.ready
+        fixes = self.inputs.t_fix[between], ready.fixes_n[between]
         drift_n = self._drift(chord, f)
         drift = float(np.linalg.norm(drift_n))
-        residual = stray(run.path(f), chord.start, fixes)
-        up = stray(run.path(solve(chord)[0]), chord.start, fixes)
+        residual = stray(ready.path(f), chord.start, fixes)
+        up = stray(ready.path(solve(chord)[0]), chord.start, fixes)
         residual[:, 2] = up[:, 2]              # the pitch is no noise of heights
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
         if np.isnan(self.config.gnss.correlation_time):     # else told, not judged
             start, end = marks_no_better(
-                (chord.start, chord.end), run.spans, fixes[0], self.track.at(fixes[0]) @ f,
+                (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])
             chord = replace(chord, start=start, end=end)
         f, _ = solve(chord, factor[2])
@@ -142,7 +141,7 @@ class TwoPointRun:
         keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
         D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
         sources = drift_sources(self.track.t[keep], D, matrix_from_quat(self.track.q_nb[keep]),
-                                self.run.alignment)
+                                self.ready.alignment)
         # the bow of a pinned track is a quarter of what its free end would stray
         return np.concatenate(list(sources.values()), axis=1) / 4
 
@@ -157,20 +156,20 @@ class TwoPointRun:
 
     def _judge_track(self, chord, f, fixes, residual, drift):
         """Compare the corrected track with the fixes: reversing, sanity."""
-        run, (t, p) = self.run, fixes
+        ready, (t, p) = self.ready, fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
-        keep, sigma = steady(residual, run.fix_sigma)
+        keep, sigma = steady(residual, ready.fix_sigma)
         _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
         found = against_travel(direction, course, stretch, self.config.odometer.signed)
-        run.reasons += found
+        self.found += found
         if not found:
-            check = track_check(stray(run.path(f), chord.start, fixes), run.distance)
-            self.reasons += mismatch(check, run.fix_sigma, drift, run.distance)
+            check = track_check(stray(ready.path(f), chord.start, fixes), ready.distance)
+            self.reasons += mismatch(check, ready.fix_sigma, drift, ready.distance)
 
     def _reversed(self, chord):
         """Say that the odometer counts down where nothing tells how the Imu is pushed."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
-        if backwards and self.run.facing is None and not chord.alignment.heading_separable:
-            self.run.reasons.append(Reason(
+        if backwards and self.ready.facing is None and not chord.alignment.heading_separable:
+            self.found.append(Reason(
                 Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive '
                 'counts mean backwards, or the vehicle was reversed all the way'))

@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
-from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.plan.drive import AT_REST, PlannedDrive, STEP
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
@@ -30,7 +29,8 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs Imu, odometer and fixes between the marks; see odocal '
                       'inspect for what is there')
-    origin, fixes_n, scale = _placed(inputs, config)
+    placed = _placed(inputs, config)
+    origin, scale = placed.origin, placed.rough
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
         inputs.t_stop, inputs.t_imu[-1], inputs.travel.t[-1])
     t = np.linspace(first, last, max(2, int((last - first) / max(STEP, (last - first) / 5e4))))
@@ -41,23 +41,17 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
     speed = np.where(resting, 0.0, way * scale / (2 * HALF))
     speed[~resting & (np.abs(speed) <= AT_REST)] = 2 * AT_REST    # too short to count as rest
     yaw = _yaw(inputs, spans, t)
-    return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, fixes_n),
+    return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, placed.fixes_n),
                         np.zeros_like(t), origin.latitude, origin.longitude, origin.height)
 
 
 def _placed(inputs, config):
-    """Return origin, fixes in n, (k, 3) m, and the rough scale; raise BadData without one."""
-    geodetic = np.nan_to_num(inputs.geodetic)
-    near = int(np.argmin(np.abs(inputs.t_fix)))
-    origin = Origin(*(float(x) for x in geodetic[near]))
-    fixes_n = origin.to_n(geodetic)
-    sigma = float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0])))
-    scale = rough_scale(inputs.travel, inputs.t_fix, fixes_n, sigma) \
-        or nominal_scale(config, inputs.scale_unit)
-    if not scale:
+    """Return where the fixes lie and how far a count reaches; raise BadData without."""
+    placed = place(inputs, config)
+    if not placed.rough:
         raise BadData('the scale is not known yet: the fixes moved too little, and '
                       'odometer.nominal_scale is not set')
-    return origin, fixes_n, scale
+    return placed
 
 
 def count_size(leg: Leg, config: Config) -> float:
@@ -71,7 +65,7 @@ def count_size(leg: Leg, config: Config) -> float:
 
     """
     inputs, _ = screen(leg, config)
-    return inputs.travel.quantum * _placed(inputs, config)[2]
+    return inputs.travel.quantum * _placed(inputs, config).rough
 
 
 def _yaw(inputs, spans, t):

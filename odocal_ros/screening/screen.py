@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import let_go
-from odocal_ros.nav.dead_reckoning import rough_scale
 from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.integral import by_step
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.clocks import judge_clocks
-from odocal_ros.screening.fix_screen import origin_amid, usable_fixes
+from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
 from odocal_ros.screening.wheel_faults import broken_wheels
@@ -127,18 +127,9 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     if unfelt:
         return inputs, tuple(found)
     back = reversed_starts(inputs.travel, t_imu, w_b, f_b, (0.0, t_stop))
-    found += said_of(back, inputs.travel, _metres(inputs) if len(back) else None, BY_IMU,
-                     config.odometer.signed)
+    metres = place(inputs, config).rough or None if len(back) else None
+    found += said_of(back, inputs.travel, metres, BY_IMU, config.odometer.signed)
     return inputs.mirrored(back), tuple(found)
-
-
-def _metres(inputs):
-    """Return rough metres per unit of travel, None where the fixes do not tell."""
-    t, geodetic = inputs.t_fix, inputs.geodetic
-    if not len(t):
-        return None
-    return rough_scale(inputs.travel, t, origin_amid(t, geodetic).to_n(np.nan_to_num(geodetic)),
-                       float(np.sqrt(np.median(inputs.covariance_n[:, 0, 0]))))
 
 
 def _turned(vector_i, scale, C_bi):

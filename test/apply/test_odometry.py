@@ -9,7 +9,7 @@ from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, t
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.pipeline.calibrate import calibrate
-from odocal_ros.pipeline.leg_run import LegRun
+from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -51,8 +51,7 @@ def test_of_two_wheels_each_has_its_own_factor(two_wheels):
     made = two_wheels
     row = int(np.searchsorted(made.imu.stamp_ns, made.truth.start_ns)) - 5
     alignment, config = alignment_of(made, row), settings(made)
-    run = LegRun(made.leg(), screen(made.leg(), config)[0], config, [], alignment)
-    assert run.examine()
+    run, _ = prepare(made.leg(), screen(made.leg(), config)[0], config, alignment=alignment)
     left, right = (run.reckon(travel).P * scale for travel, scale in zip(
         (run.inputs.travel_left, run.inputs.travel_right), made.truth.wheel_scales, strict=True))
     wanted = (left + right) / 2 @ forward_b(made.truth.yaw, made.truth.pitch)

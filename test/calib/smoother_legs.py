@@ -11,7 +11,7 @@ from odocal_ros.calib.smoother.state import C_bv, GNSS_DELAY, LN_K, M, ODO_DELAY
 from odocal_ros.data.samples import VelocitySamples
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.standstill import standstills
-from odocal_ros.pipeline.leg_run import LegRun
+from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.sim import motion, sensors
 from odocal_ros.sim.noise import random_walk, stream
@@ -34,9 +34,10 @@ def made(**options):
 def leg_of(leg, config):
     """Return the smoother's view of a leg."""
     inputs, _ = screen(leg, config)
-    run = LegRun(leg, inputs, config, [], None)
-    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, run.rough, config.leg.standstill)
-    return smoother_leg(inputs, config, run.origin, run.fixes_n, spans, run.rough)
+    placed = place(inputs, config)
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
+                        config.leg.standstill)
+    return smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans, placed.rough)
 
 
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):

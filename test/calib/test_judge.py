@@ -11,13 +11,14 @@ from odocal_ros.calib.check import (
     steady,
     track_check,
 )
-from odocal_ros.calib.judge import judge, nominal_scale
+from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.slow_errors import slow_variance
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.reasons import Code
 from odocal_ros.screening.sanity import imu_sanity
 from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.nominal import nominal_scale
 
 CONFIG = Config()
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.judge import nominal_scale
 from odocal_ros.calib.smoother.outside import Heading, outside_heading, outside_velocity, Velocity
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
 STEPS = 0.05           # m/s: a speed in finer steps errs as if by chance

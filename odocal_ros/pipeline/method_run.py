@@ -1,0 +1,35 @@
+"""What a method gives on one leg."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.reasons import Reason
+
+
+class Paths(NamedTuple):
+    """
+    The antenna's path as configured and as calibrated: t (n,) to (n, 3) m, but for a constant.
+
+    Both have one attitude, and the fit's angles where it determines none: they differ in what
+    the calibration changes and in nothing else.
+    """
+
+    before: Callable
+    after: Callable
+
+
+class MethodRun(NamedTuple):
+    """
+    A method's result and what it found beside it.
+
+    paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
+    'odometer' to s late and sigma; None from a method that sees none.   slips : of one wheel, as
+    they stand in calibration.json.
+    """
+
+    result: MethodResult
+    paths: Paths | None = None
+    found: tuple[Reason, ...] = ()
+    delays: dict[str, tuple] | None = None
+    slips: tuple[dict, ...] = ()

@@ -1,0 +1,128 @@
+"""From screened inputs to a leg that methods can be run on: placed, faced, aligned, reckoned."""
+
+import numpy as np
+
+from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
+from odocal_ros.calib.mounting import with_axes
+from odocal_ros.calib.turning import gyro_reasons, turn_ratio
+from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
+from odocal_ros.data.samples import let_go
+from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.integral import by_row, medians
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.pipeline.align import align
+from odocal_ros.pipeline.coarse_odometer import coarse_reasons
+from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.facing import axes_reasons, facing
+from odocal_ros.screening.placed import place
+from odocal_ros.screening.screen import imu_gap
+
+FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
+BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
+
+
+def prepare(leg, inputs, config, reasons=(), alignment=None, holdout=False):
+    """
+    Prepare a leg for the methods.
+
+    Parameters
+    ----------
+    leg, inputs, config : Leg, Inputs, Config
+        The leg, screened, and the settings in force.
+    reasons : sequence of Reason
+        What was found of it so far.
+    alignment : Alignment, optional
+        Used instead of the leg's own.
+    holdout : bool
+        Keep the last fifth of the distance back from the fit.
+
+    Returns
+    -------
+    PreparedLeg, None where no method can be run on it, and all that was found, a tuple.
+
+    """
+    placed = place(inputs, config)
+    let_go(*vars(leg.imu).values())
+    still = _standing(inputs, placed)
+    if still is not None:
+        return None, (*reasons, *still)
+    faces = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel,
+                   placed.rough) if inputs.felt else None
+    axes = axes_reasons(faces, config.imu.nominal_yaw)
+    reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop), *with_axes(axes, inputs))
+    if Code.IMU_AXES in {r.code for r in axes}:
+        return None, reasons
+    turning = _turning(inputs, config, placed)
+    if turning:
+        return None, (*reasons, *turning)
+    prepared = _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout)
+    return prepared, prepared.reasons
+
+
+def _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout):
+    """Return the leg aligned, dead reckoned, and the drive judged."""
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
+                        config.leg.standstill)
+    about = ()
+    if alignment is None:
+        alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,
+                                 config)
+    let_go(*vars(leg.imu).values())
+    gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
+    epochs = attitude_of(inputs, placed.origin.latitude, alignment.t, alignment.q_nb,
+                         alignment.gyro_bias)
+    track = dead_reckon(*epochs, inputs.travel)
+    apart, slips = _wheels_beside(inputs, config, placed, track, reasons)
+    distance, judged = judge_drive(track, inputs.t_stop, placed.rough, config.leg)
+    # turns are what the others live on
+    of_ends = tuple(r for r in judged if r.code is Code.LEG_NOT_STRAIGHT)
+    return PreparedLeg(
+        **vars(placed), leg=leg, inputs=inputs, config=config, facing=faces,
+        lever_b=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
+        alignment=alignment, about_alignment=about, epochs=epochs, track=track,
+        wheel_slips=slips, distance=distance,
+        t_fit=_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop, holdout=holdout,
+        reasons=(*reasons, *gap, *coarse_reasons(inputs, placed), *apart,
+                 *(r for r in judged if r not in of_ends)), of_ends=of_ends)
+
+
+def _standing(inputs, placed):
+    """Return why there is no drive to speak of, None where there is one."""
+    still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
+                       inputs.t_stop)
+    if still or not placed.rough:
+        return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little for a scale'),)
+    covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
+    if covered.sum() < FEWEST_ROWS:
+        return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
+    return None
+
+
+def _turning(inputs, config, placed):
+    """Return how the gyro turns, where it does not turn with the course of the fixes."""
+    up_b = medians(inputs.f_b)
+    up_b /= np.linalg.norm(up_b)
+    ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
+                       inputs.t_fix, placed.fixes_n, placed.fix_sigma)
+    return gyro_reasons(ratio, config.imu.gyro_scale)
+
+
+def _wheels_beside(inputs, config, placed, track, reasons):
+    """Return what is wrong with two wheels beside each other, and where one slipped."""
+    odometer = config.odometer
+    unseen = inputs.travel_right is None or not inputs.felt
+    if unseen or BROKEN & {r.code for r in reasons}:
+        return (), NO_SLIPS
+    return wheel_faults(
+        inputs.travel_left, inputs.travel_right, (inputs.t_imu, inputs.w_b, inputs.f_b),
+        (0.0, inputs.t_stop), track, placed.origin.latitude, placed.rough,
+        odometer.track_width, inputs.doubt_t, odometer.max_scale_deviation)
+
+
+def _four_fifths(track, t_stop):
+    """Return when four fifths of the distance are driven, s."""
+    inside = (track.t >= 0) & (track.t <= t_stop)
+    s = track.s[inside]
+    way = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
+    return float(track.t[inside][np.searchsorted(way, 0.8 * way[-1])])

@@ -1,0 +1,109 @@
+"""A leg made ready for the methods: aligned, reckoned, judged; nothing of it changes later."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
+from odocal_ros.calib.wheels.slips import WheelSlips
+from odocal_ros.data.leg import Leg
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import dead_reckon, Track
+from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.strapdown import attitude
+from odocal_ros.reasons import Reason
+from odocal_ros.screening.facing import Facing
+from odocal_ros.screening.placed import Placed
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
+
+EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
+AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLeg(Placed):
+    """
+    All that methods read; what they find is theirs, so that their order does not matter.
+
+    leg, inputs, config : as screened, under the settings in force.   facing : of the Imu, None
+    unseen.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
+    standstills.   alignment : and what it had to say.   epochs : the attitude as aligned, t (m,)
+    s and q_nb (m, 4).   track : of the odometer (the mean of the wheels), dead reckoned so.
+    wheel_slips : of one wheel against the other.   distance : m, by the rough scale.   t_fit : s;
+    fixes after it are held out, where ``holdout`` is.   reasons : what was found of the leg;
+    of_ends : what matters to its ends alone.
+    """
+
+    leg: Leg
+    inputs: Inputs
+    config: Config
+    facing: Facing | None
+    lever_b: NDArray[np.float64]
+    spans: NDArray[np.float64]
+    alignment: Alignment
+    about_alignment: tuple[Reason, ...]
+    epochs: tuple[NDArray[np.float64], NDArray[np.float64]]
+    track: Track
+    wheel_slips: WheelSlips
+    distance: float
+    t_fit: float
+    holdout: bool
+    reasons: tuple[Reason, ...]
+    of_ends: tuple[Reason, ...]
+
+    def path(self, f, track=None):
+        """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
+        track = self.track if track is None else track
+
+        def at(t):
+            path = track.at(t) @ f
+            return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
+        return at
+
+    def mark(self, t, path, name=''):
+        """
+        Return the antenna's position at t, None without any.
+
+        By the fixes about it, or the surveyed point of the mark 'start' or 'end'.
+        """
+        point = self._surveyed(name, t)
+        if point:
+            position = np.array([np.deg2rad(point[0]), np.deg2rad(point[1]), point[2]])
+            return MarkFix(t, self.origin.to_n(position), np.eye(3) * point[3]**2,
+                           standing_at(t, self.spans) is not None, 0, 0, surveyed=True)
+        inputs, here = self.inputs, path(np.array(t))
+        rhythm = np.median(np.diff(inputs.t_fix)) if len(inputs.t_fix) > 1 else MARK_WINDOW
+        return fix_at(t, standing_at(t, self.spans),
+                      (inputs.t_fix, self.fixes_n, inputs.covariance_n),
+                      lambda times: path(times) - here,
+                      self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
+
+    def _surveyed(self, name, t):
+        """Return the reference point at a mark, () where the way does not begin or end there."""
+        if not name:
+            return ()
+        t_mark = 0.0 if name == 'start' else self.inputs.t_stop
+        span = standing_at(t_mark, self.spans)
+        if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
+            return getattr(self.config.reference, name)
+        return ()
+
+    def reckon(self, travel):
+        """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
+        return dead_reckon(*self.epochs, travel)
+
+    def attitude_from(self, t_begin, q_nb, gyro_bias):
+        """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
+        return attitude_of(self.inputs, self.origin.latitude, t_begin, q_nb, gyro_bias)
+
+
+def attitude_of(inputs, latitude, t_begin, q_nb, gyro_bias):
+    """Return the attitude of inputs from a time, s, on: t (m,) s, q_nb (m, 4)."""
+    rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
+                 np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
+    t = inputs.t_imu[rows]
+    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
+    return attitude(t, inputs.w_b[rows], q_nb, earth_rate_n(latitude),
+                    max(1, int(rate / EPOCH_RATE)), gyro_bias)
