@@ -72,8 +72,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
 
 def _once(found):
     """Return what methods and tracks found, of fixes far off a path only what the first said."""
-    far = [r for r in found if r.code is Code.BAD_ROWS_DROPPED]
-    return [r for r in found if r not in far[1:]]
+    far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
+    return [r for k, r in enumerate(found) if k not in far[1:]]
 
 
 def _methods_of(prepared):
