@@ -29,10 +29,10 @@ ROOMS = {
     'apply': 'calib data nav settings',
     'sim': 'data nav settings',
     'paper': 'calib nav pipeline settings sim',
-    'output': 'calib nav outside paper pipeline settings',
+    'output': 'calib nav outside paper patent pipeline settings',
     'live': 'apply bagio calib data foresee messages output outside pipeline settings',
-    'offline': 'bagio calib data messages nav output outside paper pipeline plan screening '
-               'settings sim'}
+    'offline': 'bagio calib data messages nav output outside paper patent pipeline plan '
+               'screening settings sim'}
 COMMON = {'errors', 'reasons'}
 
 

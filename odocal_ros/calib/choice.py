@@ -7,6 +7,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'wheels', 'two_point')
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
+BY = {'patent': 'wheels'}       # asked for: the method that decides then
 # what the smoother refuses end points do not know either: they have but the accelerometer's level
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # what a reason speaks of: nothing to say where another method gives it
@@ -32,6 +33,7 @@ def deciding(asked, shown: bool = False) -> tuple[str, ...]:
         return asked
     if asked in ('auto', 'all'):
         return ORDER
+    asked = BY.get(asked, asked)
     return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
 
 

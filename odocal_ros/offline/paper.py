@@ -20,7 +20,7 @@ def run(args) -> int:
     """Compute, print, draw; return 0."""
     picture = None if args.plot is None else Path(args.plot)
     if picture is not None:
-        _check_picture(picture)
+        check_picture(picture)
     from odocal_ros.paper.tables import compute
     tables = compute()
     if picture is not None:
@@ -37,7 +37,7 @@ def run(args) -> int:
     return 0
 
 
-def _check_picture(path: Path) -> None:
+def check_picture(path: Path) -> None:
     """Refuse before computing what could not be drawn after it."""
     if path.suffix.lower() not in PICTURES:
         raise BadUsage(f'--plot {path}: want a name that ends in {", ".join(PICTURES)}')

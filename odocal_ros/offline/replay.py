@@ -35,7 +35,7 @@ def add_arguments(parser) -> None:
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
-    add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all'),
+    add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
         help='method whose figures are the result')
     add('--holdout', action='store_true', help='keep the last fifth of each leg back and check '
         'the correction on it')

@@ -1,11 +1,10 @@
 """The picture of odocal paper: the track of figure 1, and how each error grows."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 
-from odocal_ros.errors import BadUsage
+from odocal_ros.output.pictures import new_figure, save_figure
 from odocal_ros.paper.tables import PaperTables
 
 # Okabe and Ito's colours, told apart by colour-blind eyes too
@@ -17,7 +16,6 @@ LABELS = {'phi_U0': r'$\phi_{U0}$ = 3.6′', 'all': 'all of them',
           'phi_N0': r'$\phi_{N0}$ = 0.5′', 'eps_x': r'$\varepsilon_x$ = 0.01 °/h',
           'eps_y': r'$\varepsilon_y$ = 0.01 °/h'}
 GRID = {'color': '0.88', 'linewidth': 0.6}
-DPI = 150
 
 
 def draw(tables: PaperTables, path: Path) -> None:
@@ -30,10 +28,7 @@ def draw(tables: PaperTables, path: Path) -> None:
         The file cannot be written.
 
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    figure = Figure(figsize=(12.0, 6.6), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = new_figure(12.0, 6.6)
     grid = figure.add_gridspec(1, 2, width_ratios=(0.82, 1.0))
     left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
     _track(left.subplots(), tables)
@@ -42,13 +37,7 @@ def draw(tables: PaperTables, path: Path) -> None:
     figure.legend(*upper.get_legend_handles_labels(), loc='outside lower center', ncols=4,
                   frameon=False, fontsize=9, title='Source of error, and the yaw error that the '
                   'pipeline ends with (estimate - truth)', title_fontsize=9)
-    part = path.with_name(f'.{path.name}.part')
-    try:
-        figure.savefig(part, format=path.suffix[1:].lower(), dpi=DPI)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise BadUsage(f'--plot {path}: cannot write it ({error.strerror})') from None
+    save_figure(figure, path)
 
 
 def _track(axes, tables):

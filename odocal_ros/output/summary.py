@@ -9,6 +9,7 @@ from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.output.budget_table import budget_lines, LABELS
 from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
+from odocal_ros.output.search_table import search_lines
 from odocal_ros.output.track_table import track_lines
 from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
@@ -52,7 +53,7 @@ def screen(calibration: Calibration, styled: bool = False, width: int = WIDTH,
                                  (False, False, False)):
         parts = [_head(calibration, styled), _values(calibration, width),
                  _leg_table(calibration.legs, width), _method_table(calibration),
-                 track_lines(calibration.legs, width),
+                 search_lines(calibration.legs), track_lines(calibration.legs, width),
                  _budget(calibration, width, small) if budget else [],
                  reason_lines(calibration.reasons, width, brief=not notes)]
         text = '\n\n'.join('\n'.join(part) for part in parts if part)

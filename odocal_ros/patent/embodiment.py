@@ -11,6 +11,7 @@ is to be turned counter-clockwise by the heading error.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from odocal_ros.patent.arrays import full_factorial, least_rows, nearly_balanced
 from odocal_ros.patent.criteria import score
@@ -52,6 +53,7 @@ class Embodiment:
     small, whole : the rows of the best of 81 and of all 441 among ``rows``.
     refined, refined_together : by surfaces inside the range, left and right free or together.
     direct, direct_together : by least squares, in no range.   radius : m, nominal, of both wheels.
+    grid : (7, 7) m, least mean distance over the headings, by left and right radius of all 441.
     """
 
     rows: tuple[Row, ...]
@@ -64,11 +66,24 @@ class Embodiment:
     direct: LeastSquares
     direct_together: LeastSquares
     radius: float
+    grid: NDArray[np.float64]
 
     @property
     def sigma_radius(self) -> float:
         """Return the formal sigma of right less left radius by positions, m."""
         return self.direct.sigma_difference * self.radius
+
+    def as_dict(self) -> dict:
+        """Return what ``odocal patent --json`` prints."""
+        return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
+                'imbalance': self.imbalance, 'orthogonal_rows': self.least,
+                'response_surface': {'iterations': self.refined.iterations,
+                                     'settled': self.refined.settled,
+                                     'on_edge': self.refined.on_edge},
+                'least_squares': {'condition_number': float(self.direct.condition),
+                                  'correlation': float(self.direct.correlation[0, 1]),
+                                  'sigma_right_less_left_m': float(self.sigma_radius)},
+                'told_apart': bool(self.told_apart)}
 
     @property
     def told_apart(self) -> bool:
@@ -93,7 +108,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment
     half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * HEADING_STEP])
     design = nearly_balanced(LEVELS)     # 81 rows
     small, whole = (_levels(rows, half) for rows in (design.rows, full_factorial(LEVELS)))
-    x_small, x_whole = (_best(leg, x) for x in (small, whole))
+    (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, whole))
     step = 2 * half / (np.array(LEVELS) - 1)
     spaces = Space(held=False), Space(held=True)
     refined, together = (
@@ -117,7 +132,7 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment
              row('least squares', direct.x), row('  wheels together', direct_together.x)]
     rows += [] if truth is None else [given('truth', truth)]
     return Embodiment(tuple(rows), design.imbalance, least_rows(LEVELS), *best, refined, together,
-                      direct, direct_together, radius)
+                      direct, direct_together, radius, means.reshape(LEVELS).min(axis=2))
 
 
 def _levels(rows, half):
@@ -125,6 +140,6 @@ def _levels(rows, half):
 
 
 def _best(leg, x):
-    """Return the row with the least mean distance, ties by the largest."""
+    """Return the row with the least mean distance, ties by the largest; and all mean distances."""
     scores = score(leg, sets_of(leg, x), course=False)
-    return x[np.lexsort((scores.max, scores.mean))[0]]
+    return x[np.lexsort((scores.max, scores.mean))[0]], scores.mean

@@ -1,4 +1,4 @@
-"""The method ``wheels`` on one leg: the estimate, and beside it the search of source B."""
+"""The method ``wheels`` on one leg: the estimate and, where asked for, the patent's search."""
 
 from dataclasses import replace
 
@@ -12,10 +12,8 @@ from odocal_ros.calib.wheels.unseen import drawn_out
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
-from odocal_ros.patent.planar import planar_leg
-from odocal_ros.patent.ranges import ranges_of
-from odocal_ros.patent.search import search
 from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.patent_run import search_of
 from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
 
@@ -34,7 +32,7 @@ def wheels(ready, passed=None) -> MethodRun:
     two = ready.inputs.travel_right is not None
     if not two and ready.inputs.felt:
         return MethodRun(refused(ready.inputs, ONE_COUNTER))
-    leg = _leg(ready)
+    leg = wheel_leg(ready)
     if leg is None:
         return MethodRun(refused(ready.inputs, Reason(
             Code.NO_FIX, 'no usable fix at the start mark')))
@@ -42,7 +40,8 @@ def wheels(ready, passed=None) -> MethodRun:
         fit_wheels(leg, ready.config, False))
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
-    found = _search(ready, leg, method.details['pitch']['value']) if two else None
+    asked = two and ready.config.method == 'patent'
+    found = search_of(ready, leg, method.details['pitch']['value']) if asked else None
     more = {} if found is None else {'search': found.as_dict()}
     # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself
     reasons = tuple(r for r in (found.reasons if found else ())
@@ -56,7 +55,8 @@ def wheels(ready, passed=None) -> MethodRun:
         slips=method.details['slips'])
 
 
-def _leg(ready) -> WheelLeg | None:
+def wheel_leg(ready) -> WheelLeg | None:
+    """Return a prepared leg as two wheels see it, None without a fix at its start."""
     inputs = ready.inputs
     left = right = inputs.travel
     if inputs.travel_right is not None:
@@ -88,16 +88,6 @@ def _of_one(method):
 
 def _uneven(ready) -> bool:
     return bool(UNEVEN & {r.code for r in ready.reasons})
-
-
-def _search(ready, leg, pitch):
-    """Return what source B finds: array, response surface, least squares by positions alone."""
-    a, wheels = ready.alignment, ready.config.wheels
-    start = ready.nominal or ready.rough
-    planar = planar_leg(leg.left, leg.right, leg.t_fix, leg.fixes_n, leg.covariance_n,
-                        (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
-    course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
-    return search(planar, ranges_of(wheels, course), wheels.robust)
 
 
 def _paths(ready, leg, method):

@@ -234,9 +234,10 @@ class Config:
     """All settings of the calibrator; see the module for how they are named."""
 
     method: str = setting('auto', choices=(
-        'auto', 'two_point', 'wheels', 'smoother', 'all'), about=(
+        'auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'), about=(
         'Method whose figures are the result; auto: each value of the first of smoother, wheels '
-        '(with two counters) and two_point that has it; all: the same, wheels tried always.'))
+        '(with two counters) and two_point that has it; all: the same, wheels tried always; '
+        'patent: wheels, with the search of CN104359492A beside it.'))
     vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: it stands in '
                            'results and titles the report, and a result of another one is not '
                            'restored.')

@@ -7,8 +7,12 @@ from drives import drive, everything_said
 import numpy as np
 import pytest
 
+from odocal_ros.output.summary import screen as screen_text
 from odocal_ros.pipeline.calibrate import calibrate, combine
+from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
+from odocal_ros.pipeline.prepare import prepare
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.screening.screen import screen
 from odocal_ros.sim.sensors import wheel_scales
 
 ROUTE = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True, 'imu_grade': 'industrial'}
@@ -105,12 +109,33 @@ def test_a_fifth_held_back_is_not_in_the_fit_and_is_met_too(made):
         a.value, rel=1e-12)
 
 
-def test_what_the_search_found_is_in_the_details(result):
-    search = result.methods['wheels'].details['search']
+def test_what_the_search_found_is_in_the_details_where_it_is_asked_for(made, result):
+    assert 'search' not in result.methods['wheels'].details
+    asked = calibrate(made.leg(), settings(made, method='patent'))
+    assert set(asked.methods) == {'two_point', 'wheels'}
+    # it stands beside the values and moves none of them
+    assert asked.methods['wheels'].estimates == result.methods['wheels'].estimates
+    search = asked.methods['wheels'].details['search']
     assert search['array']['name'].startswith('L49')
     assert search['before']['rms'] > search['after']['rms']
+    shown = screen_text(combine([asked], settings(made, method='patent')))
+    assert f'response surface{search["response_surface"]["scale_left"]:20.6g}' in shown
+    assert 'CN104359492A' not in screen_text(combine([result], settings(made)))
     surface, direct = search['response_surface'], search['least_squares']
     assert surface['scale_left'] == pytest.approx(direct['scale_left'], rel=1e-4 * 0.1)
+
+
+def test_the_order_of_the_methods_does_not_matter(made):
+    leg, config = made.leg(), settings(made, method='all')
+    inputs, _ = screen(leg, config)
+    prepared, _ = prepare(leg, inputs, config)
+    onward, backward = (run_methods(names, prepared, lambda name: lambda passes: None)
+                        for names in (list(METHODS), list(METHODS)[::-1]))
+    assert list(onward) == list(backward)[::-1]
+    for name, run in onward.items():
+        assert run.result.estimates == backward[name].result.estimates
+        assert run.result.reasons == backward[name].result.reasons
+    assert found_by(onward, prepared) == found_by(backward, prepared)
 
 
 def test_exchanged_wheels_reject_the_leg(made):

@@ -1,0 +1,25 @@
+"""What the search of CN104359492A found on each leg, where it was asked for, as lines."""
+
+
+def search_lines(legs) -> list[str]:
+    """Return a table of each leg's search, empty where there was none."""
+    lines = []
+    for k, leg in enumerate(legs, 1):
+        wheels = leg.methods.get('wheels')
+        found = wheels and wheels.details.get('search')
+        if not found:
+            continue
+        best, after = found['best_row'], found['after']
+        rows = ((f'best of {found["array"]["rows"]} ({found["array"]["name"]})', best, best),
+                ('response surface', found['response_surface'], after),
+                ('least squares', found['least_squares'], None))
+        lines += ['search by positions alone (CN104359492A), without sigmas'
+                  + (f', leg {k}' if len(legs) > 1 else ''),
+                  f'  {"":24}  {"left":>10}  {"right":>10}  turn, deg  mean, m   max, m']
+        for name, values, fit in rows:
+            how = '' if fit is None else f'  {fit["mean"]:7.3f}  {fit["max"]:7.3f}'
+            lines.append(f'  {name:24}  {values["scale_left"]:10.6g}  '
+                         f'{values["scale_right"]:10.6g}  {values["heading_deg"]:+9.4f}{how}')
+        if found['left_and_right_held_together']:
+            lines.append('  the fixes do not tell left from right: their ratio is kept')
+    return lines

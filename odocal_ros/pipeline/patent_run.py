@@ -1,0 +1,23 @@
+"""The search of patent CN104359492A on one leg, beside method wheels: by positions alone."""
+
+from odocal_ros.patent.planar import planar_leg, PlanarLeg
+from odocal_ros.patent.ranges import ranges_of
+from odocal_ros.patent.search import search, SearchResult
+
+
+def planar_of(ready, leg, pitch) -> PlanarLeg:
+    """
+    Return a leg as the patent sees it: two tracks in the plane, and fixes.
+
+    ready : PreparedLeg.   leg : WheelLeg of it.   pitch : rad, of the Imu on the vehicle.
+    """
+    start = ready.nominal or ready.rough
+    return planar_leg(leg.left, leg.right, leg.t_fix, leg.fixes_n, leg.covariance_n,
+                      (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
+
+
+def search_of(ready, leg, pitch) -> SearchResult:
+    """Return what array, response surface and least squares find; arguments of planar_of."""
+    a, wheels = ready.alignment, ready.config.wheels
+    course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
+    return search(planar_of(ready, leg, pitch), ranges_of(wheels, course), wheels.robust)
