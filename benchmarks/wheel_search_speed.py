@@ -5,7 +5,7 @@ Time the wheels' search on an hour of driving: many parameter sets at once, besi
 
 An hour of track at 50 Hz and fixes at 5 Hz (18 000). ``at once`` are the products of matrices that
 the search uses; ``set by set`` evaluates one set after another with the same precomputed sums;
-``from the pulses`` sums travel and heading up again for each set, as source B's equations say.
+``from the pulses`` sums travel and heading up again for each set, as the patent's equations say.
 """
 
 import argparse

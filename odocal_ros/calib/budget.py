@@ -106,7 +106,7 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
 
     The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the error that
     both ends share, which makes the Earth, and so the chord, larger. ``projection`` is there to
-    be seen to be zero: the chord is taken in space, not in a plane (method.md 1.1).
+    be seen to be zero: the chord is taken in space, not in a plane.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def _second_order(t, D, alignment, height_variance):
     """
     Return what is of second order in the scale.
 
-    Half the distance-weighted variance of a wandering attitude (method.md 1.5), for a gyro bias
+    Half the distance-weighted variance of a wandering attitude, for a gyro bias
     and noise of the size of their sigmas, and half the square of the tilt that height errors of
     the fixes feign.
     """

@@ -1,7 +1,7 @@
 """
 The two-point method: scale, yaw and pitch from where a leg ended, by track and by fix.
 
-Source A (Shi et al. 2015) takes the ratio of two chords in a plane and the angle between them,
+Shi et al. 2015 takes the ratio of two chords in a plane and the angle between them,
 eq. (6)-(10). The same similarity is solved here in the Earth-fixed Cartesian frame n, where track
 and truth are similar to the last digit: with M the attitude summed over travel and c the chord
 between the reference positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at

@@ -25,7 +25,7 @@ class Plane:
     false_easting: float = 500000.0
 
     def forward(self, latitude, longitude):
-        """Return northing, easting, m (eq. 1-5 of source A), of rad: (...)."""
+        """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), of rad: (...)."""
         from pyproj import Proj
         a, rf = ELLIPSOIDS[self.ellipsoid]
         proj = Proj(proj='tmerc', lat_0=0, lon_0=self.central_meridian, k_0=self.scale,

@@ -51,7 +51,7 @@ def _parser(names) -> argparse.ArgumentParser:
 
 
 def main(argv=None) -> int:
-    """Run a command line; return its exit code (design.md section 1)."""
+    """Run a command line; return its exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if sys.stdout is None:       # closed by whoever started us
         sys.stdout = open(os.devnull, 'w', encoding='utf-8')     # noqa: SIM115 until exit

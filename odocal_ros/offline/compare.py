@@ -19,7 +19,7 @@ CAUSES = {
 
 
 def add_arguments(parser) -> None:
-    """Declare the options of design.md section 1."""
+    """Declare the options."""
     parser.description = (
         'Show each value with its change since the first calibration and since the one before, '
         'in its unit and in sigmas. A change counts beyond 3 sigma. Exit code 0: no change that '

@@ -1,4 +1,4 @@
-"""odocal paper: tables 1 to 4 of source A, computed beside printed."""
+"""odocal paper: tables 1 to 4 of Shi et al. 2015, computed beside printed."""
 
 from pathlib import Path
 

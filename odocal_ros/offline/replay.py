@@ -21,7 +21,7 @@ class LegDropped(BadUsage):
 
 
 def add_arguments(parser) -> None:
-    """Declare the options of design.md section 1."""
+    """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
     add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')

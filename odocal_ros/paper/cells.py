@@ -1,5 +1,5 @@
 """
-What source A prints in its tables 1 to 4, and a cell that holds it beside our value.
+What Shi et al. 2015 prints in its tables 1 to 4, and a cell that holds it beside our value.
 
 Shi, Ma, Zhang, Zhang 2015, 'The initial calibration of odometer and error analysis'. Tables 1 and
 2 print magnitudes. The yaw errors of tables 3 and 4 are printed as truth - estimate; ours are

@@ -1,4 +1,4 @@
-"""Tables 1 and 2 of source A: the coefficients of its error equations, and what they weigh."""
+"""Tables 1 and 2 of Shi et al. 2015: coefficients of the error equations, and their weight."""
 
 import numpy as np
 

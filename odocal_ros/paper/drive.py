@@ -1,8 +1,8 @@
 """
-Section 3 of source A: its drive, through the pipeline that a user's bag goes through.
+Section 3 of Shi et al. 2015: its drive, through the pipeline that a user's bag goes through.
 
 The drive is simulated with perfect sensors; the errors are put into the alignment that the
-pipeline is handed (method.md 1.6): phi in ENU, computed = (I - [phi x]) true, at the end of the
+pipeline is handed: phi in ENU, computed = (I - [phi x]) true, at the end of the
 standstill; drift as what the pipeline takes too little off the gyro from there on.
 """
 

@@ -1,7 +1,7 @@
 """
-Closed forms of source A's error analysis: plane, chord, straight leg (eq. 11-14, 29-33).
+Closed forms of Shi et al.'s error analysis: plane, chord, straight leg (eq. 11-14, 29-33).
 
-All errors are estimate less truth (method.md 1.5; the paper's (30)-(33) print the reverse). K is
+All errors are estimate less truth (the paper's (30)-(33) print the reverse). K is
 the scale factor, alpha the yaw mounting angle (alpha_psi of the paper), phi_U the heading error.
 """
 

@@ -1,7 +1,7 @@
 """
 Error model of dead reckoning: how attitude errors and gyro drift become a wrong end point.
 
-Source A, eq. (15)-(23), corrected (method.md 1.4), as a linear time-varying system along a leg
+Shi et al. 2015, eq. (15)-(23), corrected, as a linear time-varying system along a leg
 
     x' = F(t) x - [C_nb; 0] eps_b        x = [phi_E, phi_N, phi_U, dL, dlam, dh]
 
@@ -38,7 +38,7 @@ STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
 E, N, U, LAT, LON, H = range(6)
 BLOCK = 64        # steps that a scan multiplies up one after the other
 CHUNK = 4096      # steps made at a time
-PAPER_RADIUS = 6378137.0    # m, R_e of source A
+PAPER_RADIUS = 6378137.0    # m, R_e of Shi et al. 2015
 
 
 @dataclass(frozen=True, eq=False)

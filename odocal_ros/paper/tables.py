@@ -1,4 +1,4 @@
-"""Tables 3 and 4 of source A from the simulated drive, and all four of them as one thing."""
+"""Tables 3 and 4 of Shi et al. 2015 from the simulated drive, and all four as one."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,5 @@
 """
-Orthogonal arrays: which parameter sets are tried first (source B, step 5).
+Orthogonal arrays: which parameter sets are tried first (CN104359492A, step 5).
 
 In an orthogonal array (of strength two) each pair of columns holds each pair of levels equally
 often. Bose's construction gives q^2 rows of q + 1 columns for any prime power q: the points of a

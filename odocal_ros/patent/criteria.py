@@ -1,7 +1,7 @@
 """
 How well parameter sets do: distances at the fixes, and heading against course over ground.
 
-Source B has the maximum and the mean of the distances, and names the receiver's course as a
+The patent has the maximum and the mean of the distances, and names the receiver's course as a
 standard besides. The mean square is what the refinement lowers.
 """
 

@@ -1,5 +1,5 @@
 """
-The embodiment of source B as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
+The embodiment of CN104359492A as given: radii +-0.03 m in seven levels, heading +-1 deg in nine.
 
 It lists seven combinations that an orthogonal array is said to have chosen, and names as best one
 that is not among them. No orthogonal array for 7 x 7 x 9 levels is smaller than all 441

@@ -1,5 +1,5 @@
 """
-Dead reckoning in the plane for many parameter sets at once (source B, steps 2 to 4).
+Dead reckoning in the plane for many parameter sets at once (CN104359492A, steps 2 to 4).
 
 A parameter set is left scale, right scale (m per unit) and heading (rad, counter-clockwise): the
 angle by which the whole track is to be turned. Positions are linear in the two scales, so the

@@ -1,5 +1,5 @@
 """
-The search of source B: an orthogonal array, then response surfaces, checked by least squares.
+The search of CN104359492A: an orthogonal array, then response surfaces, checked by least squares.
 
 What is called heading here is the angle by which the dead-reckoned track must be turned,
 counter-clockwise: the error of the configured heading less the yaw mounting angle. Positions see

@@ -1,5 +1,5 @@
 """
-Alignment of a leg: which standstill, which heading source, in the order of design.md section 3.
+Alignment of a leg: which standstill, which heading source.
 
 Pure: takes screened inputs, returns an Alignment and what was found on the way.
 """

@@ -5,7 +5,7 @@ import numpy as np
 from odocal_ros.data.samples import take
 from odocal_ros.reasons import Code, Reason
 
-LIMIT = 0.5          # s, between topics (design.md, Stamps)
+LIMIT = 0.5          # s, between topics
 REACH = 1.0          # s, what a time_offset setting holds
 SET = 0.02           # s, a clock set by more than this is named
 NEIGHBOURS = 50      # rows each side that tell the lag there

@@ -1,4 +1,4 @@
-"""IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI (method.md section 3)."""
+"""IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI."""
 
 import dataclasses
 from dataclasses import dataclass

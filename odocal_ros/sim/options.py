@@ -23,7 +23,7 @@ class SimOptions:
     Choices for one drive; BY_SCENARIO is the scenario's own value.
 
     Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
-    those of method.md section 0; ``mounting_rpy`` is the nominal rotation from the Imu's frame to
+    those of docs/conventions.md; ``mounting_rpy`` is the nominal rotation from the Imu's frame to
     b that comes on top.
     """
 

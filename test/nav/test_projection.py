@@ -1,4 +1,4 @@
-"""Planes and geodesics; the printed series of source A, eq. (1)-(5), as reference."""
+"""Planes and geodesics; the printed series of Shi et al. 2015, eq. (1)-(5), as reference."""
 
 import numpy as np
 from numpy.testing import assert_allclose

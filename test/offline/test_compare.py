@@ -188,7 +188,7 @@ def test_every_compared_name_has_a_cause():
     names = ['scale_factor', 'scale_factor_left', 'scale_factor_right', 'track_width',
              'yaw_mounting_angle', 'pitch_mounting_angle', 'odometer_delay', 'gnss_delay',
              *(f'{what}_lever_arm_{a}' for what in ('odometer', 'antenna') for a in 'xyz')]
-    for name in names:        # all of design.md section 2 but those that are not compared
+    for name in names:        # all estimates but those that are not compared
         assert name not in NOT_COMPARED
         assert [key for key in CAUSES if key in name.split('_')], name
 
