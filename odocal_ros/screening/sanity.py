@@ -4,8 +4,8 @@ import numpy as np
 
 from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import G
 
-G = 9.80665
 AXES = 'xyz'
 # nothing follows from such an Imu; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}

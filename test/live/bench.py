@@ -13,7 +13,7 @@ import time
 ROOT = Path(__file__).resolve().parents[2]
 START = 'import sys; from odocal_ros.live.{} import main; sys.exit(main(sys.argv))'
 NODE = [sys.executable, '-c', START.format('node')]
-PATIENCE = 20.0   # s, for one event; only a failing test waits so long
+PATIENCE = 60.0   # s, for one event; only a failing test waits so long
 
 
 class NodeProcess:
