@@ -30,8 +30,9 @@ def per_distance(way, before, after) -> tuple[PerDistance, ...]:
     of a piece that begin together, the fixes' own noise at both ends in it.
 
     """
-    return tuple(PerDistance(length, *(float(np.sqrt(x.mean())) for x in squares), pieces)
-                 for length, pieces, squares in _lengths(way, before, after))
+    return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
+                             pieces)
+                 for length, pieces, (was, now) in _lengths(way, before, after))
 
 
 def _lengths(way, before, after):

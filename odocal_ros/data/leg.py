@@ -5,6 +5,7 @@ The recorder is the only thing in the package that remembers; both doors feed it
 """
 
 from dataclasses import dataclass, field, replace
+from typing import final
 
 import numpy as np
 
@@ -59,6 +60,7 @@ class Leg:
     form_right: OdometerForm | None = None
 
 
+@final
 class LegRecorder:
     """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
 

@@ -17,6 +17,8 @@ from odocal_ros.errors import BadData
 
 Stamps = NDArray[np.int64]
 Floats = NDArray[np.float64]
+NO_STAMPS = np.empty(0, np.int64)
+NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,24 +168,25 @@ def let_go(*arrays) -> None:
 
 def no_imu() -> ImuSamples:
     """Return an empty block."""
-    return ImuSamples([], [], np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), [])
+    return ImuSamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3, NONE_OF_4, NONE)
 
 
 def no_odometer() -> OdometerSamples:
     """Return an empty block."""
-    return OdometerSamples([], [], np.empty(0))
+    return OdometerSamples(NO_STAMPS, NO_STAMPS, NONE)
 
 
 def no_fix() -> FixSamples:
     """Return an empty block."""
-    return FixSamples([], [], [], [], [], np.empty((0, 3, 3)), [], [])
+    return FixSamples(NO_STAMPS, NO_STAMPS, NONE, NONE, NONE, np.empty((0, 3, 3)), NO_STAMPS,
+                      NO_STAMPS)
 
 
 def no_velocity() -> VelocitySamples:
     """Return an empty block."""
-    return VelocitySamples([], [], np.empty((0, 3)), np.empty((0, 3)))
+    return VelocitySamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3)
 
 
 def no_heading() -> HeadingSamples:
     """Return an empty block."""
-    return HeadingSamples([], [], np.empty((0, 4)), [])
+    return HeadingSamples(NO_STAMPS, NO_STAMPS, NONE_OF_4, NONE)

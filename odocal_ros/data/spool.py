@@ -125,7 +125,7 @@ class _Columns:
     def write(self, block, at: int) -> int:
         """Write a block's rows from row ``at`` on; return the row after the last."""
         for name, (file, dtype, shape) in self._files.items():
-            data = memoryview(np.ascontiguousarray(getattr(block, name), dtype)).cast('B')
+            data = np.ascontiguousarray(getattr(block, name), dtype).data.cast('B')
             offset = at * dtype.itemsize * int(np.prod(shape))
             while data:
                 done = os.pwrite(file.fileno(), data[:SOME], offset)

@@ -45,6 +45,7 @@ class LegSearch:
 
     def __init__(self, config: Config) -> None:
         self._steps: Steps | None = None
+        self._still = 0.0
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)
@@ -67,14 +68,15 @@ class LegSearch:
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
     def feed(self, slot: str, block, form: OdometerForm | None = None) -> None:
-        """Take rows as they went into the recorder; ``form`` is that of the odometer's."""
+        """Take rows as they went into the recorder; the odometer's say nothing without form."""
         if slot not in self._first_ns or not len(block.stamp_ns):
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
         if slot == 'imu':
             self._hear(block.stamp_ns)
-        elif slot == 'odometer':
+        elif slot == 'odometer' and form is not None:
             self._steps = self._steps or Steps(form)
+            self._still = self._steps.still
             steps, stamps, _ = self._steps.of(block)
             travel = self._travel + np.cumsum(steps)
             if len(travel):
@@ -117,15 +119,14 @@ class LegSearch:
             return
         if self._anchor is None:
             self._anchor = t, s
-        elif abs(s - self._anchor[1]) > self._steps.still:
-            self._moves(t)
+        elif abs(s - self._anchor[1]) > self._still:
+            self._moves(t, self._anchor[0])
             self._anchor = t, s
         else:
-            self._stands(t)
+            self._stands(t, self._anchor[0])
 
-    def _moves(self, t: int) -> None:
-        stood_ns = self._anchor[0]
-        self._stands(t - BEFORE_NS)
+    def _moves(self, t: int, stood_ns: int) -> None:
+        self._stands(t - BEFORE_NS, stood_ns)
         rested = t - stood_ns >= self._standstill_ns
         leg, off_ns = self.open, max(t - BEFORE_NS, stood_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, stood_ns):
@@ -136,8 +137,7 @@ class LegSearch:
         if self.open is None and not self._needs_rest:
             self.spans.append(Span(off_ns))
 
-    def _stands(self, t: int) -> None:
-        since_ns = self._anchor[0]
+    def _stands(self, t: int, since_ns: int) -> None:
         stood_ns = t - since_ns
         self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
         leg = self.open

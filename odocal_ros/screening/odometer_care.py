@@ -113,9 +113,9 @@ def doubted(way: Travel, value, form):
         odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
         # a reset: of the travel since the last count nothing is known but the speeds beside
         stall = [_stall(step, k) for k in odd]
-        lost = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
+        most = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
                 * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
-        return way, way.t[odd], np.array(lost) / np.sqrt(3)
+        return way, way.t[odd], np.array(most) / np.sqrt(3)
     odd = np.flatnonzero(dt > max(GAP * usual, 0.2))
     before = np.array([_usual(rate[max(0, k - BESIDE):k]) for k in odd])
     after = np.array([_usual(rate[k + 1:k + 1 + BESIDE]) for k in odd])

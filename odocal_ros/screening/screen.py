@@ -62,9 +62,9 @@ class Inputs:
         """Return them with what was counted in spans, (m, 2) s, counted the other way."""
         if not len(spans):
             return self
-        return replace(self, **{name: way and way.mirrored(spans) for name, way in (
-            ('travel', self.travel), ('travel_left', self.travel_left),
-            ('travel_right', self.travel_right))})
+        return replace(self, travel=self.travel.mirrored(spans),
+                       travel_left=self.travel_left and self.travel_left.mirrored(spans),
+                       travel_right=self.travel_right and self.travel_right.mirrored(spans))
 
 
 def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:

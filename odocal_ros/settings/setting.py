@@ -1,17 +1,25 @@
 """One setting: how it is declared in a dataclass, and how a value for it is checked."""
 
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
 import difflib
 from functools import cache
 import math
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.outside.names import is_frame, one_line
 
 LARGEST = 1e9      # no setting in SI units means a number beyond it; sums with it stay finite
-AnyConfig = TypeVar('AnyConfig', bound=Any)     # a dataclass of settings and groups of them
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
+
+
+class Settings(Protocol):
+    """A dataclass of settings and groups of them."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field]]
+
+
+AnyConfig = TypeVar('AnyConfig', bound=Settings)
 
 
 def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False,
