@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.samples import Floats, Stamps
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 WILD = 100.0         # rad/s: no turn rate
@@ -26,7 +26,7 @@ class ImuStream:
         self.zero_ns = 0
         self.at = 0
         self._stale = 0
-        self.stamp_ns: Stamps = np.empty(0, np.int64)
+        self.stamp_ns: Ints = np.empty(0, np.int64)
         self.t: NDArray[np.floating] = np.empty(0)
         self.w_b: Floats = np.empty((0, 3))
         self.f_b: Floats = np.empty((0, 3))

@@ -13,10 +13,10 @@ import mmap
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.errors import BadData
 
-Stamps = NDArray[np.int64]
-Floats = NDArray[np.float64]
+Stamps = Ints
 NO_STAMPS = np.empty(0, np.int64)
 NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 
