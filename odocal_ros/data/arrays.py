@@ -10,5 +10,4 @@ Complexes = NDArray[np.complex128]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Values = NDArray[np.int64] | NDArray[np.float64]     # of an odometer, as sent
-Rows = slice | Ints | Bools                          # that a numpy index picks
 FloatOrFloats = TypeVar('FloatOrFloats', float, Floats)
