@@ -44,6 +44,7 @@ VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovari
 Pairs = list[tuple[str, Samples]]
 Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
 Deserialize = Callable[[bytes], object]
+Feed = Callable[[str, Samples], None]
 
 
 class SensorPlan:
