@@ -8,12 +8,14 @@ then begins where it ended. A gap of the Imu that no leg survives lies between t
 """
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import LegResult
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -93,7 +95,7 @@ class LegSearch:
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
 
-    def _hear(self, stamps) -> None:
+    def _hear(self, stamps: Ints) -> None:
         known = np.append(self._imu_ns or stamps[0], stamps[stamps > self._imu_ns])
         for k in np.flatnonzero(np.diff(known) > self._max_gap_ns):
             self._gaps.append((int(known[k]), int(known[k + 1])))
@@ -165,7 +167,8 @@ def refusal(result: LegResult) -> Reason | None:
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 
-def fold(legs, config: Config, carried: Carried | None = None) -> Carried | None:
+def fold(legs: Iterable[LegResult], config: Config,
+         carried: Carried | None = None) -> Carried | None:
     """Return what is carried on with some legs taken in, by time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried

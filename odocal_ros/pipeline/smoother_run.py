@@ -35,7 +35,8 @@ def smoother(ready, passed) -> MethodRun:
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
-    seen = {name: (e.value, e.sigma) for name, e in delays.items() if e.value is not None}
+    seen = {name: (e.value, e.sigma) for name, e in delays.items()
+            if e.value is not None and e.sigma is not None}
     # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
     late = {name: e.value or 0.0 for name, e in delays.items()}
     travel = ready.inputs.travel
