@@ -1,7 +1,9 @@
 """Reason codes: what can be said about a leg or a calibration, how grave it is, what to do."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 
 class Verdict(Enum):
@@ -12,7 +14,7 @@ class Verdict(Enum):
     REJECTED = 'rejected'
 
     @staticmethod
-    def worst(verdicts) -> 'Verdict':
+    def worst(verdicts: Iterable['Verdict']) -> 'Verdict':
         """Return the gravest of many, accepted if there are none."""
         order = list(Verdict)
         return max(verdicts, key=order.index, default=Verdict.ACCEPTED)
@@ -169,7 +171,7 @@ class Code(Enum):
         self.gravity = gravity
         self.remedy = remedy
 
-    def __new__(cls, *args):
+    def __new__(cls, *args: object) -> 'Code':
         """Give each code a value of its own, so that equal pairs do not become aliases."""
         member = object.__new__(cls)
         member._value_ = len(cls.__members__)
@@ -189,11 +191,11 @@ class Reason:
         """Return what the reader can do about it."""
         return self.do or self.code.remedy
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return the entry of calibration.json."""
         return {'code': self.code.name, 'text': self.text, 'remedy': self.remedy}
 
 
-def verdict_of(reasons) -> Verdict:
+def verdict_of(reasons: Iterable['Reason']) -> Verdict:
     """Return the gravest verdict that the reasons ask for."""
     return Verdict.worst(r.code.gravity for r in reasons)

@@ -1,7 +1,9 @@
 """The Imu's samples that odometry has not left behind."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import matrix_from_rpy
 
 WILD = 100.0         # rad/s: no turn rate
@@ -24,8 +26,10 @@ class ImuStream:
         self.zero_ns = 0
         self.at = 0
         self._stale = 0
-        self.stamp_ns = np.empty(0, np.int64)
-        self.t, self.w_b, self.f_b = np.empty(0), np.empty((0, 3)), np.empty((0, 3))
+        self.stamp_ns: Ints = np.empty(0, np.int64)
+        self.t: NDArray[np.floating] = np.empty(0)
+        self.w_b: Floats = np.empty((0, 3))
+        self.f_b: Floats = np.empty((0, 3))
 
     def feed(self, block) -> bool:
         """Take rows; return False, nothing taken, where their time has begun anew."""

@@ -13,7 +13,7 @@ from odocal_ros.bagio.parts import Batch, group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
-from odocal_ros.messages.decode import Reader
+from odocal_ros.messages.decode import Feed, Reader
 from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
 
@@ -93,7 +93,7 @@ class Bag:
                                 'metadata.yaml tells of are missing'))
         return found
 
-    def read(self, readers: dict[str, Reader], feed: Callable[[str, object], None],
+    def read(self, readers: dict[str, Reader], feed: Feed,
              progress: Callable[[float], None] | None = None) -> None:
         """
         Read topics in one pass.

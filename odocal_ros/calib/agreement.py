@@ -46,7 +46,8 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
     for name, word in NAMES.items():
         for better, other in combinations(sound, 2):
             a, b = (m.estimates.get(name) for m in (better, other))
-            if a is None or b is None or a.value is None or b.value is None:
+            if a is None or b is None or a.value is None or b.value is None \
+                    or a.sigma is None or b.sigma is None:
                 continue
             sigma = math.hypot(a.sigma, b.sigma)
             apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))

@@ -35,7 +35,7 @@ class Border:
     sigma: Floats
     used: Floats
 
-    def widened(self, factor) -> 'Border':
+    def widened(self, factor: float) -> 'Border':
         """Return what data are worth whose sigmas are too small by a factor."""
         return replace(self, information=self.information / factor**2, pull=self.pull / factor**2)
 
@@ -58,19 +58,19 @@ class Border:
         return replace(self, information=(information + information.T) / 2,
                        pull=self.pull - taken @ (A.T @ self.pull))
 
-    def turned(self, name, about: float) -> 'Border':
+    def turned(self, name: str, about: float) -> 'Border':
         """Return the border with an angle, rad, given within half a turn of another."""
         value, i = self.value.copy(), self.names.index(name)
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
-    def told(self, unit, least) -> 'Border':
+    def told(self, unit: Floats, least: float) -> 'Border':
         """Return what is left of it in directions with so much information, in units of (m,)."""
         size, V = self._directions(unit, least)
         V, W = V / unit[:, None], V * unit[:, None]
         return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
 
-    def rows(self, unit):
+    def rows(self, unit: Floats) -> tuple[Floats, Floats]:
         """
         Return the data as rows of unit variance: (r, m), and what they should be: (r,).
 
@@ -81,7 +81,7 @@ class Border:
         R = (V * root).T / unit
         return R, R @ self.value + V.T @ (self.pull * unit) / root
 
-    def _directions(self, unit, least):
+    def _directions(self, unit: Floats, least: float) -> tuple[Floats, Floats]:
         size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
         keep = size > max(LEAST * size[-1], least, 1e-300)
         return size[keep], V[:, keep]

@@ -11,9 +11,14 @@ The Earth's own turn, which carries an error of one axis to the others by 4 mrad
 out.
 """
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
+from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Source
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import skew
 
@@ -21,7 +26,7 @@ HEIGHT_UNKNOWN = 500.0    # m: fixes without a height are put on the ellipsoid, 
 PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
-def parameter_gradient(f):
+def parameter_gradient(f: Floats) -> Floats:
     """Return the (3, 3) derivative of (ln K, yaw, pitch) by f = K forward_b."""
     K = np.linalg.norm(f)
     x, y, z = f
@@ -31,7 +36,7 @@ def parameter_gradient(f):
                      [-z / level**2, 0.0, x / level**2]])
 
 
-def drift_sources(t, D, C_nb, alignment):
+def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
     """
     Return the gyro sources as chord errors, each (3, k) m for one sigma.
 
@@ -65,20 +70,23 @@ def drift_sources(t, D, C_nb, alignment):
             'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
 
 
-def _spread(r, dt):
+def _spread(r: Floats, dt: Floats) -> Floats:
     """Return the integral of [r x][r x]^T, (3, 3)."""
     mid = (r[:-1] + r[1:]) / 2
     outer = np.einsum('ni,nj,n->ij', mid, mid, dt)
-    return np.trace(outer) * np.eye(3) - outer
+    spread: Floats = np.trace(outer) * np.eye(3) - outer
+    return spread
 
 
-def _root(covariance):
+def _root(covariance: Floats) -> Floats:
     """Return a square root of a covariance that may be singular: A A^T = covariance."""
     value, vector = np.linalg.eigh(covariance)
-    return vector * np.sqrt(np.maximum(value, 0.0))
+    root: Floats = vector * np.sqrt(np.maximum(value, 0.0))
+    return root
 
 
-def _late_odometer(f, t, D, C_nb, start, end):
+def _late_odometer(f: Floats, t: Floats, D: Floats, C_nb: Floats, start: MarkFix,
+                   end: MarkFix) -> Floats:
     """
     Return what an odometer that is late by 1 s does to the chord, (3,) m.
 
@@ -87,20 +95,24 @@ def _late_odometer(f, t, D, C_nb, start, end):
     """
     middle = (C_nb[:-1] + C_nb[1:]) @ f / 2
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
-    turned = (np.diff(C_nb, axis=0) @ f * speed[:, None]).sum(axis=0)
+    turned: Floats = (np.diff(C_nb, axis=0) @ f * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
     v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
-    return turned - (v_end - v_start)
+    turned -= v_end - v_start
+    return turned
 
 
-def _velocity(t, D, begin, end):
+def _velocity(t: Floats, D: Floats, begin: float, end: float) -> Floats:
     """Return the mean velocity between two times, (3,) m/s."""
     ends = np.stack([np.interp([begin, end], t, D[:, k]) for k in range(3)], -1)
-    return (ends[1] - ends[0]) / max(end - begin, 1e-9)
+    mean: Floats = (ends[1] - ends[0]) / max(end - begin, 1e-9)
+    return mean
 
 
-def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_sigma,
-           velocity_change, lever_arm_sigma, odometer_time_sigma):
+def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Floats, C_nb: Floats,
+           alignment: Alignment, *, quantum: float, fix_scale: Floats, time_sigma: float,
+           velocity_change: Floats, lever_arm_sigma: float,
+           odometer_time_sigma: float) -> tuple[Source, ...]:
     """
     Return the sources of error of (ln K, yaw, pitch) for one leg.
 
@@ -160,14 +172,14 @@ def budget(f, M, start, end, t, D, C_nb, alignment, *, quantum, fix_scale, time_
     return (*sources, _second_order(t, D, alignment, height * fix_scale[2]**2))
 
 
-def _height_sigma(start, end):
+def _height_sigma(start: MarkFix, end: MarkFix) -> float:
     """Return how well the height that both ends share is known, m."""
     if not (start.height_known and end.height_known):
         return HEIGHT_UNKNOWN
     return float(np.sqrt((start.covariance_n[2, 2] + end.covariance_n[2, 2]) / 2))
 
 
-def _second_order(t, D, alignment, height_variance):
+def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
     """
     Return what is of second order in the scale.
 
@@ -188,12 +200,13 @@ def _second_order(t, D, alignment, height_variance):
     return Source('second_order', np.array([[size], [0.0], [0.0]]))
 
 
-def total_covariance(sources):
+def total_covariance(sources: Iterable[Source]) -> Floats:
     """Return the covariance of the parameters from all sources, (p, p)."""
-    return sum(s.effects @ s.effects.T for s in sources)
+    return sum((s.effects @ s.effects.T for s in sources), np.zeros(()))
 
 
-def budget_table(sources, parameters, scale):
+def budget_table(sources: Iterable[Source], parameters: Sequence[str],
+                 scale: Sequence[float] | Floats) -> dict[str, dict[str, float]]:
     """
     Return each source's one-sigma share of each parameter, for calibration.json.
 
@@ -203,7 +216,7 @@ def budget_table(sources, parameters, scale):
                      for i, p in enumerate(parameters)} | {'shared': s.shared} for s in sources}
 
 
-def correlations(covariance, names):
+def correlations(covariance: Floats, names: Sequence[str]) -> dict[str, float]:
     """Return the correlation of each pair of parameters, for calibration.json."""
     sigma = np.sqrt(np.diag(covariance))
     rho = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)

@@ -1,10 +1,12 @@
 """What earlier legs tell of a vehicle, without the legs: for days to come, and over a restart."""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.border import Border
+from odocal_ros.data.arrays import Floats
 
 NOTHING = {'sigma': np.inf, 'used': np.inf}      # for a null in a file
 
@@ -28,7 +30,7 @@ class Carried:
         """Return whether all that another holds is in it."""
         return self.first_ns == other.first_ns and self.legs > other.legs
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return it as calibration.json has it."""
         border = {f.name: np.asarray(getattr(self.border, f.name)).tolist()
                   for f in fields(Border)}
@@ -36,7 +38,7 @@ class Carried:
                 'legs': self.legs, 'border': border}
 
 
-def carried_from(content: dict) -> Carried:
+def carried_from(content: dict[str, Any]) -> Carried:
     """
     Return what ``as_dict`` gave, null for what is not finite.
 
@@ -59,7 +61,7 @@ def carried_from(content: dict) -> Carried:
         raise ValueError(f'carried: {error}') from None
 
 
-def _array(values, shape, nothing):
+def _array(values: Any, shape: tuple[int, ...], nothing: float) -> Floats:
     found = np.array([nothing if x is None else float(x) for x in np.ravel(values)])
     if found.size != np.prod(shape) or np.isnan(found).any():
         raise ValueError(f'{np.size(values)} numbers where {shape} are wanted, or null')

@@ -1,8 +1,12 @@
 """The check: dead reckoning against every fix, before and after the correction; and sanity."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
+from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import TrackCheck
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
 
@@ -13,7 +17,7 @@ LOOSE = 4.0               # sigmas of disagreement that name a mismatch
 SLOP = 0.002              # of the distance: slip, suspension, road
 
 
-def stray(path, pin, fixes):
+def stray(path: Callable[[Floats], Floats], pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 
@@ -31,14 +35,15 @@ def stray(path, pin, fixes):
     return pin.position_n + path(t) - path(np.array(pin.t)) - position_n
 
 
-def track_check(residual, distance) -> TrackCheck:
+def track_check(residual: Floats, distance: float) -> TrackCheck:
     """Return the patent's criteria (max, mean) and more of the residuals, m."""
     d = np.hypot(*residual.T[:2])
     return TrackCheck(float(np.sqrt((d**2).mean())), float(d.max()), float(d.mean()),
                       float(d[-1]), float(100 * d[-1] / distance) if distance else 0.0)
 
 
-def fix_noise_factor(residual, covariance_n, drift, marks=()):
+def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
+                     marks: Sequence[MarkFix] = ()) -> Floats:
     """
     Return the factors on stated fix sigmas that residuals ask for, east, north, up: (3,).
 
@@ -68,7 +73,8 @@ def fix_noise_factor(residual, covariance_n, drift, marks=()):
     return np.where(factors > 1.25, factors, 1.0)
 
 
-def mismatch(check: TrackCheck, fix_sigma, drift, distance) -> tuple[Reason, ...]:
+def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
+             distance: float) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
     allowed = LOOSE * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP * distance
     if check.rms <= allowed:
@@ -77,7 +83,8 @@ def mismatch(check: TrackCheck, fix_sigma, drift, distance) -> tuple[Reason, ...
                    f'fixes, {allowed:.1f} m would be believable'),)
 
 
-def pieces(track_2d, fixes_2d, t, sigma):
+def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,
+           sigma: float) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Cut the drive into pieces long enough for a direction.
 
@@ -101,7 +108,7 @@ def pieces(track_2d, fixes_2d, t, sigma):
             np.hypot(*track.T) / np.hypot(*fix.T))
 
 
-def steady(residual, fix_sigma):
+def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     """
     Tell which fixes are no outliers beside their neighbours, and how noisy they are.
 
@@ -121,7 +128,8 @@ def steady(residual, fix_sigma):
     return off <= 5 * sigma, sigma
 
 
-def against_travel(track_direction, course, stretch, signed) -> tuple[Reason, ...]:
+def against_travel(track_direction: Floats, course: Floats, stretch: Floats,
+                   signed: bool) -> tuple[Reason, ...]:
     """
     Return TRACK_MISMATCH where counts rise while the vehicle drives backwards.
 

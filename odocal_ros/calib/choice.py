@@ -1,8 +1,9 @@
 """Which method gives which value: the first in order whose verdict allows it."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason, Verdict
 
 ORDER = ('smoother', 'wheels', 'two_point')
@@ -23,7 +24,7 @@ ABOUT = {
 }
 
 
-def deciding(asked, shown: bool = False) -> tuple[str, ...]:
+def deciding(asked: str | tuple[str, ...], shown: bool = False) -> tuple[str, ...]:
     """
     Return the methods whose figures may be the result, the first choice first.
 
@@ -37,7 +38,8 @@ def deciding(asked, shown: bool = False) -> tuple[str, ...]:
     return tuple(dict.fromkeys((asked, ALWAYS))) if shown else (asked,)
 
 
-def choose(methods: dict[str, MethodResult], asked):
+def choose(methods: Mapping[str, MethodResult],
+           asked: str | tuple[str, ...]) -> tuple[dict[str, Estimate], tuple[str, ...]]:
     """
     Take each parameter from the first method that has it and is not rejected.
 
@@ -69,7 +71,8 @@ def choose(methods: dict[str, MethodResult], asked):
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
 
 
-def passed_over(methods: dict[str, MethodResult], asked, said=()) -> list[Reason]:
+def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...],
+                said: Iterable[Code] = ()) -> list[Reason]:
     """
     Return METHOD_REJECTED of each method that is rejected while one behind it gives.
 
@@ -84,12 +87,13 @@ def passed_over(methods: dict[str, MethodResult], asked, said=()) -> list[Reason
             for name, r in why if r.code not in (Code.NO_METHOD, *said)]
 
 
-def leg_estimates(leg) -> dict[str, Estimate]:
+def leg_estimates(leg: LegResult) -> dict[str, Estimate]:
     """Return what a LegResult says, each value by the method that gives it."""
     return choose(leg.methods, leg.deciding or ORDER)[0]
 
 
-def worth_saying(reasons, method: str, estimates: dict[str, Estimate]):
+def worth_saying(reasons: Iterable[Reason], method: str,
+                 estimates: Mapping[str, Estimate]) -> tuple[Reason, ...]:
     """Return a method's reasons without those about values that are another method's to give."""
     return tuple(r for r in reasons if r.code not in ABOUT or (
         given := estimates.get(ABOUT[r.code])) is None or given.method == method)

@@ -1,8 +1,12 @@
 """Judging values against the asked limits; run on a leg and again on a combination."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from odocal_ros.calib.result import Estimate
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 # ratio to the nominal scale, by unit of the scale: what sends such a number
 MISTAKEN = {
@@ -15,7 +19,7 @@ MISTAKEN = {
 LIKE = 0.04         # of such a ratio
 
 
-def _unit(ratio, unit, nominal) -> tuple[str, str]:
+def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return which unit a scale so far from its nominal looks like, and what to set then."""
     for known, what in MISTAKEN.get(unit, {}).items():
         if abs(ratio / known - 1) < LIKE:
@@ -25,12 +29,13 @@ def _unit(ratio, unit, nominal) -> tuple[str, str]:
     return '', ''
 
 
-def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
+def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
+          config: Config) -> tuple[Reason, ...]:
     """Return what the asked sigmas and the nominal values say of estimates."""
     reasons = []
     scale, yaw = estimates['scale_factor'], estimates['yaw_mounting_angle']
     if scale.value is not None:
-        relative = scale.sigma / scale.value
+        relative = 0.0 if scale.sigma is None else scale.sigma / scale.value
         if relative > config.verdict.max_scale_sigma:
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, f'scale sigma {share(relative)}, '
                                   f'{share(config.verdict.max_scale_sigma)} asked'))
@@ -41,14 +46,15 @@ def judge(estimates, nominal_scale, config) -> tuple[Reason, ...]:
                 reasons.append(Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale.value:.6g} '
                                       f'{scale.unit} is {100 * off:+.1f} % from the nominal '
                                       f'{nominal_scale:.6g}{why}', do))
-    if yaw.value is not None and yaw.sigma > config.verdict.max_yaw_sigma:
+    if yaw.value is not None and yaw.sigma is not None \
+            and yaw.sigma > config.verdict.max_yaw_sigma:
         sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
         reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '
                               'deg asked'))
     return tuple(reasons)
 
 
-def share(relative, sign='') -> str:
+def share(relative: float, sign: str = '') -> str:
     """Return a relative figure as people say it: in ppm, or in per cent from one on."""
     return f'{100 * relative:{sign}.1f} %' if abs(relative) >= 0.01 else (
         f'{1e6 * relative:{sign}.0f} ppm')

@@ -76,7 +76,8 @@ class LinkedLegs:
         last = self.place(len(self.borders) - 1)
         gone = np.setdiff1d(np.arange(A.shape[1]), last)
         # orthogonal rows of which only the first hold what is eliminated
-        R = np.linalg.qr(np.column_stack([A[:, gone], A[:, last], b]), mode='r')[len(gone):]
+        R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, last], b]), mode='r'))
+        R = R[len(gone):]
         rows = R[:, len(gone):-1] / self.unit
         return Border(self.names, value, rows.T @ rows, rows.T @ (R[:, -1] - rows @ value),
                       self.centre, self.sigma, self.used)

@@ -1,15 +1,18 @@
 """How an Imu sits in the vehicle: up from gravity, forward from what driving does to it."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import LEAST, pushes
+from odocal_ros.screening.screen import Inputs
 
 SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
 NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it
@@ -50,7 +53,7 @@ def remedy(found: Mounting) -> str:
             + ", if the Imu's x axis points forward." * found.assumed + '.' * (not found.assumed))
 
 
-def with_axes(reasons, inputs) -> list[Reason]:
+def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
     """Return reasons, IMU_AXES with what to set where the screened inputs show it."""
     if not any(r.code is Code.IMU_AXES for r in reasons):
         return list(reasons)
@@ -59,7 +62,8 @@ def with_axes(reasons, inputs) -> list[Reason]:
     return [replace(r, do=remedy(found)) if r.code is Code.IMU_AXES else r for r in reasons]
 
 
-def mounting(t, w_i, f_i, travel: Travel, metres_per_unit: float) -> Mounting:
+def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
+             metres_per_unit: float) -> Mounting:
     """
     Tell how an Imu sits.
 
@@ -90,7 +94,8 @@ def mounting(t, w_i, f_i, travel: Travel, metres_per_unit: float) -> Mounting:
     return Mounting(None, None, sigma, True, 0.0)
 
 
-def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
+def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
+             metres_per_unit: float) -> tuple[Floats | None, float]:
     """
     Return the forward axis (level, unit) and its sigma, rad; None where it is not seen.
 
@@ -117,7 +122,7 @@ def _forward(t, w_i, f_i, up_i, travel, metres_per_unit):
     return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma
 
 
-def _quarter_turns():
+def _quarter_turns() -> Iterator[Floats]:
     """Yield the 24 rotations that take axes to axes."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

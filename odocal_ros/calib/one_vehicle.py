@@ -1,9 +1,11 @@
 """Legs that are not of one vehicle, or not of one set of settings: they have no mean."""
 
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 import math
+from typing import NamedTuple
 
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.result import LegResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
@@ -12,48 +14,60 @@ MOST_SCALE = 0.05    # tyres: wear 2 %, pressure and load 1 %, another make 3 %
 MOST_YAW = 0.087     # rad (5 deg): no mounting gives way so far
 
 
-def unlike_legs(numbered) -> tuple[Reason, ...]:
+def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
     """
     Return LEGS_UNLIKE where scale or yaw of legs differ by more than one vehicle can.
 
-    numbered : sequence of (number, LegResult), those that are combined.
+    numbered : those that are combined, with their numbers.
     """
     found = []
-    scales = [(n, e) for n, leg in numbered
-              if (e := leg_estimates(leg).get('scale_factor')) is not None and e.value]
-    units = dict.fromkeys(e.unit for _, e in scales)
+    scales = [scale for scale in _told('scale_factor', numbered) if scale.value]
+    units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
-        which = '; '.join(f'{unit} in leg {_numbers(n for n, e in scales if e.unit == unit)}'
+        which = '; '.join(f'{unit} in leg {_numbers(s.leg for s in scales if s.unit == unit)}'
                           for unit in units)
         return (Reason(Code.LEGS_UNLIKE, f'the odometers are of different kinds, their scales '
                        f'have no mean: {which}'),)
     far = _farthest(scales)
-    if far and far[1][1].value / far[0][1].value - 1 > MOST_SCALE:
-        (a, low), (b, high) = far
-        found.append(f'the scale of leg {b} is {100 * (high.value / low.value - 1):.1f} % above '
-                     f'that of leg {a}')
-    yaws = [(n, e) for n, leg in numbered if (e := leg_estimates(leg).get(
-        'yaw_mounting_angle')) is not None and e.value is not None]
+    if far and (more := far[1].value / far[0].value - 1) > MOST_SCALE:
+        low, high = far
+        found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
+                     f'that of leg {low.leg}')
+    yaws = _told('yaw_mounting_angle', numbered)
     # of an Imu that faces backwards they lie about +-180 deg
-    far = _farthest([(n, replace(e, value=float(wrap(e.value - yaws[0][1].value))))
-                     for n, e in yaws])
-    if far and far[1][1].value - far[0][1].value > MOST_YAW:
-        (a, low), (b, high) = far
-        found.append(f'the yaw mounting of leg {b} is '
-                     f'{math.degrees(high.value - low.value):.1f} deg above that of leg {a}')
+    far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
+    if far and (more := far[1].value - far[0].value) > MOST_YAW:
+        low, high = far
+        found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
+                     f'that of leg {low.leg}')
     return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: more than one vehicle with one '
                    'mounting changes between drives'),) if found else ()
 
 
-def _farthest(estimates):
-    """Return the lowest and the highest of (number, Estimate) that surely differ, () if none."""
-    if len(estimates) < 2:
-        return ()
-    order = sorted(estimates, key=lambda entry: entry[1].value)
+class _Told(NamedTuple):
+    """What a leg tells of one value."""
+
+    leg: int
+    value: float
+    sigma: float
+    unit: str
+
+
+def _told(name: str, numbered: Sequence[tuple[int, LegResult]]) -> list[_Told]:
+    every = ((n, leg_estimates(leg).get(name)) for n, leg in numbered)
+    return [_Told(n, e.value, e.sigma, e.unit) for n, e in every
+            if e is not None and e.value is not None and e.sigma is not None]
+
+
+def _farthest(told: list[_Told]) -> tuple[_Told, _Told] | None:
+    """Return the lowest and the highest where they surely differ."""
+    if len(told) < 2:
+        return None
+    order = sorted(told, key=lambda one: one.value)
     low, high = order[0], order[-1]
-    noise = (high[1].sigma**2 + low[1].sigma**2)**0.5
-    return (low, high) if high[1].value - low[1].value > SURE * noise else ()
+    noise = (high.sigma**2 + low.sigma**2)**0.5
+    return (low, high) if high.value - low.value > SURE * noise else None
 
 
-def _numbers(numbers) -> str:
+def _numbers(numbers: Iterable[int]) -> str:
     return ', '.join(map(str, numbers))

@@ -1,8 +1,11 @@
 """Error of dead reckoning per distance driven, before and after: what scale and yaw make of it."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from odocal_ros.calib.result import PerDistance
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 
 LENGTHS = 100.0, 500.0, 1000.0      # m
@@ -13,7 +16,7 @@ SURE = 3.0          # sigmas of the difference of two mean squares
 WORSE = 1.1         # times as far, below which nobody would mind
 
 
-def per_distance(way, before, after) -> tuple[PerDistance, ...]:
+def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
     """
     Return the relative error of two tracks, pinned anew to a fix for each piece.
 
@@ -30,11 +33,13 @@ def per_distance(way, before, after) -> tuple[PerDistance, ...]:
     of a piece that begin together, the fixes' own noise at both ends in it.
 
     """
-    return tuple(PerDistance(length, *(float(np.sqrt(x.mean())) for x in squares), pieces)
-                 for length, pieces, squares in _lengths(way, before, after))
+    return tuple(PerDistance(length, float(np.sqrt(was.mean())), float(np.sqrt(now.mean())),
+                             pieces)
+                 for length, pieces, (was, now) in _lengths(way, before, after))
 
 
-def _lengths(way, before, after):
+def _lengths(way: Floats, before: Floats,
+             after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
     for length in LENGTHS:
         a, b = _ends(way, length)
         if len(a):
@@ -42,7 +47,7 @@ def _lengths(way, before, after):
             yield length, len(a) / BEGINNINGS, squares
 
 
-def _ends(way, length):
+def _ends(way: Floats, length: float) -> tuple[Ints, Ints]:
     """Return the rows at which pieces of a length begin and end, a tenth of it apart."""
     begin = np.arange(way[0], way[-1] - length, length / BEGINNINGS) if len(way) else np.empty(0)
     a = np.searchsorted(way, begin)
@@ -53,7 +58,7 @@ def _ends(way, length):
     return a[near], b[near]
 
 
-def check_worse(way, before, after, configured) -> list[Reason]:
+def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) -> list[Reason]:
     """
     Return CHECK_WORSE where the correction takes the track farther from the fixes, beyond chance.
 

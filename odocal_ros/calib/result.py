@@ -1,6 +1,7 @@
 """What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ class Estimate:
     unit: str
     method: str = ''
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return the entry of calibration.json."""
         entry = {'value': self.value, 'sigma': self.sigma, 'unit': self.unit}
         return entry | ({'method': self.method} if self.method else {})
@@ -54,7 +55,7 @@ class MethodResult:
     estimates: dict[str, Estimate] = field(default_factory=dict)
     parameters: tuple[str, ...] = ()    # names in the order of the sources' rows
     sources: tuple[Source, ...] = ()
-    details: dict = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
     border: Border | None = None        # of the leg, or of all; None: the method has none
 
     @property
@@ -101,12 +102,12 @@ class LegResult:
     before: TrackCheck | None = None
     after: TrackCheck | None = None
     per_distance: tuple[PerDistance, ...] = ()
-    track_n: NDArray | None = None            # (m, 3) corrected dead reckoning, n, m
-    track_before_n: NDArray | None = None     # (m, 3) as configured
-    reference_n: NDArray | None = None        # (k, 3) fixes used
+    track_n: NDArray[np.float64] | None = None          # (m, 3) corrected dead reckoning, n, m
+    track_before_n: NDArray[np.float64] | None = None   # (m, 3) as configured
+    reference_n: NDArray[np.float64] | None = None      # (k, 3) fixes used
     origin: tuple[float, float, float] | None = None  # latitude, longitude rad, height m of n
     bag: str = ''                             # where it was recorded, empty when live
-    C_bi: NDArray | None = None               # (3, 3) nominal rotation used, imu frame to b
+    C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
     deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
     evidence: Evidence | None = None          # what a report draws, None where no track was fit
 

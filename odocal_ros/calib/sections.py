@@ -6,6 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Complexes, Floats
+
 SECTIONS = 10        # equal parts of the way
 FEWEST = 8           # fixes of a section
 BLOCKS = 24          # means of fixes that a section is made of: noise from one to the next is gone
@@ -13,6 +15,7 @@ SHORTEST = 10.0      # m, of a section
 LEAST = 0.01         # of a stated sigma: fixes are not better than that, one to the next
 LAGS = (1, 3)        # blocks, at which the correlation is looked at
 FAR = 16             # blocks from which the longer lag tells
+Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])  # block to block
 
 
@@ -30,7 +33,7 @@ class Sections:
     sigma: NDArray[np.float64]
 
 
-def sections(way, reckoned_n, fix_n, sigma) -> Sections:
+def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> Sections:
     """
     Return the scale of each tenth of the way, relative to the one used in dead reckoning.
 
@@ -72,7 +75,7 @@ def sections(way, reckoned_n, fix_n, sigma) -> Sections:
     return Sections(edges[:-1], edges[1:], ratio, error)
 
 
-def _stretched(z, w):
+def _stretched(z: Complexes, w: Complexes) -> Stretch:
     """Return the turn and stretch that takes z onto w (complex, m), what is left, and spread."""
     z, w = z - z.mean(), w - w.mean()
     spread = float(np.vdot(z, z).real)
@@ -80,7 +83,7 @@ def _stretched(z, w):
     return c, w - c * z, spread
 
 
-def _errors(fits, stated):
+def _errors(fits: list[Stretch], stated: float) -> list[float]:
     """Return the sigma of each stretch."""
     if not fits:
         return []
@@ -100,7 +103,7 @@ def _errors(fits, stated):
 
 
 @lru_cache(maxsize=32)
-def _process(n):
+def _process(n: int) -> Floats:
     """
     Return what a line fitted to n rows of a first-order process leaves, by its memory.
 

@@ -4,10 +4,13 @@ A leg: what the sensors said between two marks, and the recorder that collects i
 The recorder is the only thing in the package that remembers; both doors feed it.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any, final
 
 import numpy as np
 
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -19,13 +22,15 @@ from odocal_ros.data.samples import (
     no_velocity,
     OdometerForm,
     OdometerSamples,
+    Samples,
+    SomeSamples,
     take,
     VelocitySamples,
 )
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
-EMPTY = {
+EMPTY: dict[str, Callable[[], Samples]] = {
     'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
@@ -59,6 +64,7 @@ class Leg:
     form_right: OdometerForm | None = None
 
 
+@final
 class LegRecorder:
     """Collects blocks until a leg is closed; how a stream was chopped leaves no trace."""
 
@@ -68,7 +74,7 @@ class LegRecorder:
         self.form = COUNTER
         self.form_right: OdometerForm | None = None
 
-    def feed(self, slot: str, block) -> None:
+    def feed(self, slot: str, block: Samples) -> None:
         """Append a block (one row or many) to a slot of SLOTS."""
         if len(block.stamp_ns):
             self._rows[slot].feed(block)
@@ -78,7 +84,7 @@ class LegRecorder:
         """Return the stamp of the last row fed, 0 before the first."""
         return self._newest[slot]
 
-    def rows(self, slot: str):
+    def rows(self, slot: str) -> Any:
         """Return all rows of a slot as one block, in order of arrival."""
         return self._rows[slot].all()
 
@@ -95,7 +101,7 @@ class LegRecorder:
         copy._rows = {slot: rows.snapshot() for slot, rows in self._rows.items()}
         return copy
 
-    def forget_before(self, stamp_ns: int, slots=SLOTS) -> None:
+    def forget_before(self, stamp_ns: int, slots: Iterable[str] = SLOTS) -> None:
         """Drop blocks that lie whole before a stamp, to bound memory."""
         for slot in slots:
             self._rows[slot].forget(lambda block: _key(block) < stamp_ns)
@@ -136,12 +142,13 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns, **rows)
 
 
-def _key(samples) -> np.ndarray:
+def _key(samples: Samples) -> Ints:
     """Return the stamp by which a row is placed: rows without one go by their arrival."""
-    return np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+    key: Ints = np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+    return key
 
 
-def _cut(samples, first_ns: int, stop_ns: int):
+def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     key = _key(samples)
     after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
     last_ns = after.min() if len(after) else stop_ns

@@ -7,16 +7,20 @@ message has none), ``received_ns`` the arrival (bag time, or the middleware's so
 is used to compare clocks and never enters a result.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 import mmap
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
-Stamps = NDArray[np.int64]
-Floats = NDArray[np.float64]
+Stamps = Ints
+NO_STAMPS = np.empty(0, np.int64)
+NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +44,7 @@ class OdometerSamples:
 
     stamp_ns: Stamps     # (n,)
     received_ns: Stamps  # (n,)
-    value: NDArray       # (n,) int64 for counters (uint64 as its int64 bits), else float64
+    value: Values        # (n,) int64 for counters (uint64 as its int64 bits), else float64
 
     def __post_init__(self) -> None:
         whole = np.issubdtype(np.asarray(self.value).dtype, np.integer)
@@ -76,8 +80,8 @@ class FixSamples:
     longitude: Floats          # (n,) rad
     height: Floats             # (n,) m, ellipsoidal
     covariance_n: Floats       # (n, 3, 3) m^2, ENU
-    covariance_type: NDArray   # (n,) int64, 0 unknown .. 3 known
-    status: NDArray            # (n,) int64, NavSatStatus: -1 no fix .. 2
+    covariance_type: Ints      # (n,) 0 unknown .. 3 known
+    status: Ints               # (n,) NavSatStatus: -1 no fix .. 2
 
     def __post_init__(self) -> None:
         freeze(self, latitude=(), longitude=(), height=(), covariance_n=(3, 3),
@@ -111,9 +115,11 @@ class HeadingSamples:
 
 
 Samples = ImuSamples | OdometerSamples | FixSamples | VelocitySamples | HeadingSamples
+SomeSamples = TypeVar('SomeSamples', bound=Samples)
+Index = slice | Ints | Bools      # of rows
 
 
-def freeze(owner, **rows) -> None:
+def freeze(owner: Samples, **rows: Any) -> None:
     """Swap each field for a read-only array; rows give the shape after n, or (shape, dtype)."""
     n = len(owner.stamp_ns)
     wanted = {'stamp_ns': ((), np.int64), 'received_ns': ((), np.int64)} | rows
@@ -128,13 +134,13 @@ def freeze(owner, **rows) -> None:
         object.__setattr__(owner, name, array)
 
 
-def take(samples, index):
+def take(samples: SomeSamples, index: Index) -> SomeSamples:
     """Return the rows that a numpy index picks, as the same type."""
     return of_columns(type(samples), {f.name: getattr(samples, f.name)[index]
                                   for f in fields(samples)})
 
 
-def join(blocks):
+def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
     """Return many blocks of one type as one block, in the order given."""
     blocks = list(blocks)
     if len(blocks) == 1:
@@ -144,7 +150,7 @@ def join(blocks):
                                     for n in names})
 
 
-def of_columns(kind, columns):
+def of_columns(kind: type[SomeSamples], columns: Mapping[str, NDArray[Any]]) -> SomeSamples:
     """Return samples of arrays that were checked before and that nobody else holds: no copy."""
     samples = object.__new__(kind)
     for name, array in columns.items():
@@ -153,37 +159,39 @@ def of_columns(kind, columns):
     return samples
 
 
-def let_go(*arrays) -> None:
+def let_go(*arrays: NDArray[Any]) -> None:
     """Give back the memory of arrays that are mapped from a file; they can be read as before."""
     for array in arrays:
-        while isinstance(array, np.ndarray):
-            array = array.base
-        if isinstance(array, memoryview):
-            array = array.obj
-        if isinstance(array, mmap.mmap):
-            array.madvise(mmap.MADV_DONTNEED)
+        owner: Any = array
+        while isinstance(owner, np.ndarray):
+            owner = owner.base
+        if isinstance(owner, memoryview):
+            owner = owner.obj
+        if isinstance(owner, mmap.mmap):
+            owner.madvise(mmap.MADV_DONTNEED)
 
 
 def no_imu() -> ImuSamples:
     """Return an empty block."""
-    return ImuSamples([], [], np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), [])
+    return ImuSamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3, NONE_OF_4, NONE)
 
 
 def no_odometer() -> OdometerSamples:
     """Return an empty block."""
-    return OdometerSamples([], [], np.empty(0))
+    return OdometerSamples(NO_STAMPS, NO_STAMPS, NONE)
 
 
 def no_fix() -> FixSamples:
     """Return an empty block."""
-    return FixSamples([], [], [], [], [], np.empty((0, 3, 3)), [], [])
+    return FixSamples(NO_STAMPS, NO_STAMPS, NONE, NONE, NONE, np.empty((0, 3, 3)), NO_STAMPS,
+                      NO_STAMPS)
 
 
 def no_velocity() -> VelocitySamples:
     """Return an empty block."""
-    return VelocitySamples([], [], np.empty((0, 3)), np.empty((0, 3)))
+    return VelocitySamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3)
 
 
 def no_heading() -> HeadingSamples:
     """Return an empty block."""
-    return HeadingSamples([], [], np.empty((0, 4)), [])
+    return HeadingSamples(NO_STAMPS, NO_STAMPS, NONE_OF_4, NONE)

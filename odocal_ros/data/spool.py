@@ -11,10 +11,12 @@ from dataclasses import fields
 import mmap
 import os
 import tempfile
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from odocal_ros.data.samples import join, of_columns, take
+from odocal_ros.data.arrays import Bools
+from odocal_ros.data.samples import join, of_columns, Samples, take
 
 MEMORY = 2**26        # bytes of a topic's rows from which they go to the file
 TAIL = 2**23          # bytes after those of the file, the same
@@ -25,16 +27,16 @@ SOME = 2**20          # bytes moved at a time
 class Rows:
     """The rows of one topic, in order of arrival."""
 
-    def __init__(self, nothing: Callable) -> None:
+    def __init__(self, nothing: Callable[[], Samples]) -> None:
         self._nothing = nothing
-        self._blocks: list = []           # after those of the file
-        self._fresh: list = []            # small ones, after the blocks
+        self._blocks: list[Samples] = []           # after those of the file
+        self._fresh: list[Samples] = []            # small ones, after the blocks
         self._size = self._fresh_size = 0     # bytes of both, of the small ones
         self._file: _Columns | None = None
         self._stop = 0                    # rows of the file that are ours
         self._writes = True
 
-    def feed(self, block) -> None:
+    def feed(self, block: Samples) -> None:
         """Append a block."""
         size = _size(block)
         self._fresh.append(block)
@@ -45,7 +47,7 @@ class Rows:
             if self._size > (MEMORY if self._file is None else TAIL):
                 self._to_file()
 
-    def all(self):
+    def all(self) -> Samples:
         """Return all rows as one block; of a file, as a view of it."""
         self._merge()
         if self._file is not None:
@@ -69,7 +71,7 @@ class Rows:
         copy._file, copy._stop = self._file, self._stop
         return copy
 
-    def forget(self, before: Callable) -> None:
+    def forget(self, before: Callable[[Samples], Bools]) -> None:
         """Drop blocks of which ``before``, (n,) bool of a block, is true throughout."""
         if self._file is not None and before(self._file.row(self._stop // 2)).all():
             # most of it may go: what is left is the pre-roll of the next leg
@@ -88,7 +90,7 @@ class Rows:
             self._size -= sum(map(_size, dropped))
             self._fresh_size = sum(map(_size, self._fresh))
 
-    def _hold(self, blocks) -> None:
+    def _hold(self, blocks: list[Samples]) -> None:
         """Hold these blocks, and no file."""
         self._blocks, self._fresh, self._file, self._stop = blocks, [], None, 0
         self._size, self._fresh_size = sum(map(_size, blocks)), 0
@@ -114,32 +116,32 @@ class Rows:
 class _Columns:
     """Samples of one kind in files that have no name, one for each column."""
 
-    def __init__(self, like) -> None:
+    def __init__(self, like: Samples) -> None:
         self._kind = type(like)
-        self._files = {}
+        self._files: dict[str, tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = {}
         for field in fields(like):
             column = getattr(like, field.name)
             file = tempfile.TemporaryFile(prefix='odocal_')      # noqa: SIM115 while rows are
             self._files[field.name] = file, column.dtype, column.shape[1:]
 
-    def write(self, block, at: int) -> int:
+    def write(self, block: Samples, at: int) -> int:
         """Write a block's rows from row ``at`` on; return the row after the last."""
         for name, (file, dtype, shape) in self._files.items():
-            data = memoryview(np.ascontiguousarray(getattr(block, name), dtype)).cast('B')
+            data = np.ascontiguousarray(getattr(block, name), dtype).data.cast('B')
             offset = at * dtype.itemsize * int(np.prod(shape))
             while data:
                 done = os.pwrite(file.fileno(), data[:SOME], offset)
                 data, offset = data[done:], offset + done
         return at + len(block.stamp_ns)
 
-    def rows(self, stop: int):
+    def rows(self, stop: int) -> Samples:
         """Return the rows before one, mapped."""
         return of_columns(self._kind, {
             name: np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype,
                                 stop * int(np.prod(shape))).reshape(stop, *shape)
             for name, (file, dtype, shape) in self._files.items()})
 
-    def row(self, at: int):
+    def row(self, at: int) -> Samples:
         """Return one row, in memory."""
         return of_columns(self._kind, {
             name: np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
@@ -147,5 +149,5 @@ class _Columns:
             for size in [dtype.itemsize * int(np.prod(shape))]})
 
 
-def _size(block) -> int:
+def _size(block: Samples) -> int:
     return sum(getattr(block, field.name).nbytes for field in fields(block))

@@ -17,7 +17,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother import smoother_leg
 from odocal_ros.calib.smoother.chain import NotPositive
-from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.estimate import fit, WarmStart
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
@@ -27,7 +27,7 @@ from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, YAW
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.forecast import Abandoned
-from odocal_ros.foresee.smoother_warm_start import carried, rows_of, WarmStart
+from odocal_ros.foresee.smoother_warm_start import carried, rows_of
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.calibrate import turned_over

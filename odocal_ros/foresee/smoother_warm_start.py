@@ -5,38 +5,22 @@ What is added to a leg moves what was there only a little, so that few passes do
 noise levels and slips are taken over from the look before.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib.smoother.estimate import WarmStart
 from odocal_ros.calib.smoother.imperfect import with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, Priors, State
+from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
 
 SPEED_WINDOW = 0.4          # s each side, over which a speed is taken
 ALIKE = 1e-6                # s, keyframes that are the same
 NEW = 3.0                   # s, last part of the old keyframes that may be others
-
-
-@dataclass(frozen=True, eq=False)
-class WarmStart:
-    """
-    What a fit goes on from.
-
-    priors, first : as the data left them, and before any gave way; the accelerometer's scale in
-    both as it was last judged.   spread : (K, 3) factors on the odometer's variances, slips.
-    """
-
-    state: State
-    levels: Levels
-    priors: Priors
-    first: Priors
-    spread: np.ndarray
 
 
 def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:

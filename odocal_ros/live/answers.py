@@ -26,12 +26,12 @@ def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: i
         cut = f' in {len(parts)} parts' if len(parts) > 1 else ''
         text = (f'leg {leg_id}{cut}, {sum(one.distance for one in parts):.0f} m, '
                 f'{verdict.value}; all legs {text}')
-    parts = [text, good]
+    said = [text, good]
     for reason in _worth_telling(calibration)[:MOST_REASONS]:
-        parts += [f'{reason.code.name}: {reason.text}', reason.remedy]
-    if advice and advice not in parts:
-        parts.append(f'Next: {advice}')
-    return calibration.verdict is not Verdict.REJECTED, _sentences(parts)
+        said += [f'{reason.code.name}: {reason.text}', reason.remedy]
+    if advice and advice not in said:
+        said.append(f'Next: {advice}')
+    return calibration.verdict is not Verdict.REJECTED, _sentences(said)
 
 
 def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:

@@ -1,12 +1,14 @@
 """Legs that begin and end by themselves in the node, where ``leg.automatic`` asks for it."""
 
 from odocal_ros.live.filing import latest_of
+from odocal_ros.live.jobs import Computed, LeftOut
 from odocal_ros.live.leg_completion import LegCompletion
 from odocal_ros.live.result_files import iso
 from odocal_ros.live.session import State
 from odocal_ros.output.stored import Stored
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code
+from odocal_ros.settings.config import LegConfig
 
 
 class AutomaticWay(LegCompletion):
@@ -19,7 +21,7 @@ class AutomaticWay(LegCompletion):
     def __init__(self, *args) -> None:
         super().__init__(*args)
         self._search: LegSearch | None = None
-        self._searched = None                 # the settings it was made with
+        self._searched: LegConfig | None = None      # the settings it was made with
         self._counted_ns = 0                  # start of the leg whose metres are counted
         self._warned: set[str] = set()        # changes of the scale that were said
         self._recording.tap = self._hear
@@ -50,10 +52,12 @@ class AutomaticWay(LegCompletion):
     def _go_on(self) -> None:
         """Take up what earlier runs of the node have left."""
         found = latest_of(self._config(), self._node_name)
-        why = _not_ours(found, self._config()) if found and found.carried else None
+        if not found or not found.carried:
+            return
+        why = _not_ours(found, self._config())
         if why:
             self._log.warning(f'{found.name} is not gone on from: {why}')
-        elif found and found.carried:
+        else:
             self.session.carried = found.carried
             self._log.info(f'goes on from {found.name}: {found.carried.legs} legs, the last of '
                            f'{iso(found.carried.last_ns)}')
@@ -93,9 +97,9 @@ class AutomaticWay(LegCompletion):
         if self._search is not None:
             self._search.begin_anew(stamp_ns, at_rest)
 
-    def _take_leg(self, done) -> None:
+    def _take_leg(self, done: Computed | LeftOut) -> None:
         super()._take_leg(done)
-        for reason in done.calibration.reasons if done.calibration else ():
+        for reason in done.calibration.reasons if isinstance(done, Computed) else ():
             if reason.code is Code.SCALE_CHANGED and reason.text not in self._warned:
                 self._warned.add(reason.text)
                 self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')

@@ -24,33 +24,39 @@ class Computed:
     What a leg gave.
 
     results : one, or one of each part where the Imu had a gap.
-    refused : why a leg begun by itself does not count; there is no calibration then.
     carried, folded : what earlier legs tell now, and how many of those kept are in it.
     """
 
     results: tuple[LegResult, ...]
     paths: tuple
-    calibration: Calibration | None = None
-    refused: Reason | None = None
-    carried: Carried | None = None
-    folded: int = 0
+    calibration: Calibration
+    carried: Carried | None
+    folded: int
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What a leg begun by itself gave that does not count, and why not."""
+
+    results: tuple[LegResult, ...]
+    why: Reason
 
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
             kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
             by_itself: bool = False, progress: Callable[[float, str], None] | None = None,
-            ) -> Computed:
+            ) -> Computed | LeftOut:
     """Return a leg's result, its combination with the legs kept, and the paths to show."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
     results = tuple(calibrate_parts(leg, config, progress=progress))
-    paths = leg_paths(max(results, key=lambda one: one.distance), config)
     if by_itself and (why := refusal(results[0])):
-        return Computed(results, paths, refused=why)
+        return LeftOut(results, why)
+    paths = leg_paths(max(results, key=lambda one: one.distance), config)
     folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
     carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
     left = [one for leg in kept[folded:] for one in leg]
     calibration = combine([*left, *results], config, carried)
-    return Computed(results, paths, calibration, None, carried, folded)
+    return Computed(results, paths, calibration, carried, folded)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,

@@ -208,13 +208,13 @@ class LegCompletion:
                   'it') if self.session.open_leg else 'call ~/reset'
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
-    def _take_leg(self, done: jobs.Computed) -> None:
+    def _take_leg(self, done: jobs.Computed | jobs.LeftOut) -> None:
         leg_id, self._snapshot = self.session.leg_id, None
         self._distance_m = sum(one.distance for one in done.results)
-        if done.calibration is None:
-            self.session.leave_out(done.refused)
+        if isinstance(done, jobs.LeftOut):
+            self.session.leave_out(done.why)
             text = (f'leg {leg_id}, {self._distance_m:.0f} m, is not used: '
-                    f'{done.refused.code.name}: {done.refused.text}')
+                    f'{done.why.code.name}: {done.why.text}')
             self._log.info(text)
             self._computing.answer(False, text)
             return

@@ -133,7 +133,9 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns
     Without what is done ever less often as a leg grows: that is a small share by itself.
     """
     begin = time.thread_time()
-    forecast, found, failure = None, (), None
+    forecast: Forecast | None = None
+    found: tuple[Reason, ...] = ()
+    failure: Exception | None = None
     try:
         _bring_up_to_date(thinned, before, fresh, over)
         leg = thinned.leg(start_ns)

@@ -112,7 +112,7 @@ class Session:
         self.event, self.unused = 'cancelled', why
         self._settle(self.calibration)
 
-    def carry_on(self, carried: Carried, legs: int) -> None:
+    def carry_on(self, carried: Carried | None, legs: int) -> None:
         """Let go of the first kept legs: what they tell is carried on."""
         self.carried, self.legs = carried, self.legs[legs:]
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 import re
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,7 +151,7 @@ class _Walk:
     def length(self) -> int:
         self.align(4)
         at = self.layout.size
-        (length,) = struct.unpack_from('<I', self.raw, at)
+        length: int = struct.unpack_from('<I', self.raw, at)[0]
         if length > len(self.raw):
             raise ValueError('length')
         self.layout.fixed.append((at, at + 4))
@@ -210,7 +211,7 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None,
         yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
 
 
-def _alike(table: Table, fixed) -> NDArray[np.bool_]:
+def _alike(table: Table, fixed: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
     """Tell which rows equal the first one in the bytes that make a layout."""
     alike = np.ones(len(table), bool)
     for start, stop in fixed:
@@ -218,7 +219,7 @@ def _alike(table: Table, fixed) -> NDArray[np.bool_]:
     return alike
 
 
-def columns(layout: Layout, table: Table, paths: Sequence[str]) -> NDArray | None:
+def columns(layout: Layout, table: Table, paths: Sequence[str]) -> NDArray[Any] | None:
     """
     Return the values at some paths.
 

@@ -7,10 +7,12 @@ A reader takes messages as they were serialised. Those of one layout are read as
 
 from collections.abc import Callable, Sequence
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -40,6 +42,9 @@ IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 Pairs = list[tuple[str, Samples]]
+Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
+Deserialize = Callable[[bytes], object]
+Feed = Callable[[str, Samples], None]
 
 
 class SensorPlan:
@@ -48,7 +53,7 @@ class SensorPlan:
     form: OdometerForm | None = None
     known = True         # its layout is all there is to learn of its type
 
-    def __init__(self, slot: str, columns: Sequence[Column], build: Callable) -> None:
+    def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
         self.slot = slot
         self.columns = (*STAMP, *columns)
         self._build = build
@@ -61,7 +66,7 @@ class SensorPlan:
         """Say why a message holds no value, for people."""
         return 'the fields of a message are not all there'
 
-    def build(self, received_ns: NDArray, columns: list[NDArray]) -> Pairs:
+    def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:
         """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1])
         return [(self.slot, self._build(stamps, received_ns, *columns[2:]))]
@@ -93,7 +98,7 @@ class Reader:
         return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
 
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int],
-             deserialize: Callable[[bytes], object]) -> Pairs:
+             deserialize: Deserialize) -> Pairs:
         """
         Decode messages.
 
@@ -122,7 +127,8 @@ class Reader:
         n = len(raws)
         if not n:
             return []
-        out: list[NDArray] = [np.empty((n, column.width), column.dtype) for column in plan.columns]
+        out: list[NDArray[Any]] = [np.empty((n, column.width), column.dtype)
+                                   for column in plan.columns]
         good = np.ones(n, bool)
         for layout, rows, table in cdr.tables(self.msgtype, raws):
             if layout is None:
@@ -141,7 +147,7 @@ class Reader:
             out, received = [values[good] for values in out], received[good]
         return plan.build(received, out) if len(received) else []
 
-    def _settled(self, raws, deserialize) -> int:
+    def _settled(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
         """Let the plan see messages in order until it knows all; return how many told nothing."""
         for k, raw in enumerate(raws):
             view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
@@ -155,7 +161,7 @@ class Reader:
         self.unreadable += len(raws)
         return len(raws)
 
-    def _view(self, raw, deserialize) -> MessageView | None:
+    def _view(self, raw: bytes, deserialize: Deserialize) -> MessageView | None:
         """Return one message deserialised, None if that fails."""
         try:
             return MessageView(deserialize(raw))
@@ -166,7 +172,7 @@ class Reader:
             self.trouble = f'cannot be deserialised as {self.msgtype}: {why}'
             return None
 
-    def _one(self, out, i, raw, deserialize) -> bool:
+    def _one(self, out: list[NDArray[Any]], i: int, raw: bytes, deserialize: Deserialize) -> bool:
         """Read one message into row i; False: it gives none."""
         if self.unreadable > HOPELESS:      # trying costs a hundred times what reading does
             self.unreadable += 1
@@ -217,23 +223,25 @@ def full_type(msgtype: str) -> str:
     return f'{package}/msg/{name}' if package and '/' not in package else msgtype
 
 
-def _imu(stamps, received, q_ni, covariance, w_i, f_i, of_force) -> ImuSamples:
+def _imu(stamps: Ints, received: Ints, q_ni: Floats, covariance: Floats, w_i: Floats, f_i: Floats,
+         of_force: Floats) -> ImuSamples:
     with np.errstate(invalid='ignore'):      # a NaN that signals
         f_i = np.where(of_force == -1, np.nan, f_i)       # REP-145: none is sent
     return ImuSamples(stamps, received, w_i, f_i, q_ni, _yaw_variance(q_ni, covariance))
 
 
-def _heading(stamps, received, q_ni, covariance) -> HeadingSamples:
+def _heading(stamps: Ints, received: Ints, q_ni: Floats, covariance: Floats) -> HeadingSamples:
     return HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, covariance))
 
 
-def _yaw_variance(q_ni, covariance):
+def _yaw_variance(q_ni: Floats, covariance: Floats) -> Floats:
     """Return covariance[8], NaN where REP-145's -1 or an all-zero quaternion say 'none'."""
     none = (covariance[:, 0] == -1) | (q_ni == 0).all(axis=1)
     return np.where(none, np.nan, covariance[:, 1])
 
 
-def _fix(stamps, received, position, covariance, known, status) -> FixSamples:
+def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
+         status: Ints) -> FixSamples:
     with np.errstate(invalid='ignore'):      # a NaN that signals
         horizontal = position[:, :2] * RAD_PER_DEG
     return FixSamples(
@@ -241,14 +249,15 @@ def _fix(stamps, received, position, covariance, known, status) -> FixSamples:
         position[:, 2], covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
 
 
-def _velocity(stamps, received, velocity_n, *covariance) -> VelocitySamples:
+def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
+              *covariance: Floats) -> VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
     told = (variance > 0) & (variance < 1e12)       # else unknown
     return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
 
 
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0, 8))
-_SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Callable]] = {
+_SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
     ('imu', IMU): ((*_ORIENTATION, xyz('angular_velocity'), xyz('linear_acceleration'),
                     array('linear_acceleration_covariance', 0)), _imu),
     ('heading', IMU): (_ORIENTATION, _heading),

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Ints
 from odocal_ros.messages import cdr
 
 PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
@@ -43,7 +44,7 @@ class MessageView:
         except (AttributeError, LookupError, TypeError):
             return 0
 
-    def value(self, path: str):
+    def value(self, path: str) -> Any:
         """
         Return what lies at a dotted path, with [i] in a list or [name] by the list ``name``.
 
@@ -63,7 +64,7 @@ class MessageView:
         return here
 
     @staticmethod
-    def _index(owner, key: str) -> int:
+    def _index(owner: object, key: str) -> int:
         names = list(getattr(owner, 'name', ()))
         if key in names:
             return names.index(key)
@@ -99,12 +100,12 @@ class Column:
     width: int
     pick: Callable[[View], Sequence[str] | None]
 
-    def of_table(self, layout: cdr.Layout, table: cdr.Table) -> NDArray | None:
+    def of_table(self, layout: cdr.Layout, table: cdr.Table) -> NDArray[Any] | None:
         """Return (n, width) values of messages of one layout, None if they are not there."""
         paths = self.pick(layout)
         return cdr.columns(layout, table, paths) if paths else None
 
-    def of_message(self, view: MessageView) -> list | None:
+    def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the same values of one message."""
         paths = self.pick(view)
         if not paths:
@@ -133,6 +134,6 @@ def array(path: str, *indices: int) -> Column:
 STAMP = (fixed(np.int64, 'header.stamp.sec'), fixed(np.int64, 'header.stamp.nanosec'))
 
 
-def stamp_ns(sec: NDArray, nanosec: NDArray) -> NDArray[np.int64]:
+def stamp_ns(sec: Ints, nanosec: Ints) -> Ints:
     """Return header stamps in nanoseconds from the two columns of STAMP."""
     return sec[:, 0] * 10**9 + nanosec[:, 0]

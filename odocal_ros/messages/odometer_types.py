@@ -1,13 +1,15 @@
 """Odometer messages: where the value lies in each type, and what it means."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.data.arrays import Ints
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import Column, MessageView, parts, STAMP, stamp_ns, View
@@ -176,7 +178,7 @@ class OdometerPlan:
             return field
         return f'{_base(field)[0]}[{key}]' if field else key
 
-    def _pick(self, field: str, key: str):
+    def _pick(self, field: str, key: str) -> Callable[[View], Sequence[str] | None]:
         """Return the function that says where in a message a wheel's values lie."""
         path = self._path(field, key)
         base, own = _base(field)
@@ -199,7 +201,7 @@ class OdometerPlan:
         names = f', its names are {", ".join(view.names)}' if view.names else ''
         return f'no {wanted} in a {self.msgtype}{names}'
 
-    def build(self, received_ns: NDArray, columns: list[NDArray]) -> list:
+    def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:
         """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
         slots = ('odometer', 'odometer_right') if self.two else (self.slot,)

@@ -76,7 +76,7 @@ def sided(choice: Choice, side: str) -> str:
     return choice.keys[side == 'right'] if choice.sides else ''
 
 
-def _by_name(names) -> Choice | tuple[str, ...]:
+def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     """Return the pair that names tell, else all that may be wheels."""
     low = {name: name.lower() for name in names}
     free = [n for n in names if not any(w in low[n] for w in NO_WHEEL)]
@@ -103,13 +103,13 @@ def _by_name(names) -> Choice | tuple[str, ...]:
     return tuple(single) if len(rolls) == 2 and len(single) == 1 else tuple(rolls)
 
 
-def _taken(names, pair, why):
+def _taken(names: Sequence[str], pair: tuple[str, str], why: str) -> str:
     rest = '' if len(names) == 2 else f'of the joints {_listed(names)}: '
     return f'{rest}{pair[0]} is taken for the left wheel and {pair[1]} for the right one, by ' \
            f'their names{why}'
 
 
-def _words(name) -> list[str]:
+def _words(name: str) -> list[str]:
     """Return the words of a name, single letters beside each other as one: r_l is rl."""
     words: list[str] = []
     for word in (w.lower() for w in WORD.findall(name)):
@@ -120,7 +120,7 @@ def _words(name) -> list[str]:
     return words
 
 
-def _place(name) -> tuple[str, tuple[str, ...]]:
+def _place(name: str) -> tuple[str, tuple[str, ...]]:
     """Return the side that a name tells ('' none or both), and what is left of the name."""
     sides, rest = set(), []
     for word in _words(name):
@@ -137,7 +137,7 @@ def _place(name) -> tuple[str, tuple[str, ...]]:
     return (sides.pop() if len(sides) == 1 else ''), tuple(rest)
 
 
-def _letters(word) -> tuple[str, str]:
+def _letters(word: str) -> tuple[str, str]:
     """Return axle and side of a short hand: l, rh, fl, rr; '' where it is none."""
     side = {'l': 'left', 'r': 'right'}
     if word in side or word in ('lh', 'rh'):
@@ -151,12 +151,12 @@ def _letters(word) -> tuple[str, str]:
     return '', ''
 
 
-def _axle(rest) -> str:
+def _axle(rest: Sequence[str]) -> str:
     whole = ' '.join(rest)
     return 'rear' if any(w in whole for w in REAR) else 'front' if any(
         w in whole for w in FRONT) else ''
 
 
-def _listed(keys) -> str:
+def _listed(keys: Sequence[str]) -> str:
     more = len(keys) - MOST_SHOWN
     return ', '.join(keys[:MOST_SHOWN]) + (f' and {more} more' if more > 0 else '')

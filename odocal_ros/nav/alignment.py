@@ -5,10 +5,12 @@ An ``Alignment`` is an input of the pure pipeline, so that a simulation can put 
 """
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
@@ -77,7 +79,26 @@ class Level:
     C_np: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
 
 
-def level_frame(up_b):
+class Grade(Protocol):
+    """What the errors of an Imu are like (``settings.grades.Grade``), 1 sigma, SI."""
+
+    @property
+    def level_bias(self) -> float: ...
+
+    @property
+    def accel_noise(self) -> float: ...
+
+    @property
+    def gyro_bias(self) -> float: ...
+
+    @property
+    def gyro_bias_walk(self) -> float: ...
+
+    @property
+    def gyro_scale_error(self) -> float: ...
+
+
+def level_frame(up_b: Floats) -> Floats:
     """
     Return C_Lb for the up direction in b: x of L is b's x axis projected on the level.
 
@@ -89,13 +110,14 @@ def level_frame(up_b):
     return np.stack([np.cross(y, u), y, u])
 
 
-def C_nL(yaw):
+def C_nL(yaw: float) -> Floats:
     """Return the rotation that takes level axes to n for the ENU yaw of L's x axis, rad."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
+def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[float, float],
+                  grade: Grade, gyro_noise: float) -> Level:
     """
     Level from the mean specific force of a standstill.
 
@@ -131,7 +153,8 @@ def level_at_rest(t, w_b, f_b, span, grade, gyro_noise) -> Level:
                  float(rate_sigma), (float(span[0]), float(span[1])))
 
 
-def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
+def level_in_motion(t: Floats, w_b: Floats, f_b: Floats, q_0b: Floats, speed: Floats,
+                    latitude: float, grade: Grade) -> Level:
     """
     Level from the mean specific force of a stretch of driving, the odometer's speed taken out.
 
@@ -167,7 +190,7 @@ def level_in_motion(t, w_b, f_b, q_0b, speed, latitude, grade) -> Level:
                  0.0, None)
 
 
-def gyrocompass(level: Level, latitude, grade) -> tuple[float, float]:
+def gyrocompass(level: Level, latitude: float, grade: Grade) -> tuple[float, float]:
     """
     Return the ENU yaw of L's x axis and its sigma, rad, from the Earth rate seen at rest.
 
@@ -180,7 +203,7 @@ def gyrocompass(level: Level, latitude, grade) -> tuple[float, float]:
     return float(yaw), float(np.hypot(gyro, level.level_sigma * np.tan(latitude)))
 
 
-def off_the_earth(level: Level, latitude, grade) -> float:
+def off_the_earth(level: Level, latitude: float, grade: Grade) -> float:
     """
     Return by how many sigmas the rate at rest is not the Earth's, level and up: the worse one.
 
@@ -194,7 +217,8 @@ def off_the_earth(level: Level, latitude, grade) -> float:
     return float(np.abs(off / sigma).max())
 
 
-def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro_noise):
+def complete(level: Level, yaw: float, yaw_sigma: float, source: str, shared: bool,
+             latitude: float, grade: Grade, gyro_noise: float) -> Alignment:
     """
     Return the Alignment of a level and a heading, rad; the gyro bias from rest where there is one.
 
@@ -208,7 +232,8 @@ def complete(level: Level, yaw, yaw_sigma, source, shared, latitude, grade, gyro
                      grade.gyro_scale_error)
 
 
-def _gyro_bias_n(level, C_nb, yaw_sigma, latitude, grade):
+def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, latitude: float,
+                 grade: Grade) -> tuple[Floats, Floats]:
     """
     Return gyro bias and its sigma, ENU: the mean rate at rest less the Earth's.
 

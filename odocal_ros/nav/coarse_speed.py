@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
 
 FEWEST = 20          # distinct values to know a grid by
 FEW, OFTEN, DIVIDES = 4, 5, 0.02     # a slow drive's: distinct, times sent, of a cell
@@ -28,8 +29,6 @@ GOLDEN = 0.618034    # steps through a range evenly
 SHARP = 0.5          # of a cell: a speed that changes by more in a step tells no crossing
 SHARPEST = 0.02      # of a cell, sigma of a crossing: what speeds do beside
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Told:
@@ -40,7 +39,7 @@ class Told:
     side: Floats     # (m,) 1 forwards, -1 backwards
     sigma: Floats    # (m,)
 
-    def between(self, begin, end) -> 'Told':
+    def between(self, begin: float, end: float) -> 'Told':
         """Return those of a time, s."""
         pick = (self.t >= begin) & (self.t <= end)
         return Told(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
@@ -101,7 +100,7 @@ class CoarseSpeed:
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 
 
-def _gain(t, edge, q):
+def _gain(t: Floats, edge: Floats, q: float) -> Floats:
     """
     Return how fast the speed changes at its crossings (m,): between those before and after.
 
@@ -110,13 +109,13 @@ def _gain(t, edge, q):
     """
     dt, rise = np.maximum(np.diff(t), 1e-9), np.diff(edge)
     side = np.maximum(np.abs(rise), q) / dt
-    gain = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
+    gain: Floats = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
     on = np.flatnonzero(rise[:-1] * rise[1:] > 0)
     gain[on + 1] = np.abs(rise[on] + rise[on + 1]) / (dt[on] + dt[on + 1])
     return gain
 
 
-def coarse_speed(t, value) -> CoarseSpeed | None:
+def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     """Return a speed's grid, scale units per s, by its rows; None where it has none."""
     step = grid(value)
     top = np.abs(value).max(initial=0.0)
@@ -131,7 +130,7 @@ def coarse_speed(t, value) -> CoarseSpeed | None:
     return CoarseSpeed(step, t, value) if step else None
 
 
-def grid(value) -> float | None:
+def grid(value: Floats) -> float | None:
     """
     Return the step of the grid that values other than zero lie on, None where they lie on none.
 
@@ -160,7 +159,7 @@ def grid(value) -> float | None:
     return step if len(np.unique(np.rint(value / step))) >= CROWDS else None
 
 
-def _of_few(value, u, count):
+def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
     """Return the step of few distinct values u, each sent time and again, that it divides."""
     if len(u) < FEW or np.median(count) < OFTEN:
         return None
@@ -169,7 +168,7 @@ def _of_few(value, u, count):
     return step if np.abs(off).max() < DIVIDES else None
 
 
-def _refined(value, step):
+def _refined(value: Floats, step: float) -> float:
     """Return the step with which values lie on its multiples best, about one that is near."""
     cell = np.rint(value / step)
     for _ in range(3):

@@ -10,8 +10,9 @@ track is exact on the ellipsoid: converting it back to latitude, longitude and h
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
@@ -27,13 +28,13 @@ class Origin:
     longitude: float
     height: float
 
-    def to_n(self, geodetic):
+    def to_n(self, geodetic: Floats) -> Floats:
         """Return positions in n, m, of (..., 3) latitude, longitude (rad), height (m)."""
         r_e = ecef_from_geodetic(geodetic[..., 0], geodetic[..., 1], geodetic[..., 2])
         own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
         return (r_e - own_e) @ C_en(self.latitude, self.longitude)
 
-    def to_geodetic(self, position_n):
+    def to_geodetic(self, position_n: Floats) -> Floats:
         """Return (..., 3) latitude, longitude (rad), height (m) of positions in n, m."""
         own_e = ecef_from_geodetic(self.latitude, self.longitude, self.height)
         r_e = own_e + position_n @ C_en(self.latitude, self.longitude).T
@@ -54,7 +55,7 @@ class Track:
     s: NDArray[np.float64]
     P: NDArray[np.float64]
 
-    def at(self, t):
+    def at(self, t: float | Floats) -> Floats:
         """Return P at times t, linear between epochs, constant outside: (...) to (..., 3, 3)."""
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
@@ -63,14 +64,14 @@ class Track:
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
         return self.P[k] * (1 - x) + self.P[after] * x
 
-    def C_nb_at(self, t):
+    def C_nb_at(self, t: float | Floats) -> Floats:
         """Return attitude at the epoch nearest to t: (...) to (..., 3, 3)."""
         k = np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1)
         k = np.where(np.abs(self.t[k - 1] - t) < np.abs(self.t[k] - t), k - 1, k)
         return matrix_from_quat(self.q_nb[k])
 
 
-def dead_reckon(t, q_nb, travel: Travel) -> Track:
+def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
     Sum attitude over travel.
 
@@ -93,13 +94,13 @@ def dead_reckon(t, q_nb, travel: Travel) -> Track:
     return Track(t, q_nb, s, P)
 
 
-def forward_b(yaw, pitch):
+def forward_b(yaw: float | Floats, pitch: float | Floats) -> Floats:
     """Return the vehicle's forward axis in b for mounting angles, rad (roll 0): (..., 3)."""
     return np.stack([np.cos(pitch) * np.cos(yaw), -np.sin(yaw) * np.ones_like(pitch),
                      np.sin(pitch) * np.cos(yaw)], -1)
 
 
-def mounting_from_forward(d_b):
+def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
     """
     Return yaw and pitch mounting angle, rad, of a forward axis in b: inverse of forward_b.
 
@@ -111,7 +112,7 @@ def mounting_from_forward(d_b):
     return np.arctan2(-y, side * np.hypot(x, z)), np.arctan2(side * z, side * x)
 
 
-def rough_scale(travel: Travel, t_fix, fixes_n, sigma):
+def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float) -> float | None:
     """
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 

@@ -1,7 +1,9 @@
 """The Earth: WGS 84 ellipsoid, gravity and rates; geodetic and Earth-fixed coordinates."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from odocal_ros.data.arrays import FloatOrFloats, Floats
 from odocal_ros.nav.angles import arctan2
 
 A = 6378137.0                  # m, semi-major axis
@@ -13,28 +15,30 @@ K_GAMMA = 0.00193185265241     # Somigliana's constant
 M_GAMMA = 0.00344978650684     # omega^2 a^2 b / GM
 
 
-def radii(latitude):
+def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
     """Return meridian and normal radius of curvature, m, at a latitude, rad: (...)."""
     w2 = 1 - E2 * np.sin(latitude) ** 2
     normal = A / np.sqrt(w2)
     return normal * (1 - E2) / w2, normal
 
 
-def gravity(latitude, height):
+def gravity(latitude: FloatOrFloats, height: FloatOrFloats) -> FloatOrFloats:
     """Return normal gravity, m/s^2, at latitude (rad) and height (m) (NIMA TR8350.2, 4-1, 4-3)."""
     s2 = np.sin(latitude) ** 2
     gamma_0 = GAMMA_E * (1 + K_GAMMA * s2) / np.sqrt(1 - E2 * s2)
-    return gamma_0 * (1 - 2 / A * (1 + F + M_GAMMA - 2 * F * s2) * height + 3 / A**2 * height**2)
+    gamma: FloatOrFloats = gamma_0 * (
+        1 - 2 / A * (1 + F + M_GAMMA - 2 * F * s2) * height + 3 / A**2 * height**2)
+    return gamma
 
 
-def earth_rate_n(latitude):
+def earth_rate_n(latitude: ArrayLike) -> Floats:
     """Return the Earth's turn rate in ENU, rad/s: (...) to (..., 3)."""
     latitude = np.asarray(latitude, dtype=float)
     zero = np.zeros_like(latitude)
     return np.stack([zero, OMEGA * np.cos(latitude), OMEGA * np.sin(latitude)], -1)
 
 
-def transport_rate_n(latitude, height, velocity_n):
+def transport_rate_n(latitude: Floats, height: Floats, velocity_n: Floats) -> Floats:
     """Return the turn rate of the local level against the Earth, ENU, rad/s: (..., 3)."""
     meridian, normal = radii(latitude)
     east, north = velocity_n[..., 0], velocity_n[..., 1]
@@ -42,7 +46,7 @@ def transport_rate_n(latitude, height, velocity_n):
                      east * np.tan(latitude) / (normal + height)], -1)
 
 
-def ecef_from_geodetic(latitude, longitude, height):
+def ecef_from_geodetic(latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Floats:
     """Return Earth-fixed coordinates, m, of rad, rad, m: (...) to (..., 3)."""
     latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
     normal = radii(latitude)[1]
@@ -51,7 +55,7 @@ def ecef_from_geodetic(latitude, longitude, height):
                      (normal * (1 - E2) + height) * np.sin(latitude)], -1)
 
 
-def geodetic_from_ecef(r_e):
+def geodetic_from_ecef(r_e: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """
     Return latitude, longitude (rad), height (m) of Earth-fixed coordinates, m: (..., 3).
 
@@ -71,7 +75,7 @@ def geodetic_from_ecef(r_e):
     return latitude, arctan2(y, x), height
 
 
-def C_en(latitude, longitude):
+def C_en(latitude: ArrayLike, longitude: ArrayLike) -> Floats:
     """Return the rotation that takes ENU to Earth-fixed axes: (...) to (..., 3, 3)."""
     latitude, longitude = np.broadcast_arrays(latitude, longitude)
     sp, cp, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)

@@ -2,18 +2,20 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
+
 FACTOR = 5.0         # of the median interval: what is longer is a gap
 SHORTEST = 0.2       # s
 FEWEST = 10          # rows that show a rhythm
 
 
-def gaps_longer(t, limit):
+def gaps_longer(t: Floats, limit: float) -> Floats:
     """Return begin and end of the steps of times, (n,) s, longer than ``limit`` s: (k, 2)."""
     k = np.flatnonzero(np.diff(t) > limit)
     return np.stack([t[k], t[k + 1]], -1)
 
 
-def gaps_in_rhythm(t):
+def gaps_in_rhythm(t: Floats) -> Floats:
     """Return begin and end of the steps far beyond the stream's own rhythm: (k, 2) s."""
     if len(t) < FEWEST:
         return np.empty((0, 2))

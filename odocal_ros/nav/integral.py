@@ -5,27 +5,33 @@ The Imu of a long leg is most of the memory that a computation takes, and each c
 is as much again.
 """
 
-import numpy as np
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import let_go
 
+Array = NDArray[Any]
 CHUNK = 2**16     # rows
 
 
-def chunks(n, *columns):
+def chunks(n: int, *columns: Array) -> Iterator[slice]:
     """Yield slices of n rows; what is mapped of the columns is let go after each."""
     for first in range(0, n, CHUNK):
         yield slice(first, min(first + CHUNK, n))
         let_go(*columns)
 
 
-def by_row(function, *columns):
+def by_row(function: Callable[..., Array], *columns: Array) -> Array:
     """Return what a function makes of each row of arrays, (n, ...) to (n,)."""
     parts = [function(*(x[rows] for x in columns)) for rows in chunks(len(columns[0]), *columns)]
     return np.concatenate(parts) if parts else function(*columns)
 
 
-def by_step(function, *columns, steps=1):
+def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
     """Return what a function of rows side by side, (m, ...) to (m - steps,), makes of them all."""
     n = len(columns[0])
     if n < 1 + steps:
@@ -34,7 +40,7 @@ def by_step(function, *columns, steps=1):
                            for rows in chunks(n - steps, *columns)])
 
 
-def medians(x):
+def medians(x: Floats) -> Floats:
     """Return the median of each column: (n, k) to (k,)."""
     column, found = np.empty(len(x)), []
     for k in range(x.shape[1]):
@@ -47,10 +53,10 @@ def medians(x):
 class Integral:
     """The integral of (n, ...) by the trapezoid rule, over times that come in pieces."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.end = 0.0
 
-    def over(self, t, x):
+    def over(self, t: Floats, x: Floats) -> Floats:
         """Return it at the times of a piece, whose first row is the last of that before."""
         out = np.empty_like(x)
         out[0] = self.end
@@ -61,7 +67,7 @@ class Integral:
         return out
 
 
-def integral_at(times, t, x):
+def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """
     Return the integral of x, (n, ...), from t[0] on, linear between rows.
 
@@ -73,7 +79,7 @@ def integral_at(times, t, x):
     return out
 
 
-def pieces(times, t, *columns):
+def pieces(times: Floats, t: Floats, *columns: Array) -> Iterator[tuple[slice, slice]]:
     """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
     done = 0
     for rows in chunks(len(t) - 1, *columns):
@@ -84,7 +90,7 @@ def pieces(times, t, *columns):
         done = max(end, done)
 
 
-def interpolated(times, t, x, out):
+def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
     """Write x, (n,) or (n, k), at times to out, linear between rows."""
     if x.ndim == 1:
         out[:] = np.interp(times, t, x)
@@ -93,7 +99,7 @@ def interpolated(times, t, x, out):
         out[:, k] = np.interp(times, t, x[:, k])
 
 
-def twice_integral_at(times, t, x):
+def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
     once, twice, out = Integral(), Integral(), np.empty(len(times))
     for where, rows in pieces(times, t, x):

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats, Values
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.reasons import Code, Reason
 
@@ -28,13 +30,13 @@ class Travel:
     quantum: float
     coarse: CoarseSpeed | None = None
 
-    def at(self, t):
+    def at(self, t: Floats) -> Floats:
         """Return travel at times t, linear between rows, constant outside."""
         return np.interp(t, self.t, self.s)
 
-    def mirrored(self, spans) -> 'Travel':
+    def mirrored(self, spans: Floats) -> 'Travel':
         """Return it with what was counted in spans, (m, 2) s, counted the other way."""
-        def way(t):
+        def way(t: Floats) -> Floats:
             return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
                             -1.0, 1.0)
         step = np.diff(self.s, prepend=self.s[:1]) * way(self.t)
@@ -42,8 +44,8 @@ class Travel:
         return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 
-def travel(t, value, form, reversed_counts=False,
-           name='the counter') -> tuple[Travel, tuple[Reason, ...]]:
+def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool = False,
+           name: str = 'the counter') -> tuple[Travel, tuple[Reason, ...]]:
     """
     Sum an odometer's rows up to travel.
 
@@ -70,7 +72,7 @@ def travel(t, value, form, reversed_counts=False,
     coarse = None
     if form.quantity == 'rate':
         step = (value[:-1] + value[1:]) / 2 * np.diff(t)
-        coarse = coarse_speed(t, -value if reversed_counts else value)
+        coarse = coarse_speed(t, (-value if reversed_counts else value).astype(float, copy=False))
     elif form.quantity == 'increment':
         step = value[1:].astype(float)
     else:
@@ -94,7 +96,8 @@ def mean_travel(left: Travel, right: Travel) -> Travel:
     return Travel(t, s - (s[0] if len(s) else 0.0), left.quantum / np.sqrt(2))
 
 
-def _counter_steps(t, value, modulus, name):
+def _counter_steps(t: Floats, value: Values, modulus: int,
+                   name: str) -> tuple[Floats, tuple[Reason, ...]]:
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
     whole = np.issubdtype(value.dtype, np.integer)
     raw = step = np.diff(value)                    # integers wrap at 2^64 by themselves
@@ -121,7 +124,7 @@ def _counter_steps(t, value, modulus, name):
     return step, reasons
 
 
-def _resets(t, step, whole):
+def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
     """Tell which steps no wheel can make: far above the drive's speed, alone or in pairs."""
     dt = np.diff(t)
     if len(step) < ENOUGH or not step.any():
@@ -138,7 +141,7 @@ def _resets(t, step, whole):
     return far
 
 
-def _bridged(t, step, resets):
+def _bridged(t: Floats, step: Floats, resets: Bools) -> Floats:
     """Return steps with the resets replaced by the rate beside them."""
     dt = np.diff(t)
     step = step.copy()

@@ -1,8 +1,12 @@
 """Plane coordinates (leg-centred, Gauss-Krueger, UTM) and geodesics, by pyproj."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+
+from odocal_ros.data.arrays import Floats
 
 # semi-major axis m, inverse flattening
 ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
@@ -24,7 +28,7 @@ class Plane:
     ellipsoid: str = 'WGS84'
     false_easting: float = 500000.0
 
-    def forward(self, latitude, longitude):
+    def forward(self, latitude: Floats, longitude: Floats) -> tuple[Floats, Floats]:
         """Return northing, easting, m (eq. 1-5 of Shi et al. 2015), of rad: (...)."""
         from pyproj import Proj
         a, rf = ELLIPSOIDS[self.ellipsoid]
@@ -34,7 +38,20 @@ class Plane:
         return np.asarray(northing), np.asarray(easting)
 
 
-def plane_for(projection, longitude) -> Plane:
+class Projection(Protocol):
+    """The settings ``projection``."""
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def ellipsoid(self) -> str: ...
+
+    @property
+    def central_meridian(self) -> float: ...
+
+
+def plane_for(projection: Projection, longitude: float) -> Plane:
     """Return the plane the projection settings ask for about a longitude, rad."""
     degrees = float(np.rad2deg(longitude))
     meridian = projection.central_meridian
@@ -44,7 +61,8 @@ def plane_for(projection, longitude) -> Plane:
     return Plane(float(meridian), SCALE[projection.kind], projection.ellipsoid)
 
 
-def plane_chord(plane: Plane, start, end):
+def plane_chord(plane: Plane, start: Sequence[float] | Floats,
+                end: Sequence[float] | Floats) -> tuple[float, float]:
     """
     Return length, m, and bearing from grid north, rad, of a chord in the plane (eq. 6, 7, 10).
 
@@ -54,7 +72,8 @@ def plane_chord(plane: Plane, start, end):
     return float(np.hypot(n1 - n0, e1 - e0)), float(np.arctan2(e1 - e0, n1 - n0))
 
 
-def geodesic_chord(start, end):
+def geodesic_chord(start: Sequence[float] | Floats,
+                   end: Sequence[float] | Floats) -> tuple[float, float]:
     """Return length at the mean height, m, and azimuth, rad, of the WGS 84 geodesic."""
     from pyproj import Geod
     geod = Geod(ellps='WGS84')

@@ -6,28 +6,31 @@ Rotations: matrices, quaternions (x y z w, as ROS sends them) and fixed-axis rol
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2
 
 
-def skew(a):
+def skew(a: ArrayLike) -> Floats:
     """Return the matrix of the cross product with a: (..., 3) to (..., 3, 3)."""
     return np.cross(np.asarray(a, dtype=float)[..., None, :], -np.eye(3))
 
 
-def exp_so3(phi):
+def exp_so3(phi: Floats) -> Floats:
     """Return the rotation matrix of rotation vector phi, rad: (..., 3) to (..., 3, 3)."""
     half = np.linalg.norm(phi, axis=-1)[..., None, None] / 2
     S = skew(phi)
-    return np.eye(3) + np.sinc(2 * half / np.pi) * S + np.sinc(half / np.pi) ** 2 / 2 * S @ S
+    C: Floats = np.eye(3) + np.sinc(2 * half / np.pi) * S + np.sinc(half / np.pi) ** 2 / 2 * S @ S
+    return C
 
 
-def transpose(C):
+def transpose(C: Floats) -> Floats:
     """Return the inverse rotation: (..., 3, 3)."""
     return np.swapaxes(C, -1, -2)
 
 
-def quat_from_rotvec(phi):
+def quat_from_rotvec(phi: ArrayLike) -> Floats:
     """Return the quaternion of rotation vector phi, rad: (..., 3) to (..., 4)."""
     phi = np.asarray(phi, dtype=float)
     half = np.sqrt(np.einsum('...i,...i->...', phi, phi)) / 2
@@ -37,7 +40,7 @@ def quat_from_rotvec(phi):
     return q
 
 
-def quat_multiply(p, q):
+def quat_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
     """Return the product: p_ab, q_bc to q_ac, (..., 4)."""
     px, py, pz, pw = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
     qx, qy, qz, qw = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
@@ -47,12 +50,12 @@ def quat_multiply(p, q):
                      pw * qw - px * qx - py * qy - pz * qz], axis=-1)
 
 
-def quat_conjugate(q):
+def quat_conjugate(q: ArrayLike) -> Floats:
     """Return the inverse of a unit quaternion: (..., 4)."""
     return np.asarray(q, dtype=float) * [-1.0, -1.0, -1.0, 1.0]
 
 
-def quat_at(t_new, t, q):
+def quat_at(t_new: Floats, t: Floats, q: Floats) -> Floats:
     """
     Return attitude at times, of attitudes that turn little from one to the next: (k, 4).
 
@@ -60,11 +63,12 @@ def quat_at(t_new, t, q):
     """
     sides = np.einsum('ki,ki->k', q[1:], q[:-1])
     q = q * np.cumprod(np.append(1.0, np.where(sides < 0, -1.0, 1.0)))[:, None]
-    found = np.stack([np.interp(t_new, t, column) for column in q.T], -1)
-    return found / np.linalg.norm(found, axis=-1)[..., None]
+    found: Floats = np.stack([np.interp(t_new, t, column) for column in q.T], -1)
+    found /= np.linalg.norm(found, axis=-1)[..., None]
+    return found
 
 
-def matrix_from_quat(q):
+def matrix_from_quat(q: ArrayLike) -> Floats:
     """Return the rotation matrix of a quaternion of any length but zero: (..., 4)."""
     q = np.asarray(q, dtype=float)
     x, y, z, w = np.moveaxis(q, -1, 0)
@@ -82,7 +86,7 @@ def matrix_from_quat(q):
     return C
 
 
-def quat_from_matrix(C):
+def quat_from_matrix(C: ArrayLike) -> Floats:
     """
     Return the quaternion (w >= 0) of a rotation matrix: (..., 3, 3) to (..., 4).
 
@@ -100,12 +104,12 @@ def quat_from_matrix(C):
                      np.stack([xz, yz, 1 - xx - yy + zz, sz], -1),
                      np.stack([sx, sy, sz, 1 + xx + yy + zz], -1)], -2)
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q: Floats = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1)[..., None]
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def matrix_from_rpy(rpy):
+def matrix_from_rpy(rpy: ArrayLike) -> Floats:
     """Return Rz(yaw) Ry(pitch) Rx(roll) (fixed axes, URDF): (..., 3) rad to (..., 3, 3)."""
     rpy = np.asarray(rpy, dtype=float)
     (cr, cp, cy), (sr, sp, sy) = (np.moveaxis(f(rpy), -1, 0) for f in (np.cos, np.sin))
@@ -114,7 +118,7 @@ def matrix_from_rpy(rpy):
                      np.stack([-sp, cp * sr, cp * cr], -1)], -2)
 
 
-def rpy_from_matrix(C):
+def rpy_from_matrix(C: ArrayLike) -> Floats:
     """Return fixed-axis roll, pitch, yaw, rad; at pitch +-90 deg roll is set to 0."""
     C = np.asarray(C, dtype=float)
     level = np.hypot(C[..., 0, 0], C[..., 1, 0])

@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.odometer import Travel
 
 CELL = 0.1            # s, grid of the detector
 WINDOW = 0.5          # s, each side
@@ -13,7 +15,8 @@ TURN = 0.02           # rad/s, wander of the gyro that still counts as standing
 MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
 
 
-def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
+def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: float,
+                shortest: float) -> Floats:
     """
     Find when the vehicle stands.
 
@@ -50,29 +53,30 @@ def standstills(t_imu, w_b, travel, metres_per_unit, shortest):
     return spans[moved <= CREEP * (spans[:, 1] - spans[:, 0]) + _allowed(travel, metres_per_unit)]
 
 
-def _allowed(travel, metres_per_unit):
+def _allowed(travel: Travel, metres_per_unit: float) -> float:
     """Return the travel, m, of one that stands: MOVE, or a count or so of jitter."""
     count = travel.quantum * metres_per_unit
     # a few counts a turn of the wheel: one of them is motion, not jitter
     return max(MOVE, (1.5 if count <= COARSE else 0.5) * count)
 
 
-def _spans(quiet, edges, shortest):
+def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
     """Return begin and end of the runs of quiet cells that last: (k, 2)."""
     steps = np.diff(np.concatenate([[False], quiet, [False]]).astype(int))
     spans = np.stack([edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)]], -1)
     return spans[spans[:, 1] - spans[:, 0] >= shortest - 1e-9]
 
 
-def _still_wheels(middle, travel, metres_per_unit):
+def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
     """Tell where travel in the window is that of one that stands."""
     # range of the travel in the window by a few probes, so that rocking to and fro is seen
     probes = [travel.at(middle + x) for x in np.linspace(-WINDOW, WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
-    return reach * metres_per_unit <= _allowed(travel, metres_per_unit)
+    still: Bools = reach * metres_per_unit <= _allowed(travel, metres_per_unit)
+    return still
 
 
-def _gyro(edges, t_imu, w_b):
+def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     """Return the mean turn rate about each cell, (m, 3), and where it wanders less than TURN."""
     dt = np.diff(t_imu)
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
@@ -86,7 +90,7 @@ def _gyro(edges, t_imu, w_b):
     return windows.mean(axis=-1), (windows.std(axis=-1) < TURN).all(axis=-1) & seen
 
 
-def _not_turning(rate, quiet, edges, shortest):
+def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
     """
     Tell where the gyro reads what it reads at rest.
 
@@ -101,4 +105,5 @@ def _not_turning(rate, quiet, edges, shortest):
     rest = min(means, key=np.linalg.norm)
     if np.abs(rest).max() > MOST_BIAS:
         return np.zeros_like(quiet)
-    return (np.abs(rate - rest) < TURN).all(axis=-1)
+    as_at_rest: Bools = (np.abs(rate - rest) < TURN).all(axis=-1)
+    return as_at_rest

@@ -8,15 +8,17 @@ without any per-sample loop.
 
 import numpy as np
 
+from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.samples import let_go
 
+Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 BLOCK = 64       # quaternions a scan multiplies up in step; 40 to 800 make no difference
 CHUNK = 16384    # intervals worked on at a time: their arrays stay in the cache
 EVEN = 2.0       # ratio of neighbouring intervals up to which a cubic is laid through them
 TINY = 1e-9      # s, of the stamps: keeps the slope of equal stamps finite
 
 
-def rotation_increments(t, w_b, begin=0, end=None):
+def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None = None) -> Floats:
     """
     Return the rotation vectors of b between samples: (n,), (n, 3) to (3, n - 1) rad.
 
@@ -37,7 +39,8 @@ def rotation_increments(t, w_b, begin=0, end=None):
     return phi
 
 
-def _increments(t, w_b, first, last, bias=0.0):
+def _increments(t: Floats, w_b: Floats, first: int, last: int,
+                bias: float | Floats = 0.0) -> Floats:
     """Return the rotation vectors of the intervals from first up to last: (3, last - first)."""
     low, high = max(first - 1, 0), min(last + 1, len(t) - 1)     # with a neighbour each side
     h = np.diff(t[low:high + 1])
@@ -58,7 +61,7 @@ def _increments(t, w_b, first, last, bias=0.0):
     return mean[:, first - low:first - low + last - first]
 
 
-def _bow(h, rise):
+def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """
     Return what a cubic has over its chord in each inner interval, zero where uneven: (3, m - 2).
 
@@ -77,7 +80,7 @@ def _bow(h, rise):
     return bow, (right - left) * (weight * own)
 
 
-def _pairs_from_rotvec(phi):
+def _pairs_from_rotvec(phi: Floats) -> Pairs:
     """Return unit quaternions of (3, n) rotation vectors as two complex rows each."""
     half = np.sqrt(phi[0]**2 + phi[1]**2 + phi[2]**2) / 2
     s = np.sinc(half / np.pi) / 2
@@ -86,30 +89,30 @@ def _pairs_from_rotvec(phi):
     return a, b
 
 
-def _pairs(q):
+def _pairs(q: Floats) -> Pairs:
     """Return quaternions x y z w as two complex rows: w + x i and y + z i."""
     q = np.asarray(q, dtype=float)
     return q[..., 3] + 1j * q[..., 0], q[..., 1] + 1j * q[..., 2]
 
 
-def _quats(a, b):
+def _quats(a: Complexes, b: Complexes) -> Floats:
     """Return the unit quaternions x y z w of two complex rows: (n, 4)."""
     out = np.stack([a.imag, b.real, b.imag, a.real], axis=-1)
     out /= np.sqrt(np.einsum('ij,ij->i', out, out))[:, None]
     return out
 
 
-def _times(a, b, c, d):
+def _times(a: Complexes, b: Complexes, c: Complexes, d: Complexes) -> Pairs:
     """Multiply quaternions a + b j and c + d j: with z = w + x i, y + z i for (a, b)."""
     return a * c - b * np.conj(d), a * d + b * np.conj(c)
 
 
-def prefix_product(q):
+def prefix_product(q: Floats) -> Floats:
     """Return q_0, q_0 q_1, q_0 q_1 q_2 ...: (n, 4) to (n, 4), unit quaternions x y z w."""
     return _quats(*_scan(*_pairs(q)))
 
 
-def _scan(a, b):
+def _scan(a: Complexes, b: Complexes) -> Pairs:
     n = len(a)
     if n <= 2:
         if n == 2:
@@ -131,7 +134,7 @@ def _scan(a, b):
     return A.T.reshape(-1)[:n], B.T.reshape(-1)[:n]
 
 
-def _products(t, w_b, every, bias):
+def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs:
     """Return the rotation over each ``every`` intervals, the last group may be short: pairs."""
     n = len(t) - 1
     groups = -(-n // every)
@@ -152,7 +155,8 @@ def _products(t, w_b, every, bias):
     return a, b
 
 
-def attitude(t, w_b, q_nb0, earth_rate_n, every=1, bias=0.0):
+def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every: int = 1,
+             bias: float | Floats = 0.0) -> tuple[Floats, Floats]:
     """
     Propagate attitude through gyro samples.
 
@@ -187,5 +191,5 @@ def attitude(t, w_b, q_nb0, earth_rate_n, every=1, bias=0.0):
     a, b = _products(t, w_b, every, bias)
     a, b = _scan(np.append(a0, a), np.append(b0, b))
     # n turns with the Earth under the inertial frame it was at t[0]
-    earth = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
-    return t_out, _quats(*_times(*earth, a, b))
+    e, f = _pairs_from_rotvec(np.multiply.outer(np.asarray(earth_rate_n), t[0] - t_out))
+    return t_out, _quats(*_times(e, f, a, b))

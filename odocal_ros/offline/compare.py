@@ -55,10 +55,10 @@ def verdict(found, stored) -> tuple[str, bool | None]:
     """Return one sentence on all changes, and whether any counts; None: nothing to judge."""
     if not found:
         return ('nothing to judge: no value is in two calibrations that are not rejected', None)
-    from odocal_ros.offline.changes import CHANGED
+    from odocal_ros.offline.changes import Change, CHANGED, Difference
     judged = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
               for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
-    beyond = {}
+    beyond: dict[str, tuple[float, Change, Difference]] = {}
     for size, change, difference in judged:
         if difference.beyond and size > beyond.get(change.parameter, (0.0,))[0]:
             beyond[change.parameter] = size, change, difference

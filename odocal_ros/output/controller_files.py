@@ -42,12 +42,12 @@ def _multipliers(calibration, config) -> dict[str, float]:
     """Return those of diff_drive_controller: each wheel's own factor where there is one."""
     estimates = calibration.estimates
     common = known(estimates, 'scale_ratio').value
-    sides = [known(estimates, f'scale_factor_{side}') for side in ('left', 'right')]
-    nominal = nominal_scale(config, sides[0].unit or known(estimates, 'scale_factor').unit)
+    left, right = (known(estimates, f'scale_factor_{side}') for side in ('left', 'right'))
+    nominal = nominal_scale(config, left.unit or known(estimates, 'scale_factor').unit)
     out = {}
-    if nominal and all(side.value is not None for side in sides):
-        out = {f'{name}_wheel_radius_multiplier': side.value / nominal
-               for name, side in zip(('left', 'right'), sides, strict=True)}
+    if nominal and left.value is not None and right.value is not None:
+        out = {'left_wheel_radius_multiplier': left.value / nominal,
+               'right_wheel_radius_multiplier': right.value / nominal}
     elif common is not None:
         out = {f'{name}_wheel_radius_multiplier': common for name in ('left', 'right')}
     width = known(estimates, 'track_width')

@@ -10,14 +10,14 @@ def decimals(sigma: float) -> int:
     return max(0, min(12, 1 - math.floor(math.log10(sigma))))
 
 
-def with_sigma(value: float, sigma: float | None, factor: float = 1.0,
+def with_sigma(value: float | None, sigma: float | None, factor: float = 1.0,
                signed: bool = False) -> str:
     """
     Return 'value ± sigma', both times ``factor``, with the digits that the sigma leaves.
 
     Of a sigma of 100 or more two digits count too: -32000 ± 15000.
     """
-    if not math.isfinite(value):
+    if value is None or not math.isfinite(value):
         return 'unknown'
     value *= factor
     if sigma is None or not math.isfinite(sigma):

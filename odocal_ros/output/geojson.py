@@ -43,7 +43,7 @@ def _features(number: int, leg: LegResult, most: int) -> list[dict]:
                              ('as_configured', leg.track_before_n, _line),
                              ('fixes', leg.reference_n, _points)):
         positions = _positions(rows, leg, most)
-        if len(positions):
+        if rows is not None and len(positions):
             out.append(_feature(make(positions), number, leg, name,
                                 {'points': len(positions), 'of': len(rows)}))
     track = _positions(leg.track_n, leg, most)

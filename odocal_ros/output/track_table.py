@@ -31,10 +31,13 @@ def in_pieces(legs) -> list[PerDistance]:
     found: dict[float, list[PerDistance]] = {}
     for one in (x for leg in legs for x in leg.per_distance):
         found.setdefault(one.length, []).append(one)
-    whole = {length: sum(x.pieces for x in parts) for length, parts in found.items()}
-    return [PerDistance(length, *(math.sqrt(sum(
-        x.pieces * getattr(x, name)**2 for x in parts) / whole[length]) for name in SIDES),
-        whole[length]) for length, parts in sorted(found.items())]
+    return [_pooled(length, parts) for length, parts in sorted(found.items())]
+
+
+def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
+    whole = sum(x.pieces for x in parts)
+    return PerDistance(length, math.sqrt(sum(x.pieces * x.before**2 for x in parts) / whole),
+                       math.sqrt(sum(x.pieces * x.after**2 for x in parts) / whole), whole)
 
 
 def before_label(legs) -> str:

@@ -1,10 +1,10 @@
 """What reading may take, whatever a file claims: every bound, and how a user raises them."""
 
-from collections.abc import Callable
 from functools import cache
 import os
 from pathlib import Path
 import stat
+from types import ModuleType
 from typing import Any
 
 from odocal_ros.errors import BadBag
@@ -93,7 +93,7 @@ class Allowance:
         return b''.join(parts)
 
 
-def opener(packing: str) -> Callable[[], Any]:
+def opener(packing: str) -> Any:
     """Return the class of a decompressor with ``decompress(data, max_length)``; or Damaged."""
     if packing == 'zstd':
         return zstd_module().ZstdDecompressor
@@ -107,7 +107,7 @@ def opener(packing: str) -> Callable[[], Any]:
 
 
 @cache
-def zstd_module():
+def zstd_module() -> ModuleType:
     """Return the zstd module that rosbags uses: the standard library's from Python 3.14 on."""
     from importlib import import_module  # a module that is not there is looked for each time
     try:

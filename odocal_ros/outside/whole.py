@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 import signal
 import threading
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 PART = '.part'                # of files being written: no ending that a result's or a bag's have
 
@@ -19,7 +19,7 @@ PART = '.part'                # of files being written: no ending that a result'
 class Disk:
     """What may fail, one call a step."""
 
-    def __call__(self, step: Callable, *values):
+    def __call__(self, step: Callable[..., Any], *values: Any) -> Any:
         """Do a step of the operating system."""
         return step(*values)
 
@@ -34,7 +34,8 @@ class WholeFile:
         self._file = file
 
     def write(self, data: bytes) -> int:
-        return disk(self._file.write, data)
+        written: int = disk(self._file.write, data)
+        return written
 
 
 @contextmanager
@@ -101,7 +102,7 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield       # only the main thread hears of it
         return
-    came: list = []
+    came: list[tuple[Any, ...]] = []
     before = signal.signal(signal.SIGINT, lambda *values: came.append(values))
     try:
         yield

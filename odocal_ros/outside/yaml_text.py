@@ -1,12 +1,14 @@
 """YAML of parameter files, value by value: read alike by rcl, by YAML 1.1 and by odocal."""
 
+from collections.abc import Mapping
 from datetime import datetime, UTC
 import math
+from typing import Any
 
 from odocal_ros.outside.names import one_line
 
 
-def value_text(value) -> str:
+def value_text(value: object) -> str:
     """Return a value to its last bit; text in quotes, so that a joint may be named 0 or on."""
     if value is None or isinstance(value, float):
         return number(value)
@@ -14,8 +16,9 @@ def value_text(value) -> str:
         return f'[{", ".join(map(value_text, value))}]'
     if isinstance(value, str):
         import yaml
-        return yaml.safe_dump(one_line(value), default_style='"', allow_unicode=True,
-                              width=math.inf).rstrip('\n')
+        text: str = yaml.safe_dump(one_line(value), default_style='"', allow_unicode=True,
+                                   width=math.inf)
+        return text.rstrip('\n')
     return str(value).lower()
 
 
@@ -37,12 +40,12 @@ def no_date(iso: str) -> str:
     return f'{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
 
 
-def parameters(values: dict, key: str = '/**') -> str:
+def parameters(values: Mapping[str, Any], key: str = '/**') -> str:
     """Return the block of a parameter file; dicts among the values are groups."""
     return f'{key}:\n  ros__parameters:\n{_lines(values, 4)}'
 
 
-def _lines(values, indent):
+def _lines(values: Mapping[str, Any], indent: int) -> str:
     return ''.join(
         f'{" " * indent}{name}:\n{_lines(value, indent + 2)}' if isinstance(value, dict) else
         f'{" " * indent}{name}: {value_text(value)}\n' for name, value in values.items())

@@ -1,6 +1,7 @@
 """YAML from outside as a tree: nested and linked no deeper than a person would write it."""
 
 from functools import cache
+from typing import Any
 
 from odocal_ros.errors import BadConfig
 
@@ -8,16 +9,16 @@ DEPTH = 30       # of mappings and lists in each other
 
 
 @cache
-def loader(aliases: bool = False):
+def loader(aliases: bool = False) -> Any:
     """Return a safe loader that refuses what is nested too deep, and ``*links`` unless asked."""
     import yaml
 
-    class Plain(yaml.SafeLoader):
+    class Plain(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here
         """Composes with a bound."""
 
         depth = 0
 
-        def compose_node(self, parent, index):
+        def compose_node(self, parent: Any, index: Any) -> Any:
             """Compose a node and what is in it."""
             mark = self.peek_event().start_mark
             if not aliases and self.check_event(yaml.AliasEvent):
@@ -38,7 +39,7 @@ def loader(aliases: bool = False):
     return Plain
 
 
-def composed(text: str, where: str):
+def composed(text: str, where: str) -> Any:
     """Return the root node of a text (None: it is empty), or raise BadConfig that tells where."""
     import yaml
     try:

@@ -8,12 +8,14 @@ then begins where it ended. A gap of the Imu that no leg survives lies between t
 """
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import LegResult
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -45,6 +47,7 @@ class LegSearch:
 
     def __init__(self, config: Config) -> None:
         self._steps: Steps | None = None
+        self._still = 0.0
         self._standstill_ns = round(config.leg.standstill * 1e9)
         self._rest_ns = max(REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)
@@ -67,14 +70,15 @@ class LegSearch:
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
     def feed(self, slot: str, block, form: OdometerForm | None = None) -> None:
-        """Take rows as they went into the recorder; ``form`` is that of the odometer's."""
+        """Take rows as they went into the recorder; the odometer's say nothing without form."""
         if slot not in self._first_ns or not len(block.stamp_ns):
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
         if slot == 'imu':
             self._hear(block.stamp_ns)
-        elif slot == 'odometer':
+        elif slot == 'odometer' and form is not None:
             self._steps = self._steps or Steps(form)
+            self._still = self._steps.still
             steps, stamps, _ = self._steps.of(block)
             travel = self._travel + np.cumsum(steps)
             if len(travel):
@@ -91,7 +95,7 @@ class LegSearch:
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
 
-    def _hear(self, stamps) -> None:
+    def _hear(self, stamps: Ints) -> None:
         known = np.append(self._imu_ns or stamps[0], stamps[stamps > self._imu_ns])
         for k in np.flatnonzero(np.diff(known) > self._max_gap_ns):
             self._gaps.append((int(known[k]), int(known[k + 1])))
@@ -117,15 +121,14 @@ class LegSearch:
             return
         if self._anchor is None:
             self._anchor = t, s
-        elif abs(s - self._anchor[1]) > self._steps.still:
-            self._moves(t)
+        elif abs(s - self._anchor[1]) > self._still:
+            self._moves(t, self._anchor[0])
             self._anchor = t, s
         else:
-            self._stands(t)
+            self._stands(t, self._anchor[0])
 
-    def _moves(self, t: int) -> None:
-        stood_ns = self._anchor[0]
-        self._stands(t - BEFORE_NS)
+    def _moves(self, t: int, stood_ns: int) -> None:
+        self._stands(t - BEFORE_NS, stood_ns)
         rested = t - stood_ns >= self._standstill_ns
         leg, off_ns = self.open, max(t - BEFORE_NS, stood_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, stood_ns):
@@ -136,8 +139,7 @@ class LegSearch:
         if self.open is None and not self._needs_rest:
             self.spans.append(Span(off_ns))
 
-    def _stands(self, t: int) -> None:
-        since_ns = self._anchor[0]
+    def _stands(self, t: int, since_ns: int) -> None:
         stood_ns = t - since_ns
         self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
         leg = self.open
@@ -165,7 +167,8 @@ def refusal(result: LegResult) -> Reason | None:
                 Reason(Code.NO_METHOD, 'no method could be run'))
 
 
-def fold(legs, config: Config, carried: Carried | None = None) -> Carried | None:
+def fold(legs: Iterable[LegResult], config: Config,
+         carried: Carried | None = None) -> Carried | None:
     """Return what is carried on with some legs taken in, by time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried

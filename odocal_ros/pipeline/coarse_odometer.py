@@ -2,8 +2,13 @@
 
 import numpy as np
 
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.placed import Placed
+from odocal_ros.screening.screen import Inputs
 
 NAME = 'speed_truncation'
 ADDED_UP = ('two_point', 'wheels')      # methods whose travel is the sum of the speeds
@@ -11,7 +16,7 @@ WORTH = 5e-4        # of the scale: half a step that is worth a word
 COARSE = 0.2        # m, a count that is
 
 
-def half_step(inputs) -> float:
+def half_step(inputs: Inputs) -> float:
     """
     Return how much of the way half a step of the speed is, 0.0 where there are no steps.
 
@@ -26,7 +31,7 @@ def half_step(inputs) -> float:
     return coarse.step / 2 / mean if mean else 0.0
 
 
-def held_steps(method, prepared):
+def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
     size = half_step(prepared.inputs)
     if method.name not in ADDED_UP or not size:
@@ -34,16 +39,16 @@ def held_steps(method, prepared):
     return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, size), shared=True)
 
 
-def coarse_reasons(inputs, placed) -> list[Reason]:
+def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     """Say that speed or counts come in coarse steps."""
     K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
     if count > COARSE:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '
                        'by up to that')]
-    if size < WORTH:
-        return []
     coarse = _coarse(inputs)
+    if coarse is None or size < WORTH:
+        return []
     metres = coarse.step * K
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
         else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
@@ -52,7 +57,7 @@ def coarse_reasons(inputs, placed) -> list[Reason]:
                    f'what they add up to is {100 * size:.2g} % too little if they are truncated')]
 
 
-def _coarse(inputs):
+def _coarse(inputs: Inputs) -> CoarseSpeed | None:
     """Return the grid of the speed, of one of two wheels, None where there is none."""
     each = (inputs.travel, inputs.travel_left, inputs.travel_right)
     return next((way.coarse for way in each if way is not None and way.coarse), None)

@@ -1,7 +1,10 @@
 """A delay that the methods saw and estimated: say it, with the setting that takes it out."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
 SURE = 3.0          # sigmas
@@ -10,7 +13,7 @@ HIDDEN = 0.25       # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
-def delay_notes(prepared, seen) -> list[Reason]:
+def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]]) -> list[Reason]:
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
@@ -38,7 +41,7 @@ def delay_notes(prepared, seen) -> list[Reason]:
     return notes
 
 
-def _speed(prepared) -> float:
+def _speed(prepared: PreparedLeg) -> float:
     """Return the speed driven, m/s: nine tenths of the leg are slower."""
     travel = prepared.inputs.travel
     grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)

@@ -57,7 +57,8 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                           distance=prepared.distance, deciding=deciding(asked))
     distance = prepared.distance
-    if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
+    # truer than the rough scale
+    if scale.value and scale.sigma is not None and scale.sigma < WORTH * scale.value:
         distance *= scale.value / prepared.rough
     shown, said = tracks(prepared, runs[scale.method].paths)
     found += said

@@ -1,9 +1,10 @@
 """What a method gives on one leg."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Reason
 
 
@@ -15,8 +16,8 @@ class Paths(NamedTuple):
     the calibration changes and in nothing else.
     """
 
-    before: Callable
-    after: Callable
+    before: Callable[[Floats], Floats]
+    after: Callable[[Floats], Floats]
 
 
 class MethodRun(NamedTuple):
@@ -31,5 +32,5 @@ class MethodRun(NamedTuple):
     result: MethodResult
     paths: Paths | None = None
     found: tuple[Reason, ...] = ()
-    delays: dict[str, tuple] | None = None
-    slips: tuple[dict, ...] = ()
+    delays: dict[str, tuple[float, float]] | None = None
+    slips: tuple[dict[str, Any], ...] = ()

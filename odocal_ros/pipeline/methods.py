@@ -65,7 +65,8 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     for name in METHODS:
         if name in runs:
             found += runs[name].found
-            delays = delays if runs[name].delays is None else runs[name].delays
+            told = runs[name].delays
+            delays = delays if told is None else told
     return found + delay_notes(prepared, delays)
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 from odocal_ros.reasons import Code
 
@@ -9,7 +11,7 @@ HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, whic
 NAME = 'hills'
 
 
-def upright(method, prepared):
+def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
     if prepared.inputs.felt:
         return method

@@ -1,18 +1,21 @@
 """An error of the scale beyond a method's own model, put into its sigmas and budget."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Source
+from odocal_ros.calib.result import MethodResult, Source
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code
 
 WHEELS = ('scale_factor_left', 'scale_factor_right')
 SCALES = ('scale_factor', 'scale_ratio', *WHEELS)
 
 
-def with_scale_error(method, prepared, name, relative, shared=False):
+def with_scale_error(method: MethodResult, prepared: PreparedLeg, name: str,
+                     relative: Mapping[str, float], shared: bool = False) -> MethodResult:
     """
     Return a method's result with an error in the sigmas of its scales.
 

@@ -8,13 +8,17 @@ drawn out over tens of seconds is no step, and hides in the smoother's road nois
 
 import numpy as np
 
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.wheels.slips import WheelSlips
+from odocal_ros.data.arrays import Floats
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, WHEELS, with_scale_error
 
 NAME = 'slow_wheel_slip'
 STEP = 8.0          # s: method wheels takes a slip for a step, which a longer one is not
 
 
-def held(method, prepared, slips):
+def held(method: MethodResult, prepared: PreparedLeg, slips: WheelSlips) -> MethodResult:
     """
     Return a method's result with the slip of one wheel in its sigmas, as it was without any.
 
@@ -31,7 +35,7 @@ def held(method, prepared, slips):
                             dict.fromkeys(SCALES, mean) | dict.fromkeys(WHEELS, wheel))
 
 
-def _not_held(method, slips):
+def _not_held(method: MethodResult, slips: WheelSlips) -> Floats:
     """Return the sizes, m, of the slips of one wheel that are not in the method's sigmas yet."""
     long = slips.end - slips.begin > STEP
     own = [(s['t'], s['t'] + s['duration']) for s in method.details.get('slips', ())]
@@ -39,4 +43,5 @@ def _not_held(method, slips):
                      for begin, end in zip(slips.begin, slips.end, strict=True)], bool)
     # two_point sees only the ends: there the whole slip is in, however long it took
     left = {'wheels': long, 'smoother': ~seen}.get(method.name, np.zeros(len(long), bool))
-    return slips.size[left]
+    size: Floats = slips.size[left]
+    return size

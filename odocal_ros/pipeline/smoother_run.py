@@ -35,14 +35,15 @@ def smoother(ready, passed) -> MethodRun:
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
-    seen = {name: (e.value, e.sigma) for name, e in delays.items() if e.value is not None}
+    seen = {name: (e.value, e.sigma) for name, e in delays.items()
+            if e.value is not None and e.sigma is not None}
     # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
     late = {name: e.value or 0.0 for name, e in delays.items()}
     travel = ready.inputs.travel
-    epochs = _attitude(ready, method.details)
-    track = dead_reckon(*epochs, replace(travel, t=travel.t - late['odometer']))
+    t, q_nb = _attitude(ready, method.details)
+    track = dead_reckon(t, q_nb, replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, ready.config), method.details['f']
-    before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(*epochs, travel))
+    before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(t, q_nb, travel))
     return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
                      delays=seen)
 

@@ -67,11 +67,11 @@ def tracks(ready, paths) -> tuple[dict, tuple[Reason, ...]]:
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
     more |= {name: track_check(stray(path, pin, fixes), way)
              for name, path in (('before', before), ('after', after))}
-    relative = (np.interp(fixes[0], *driven(ready)),
-                *(stray(path, pin, fixes) for path in paths))
-    more['per_distance'] = per_distance(*relative)
+    way_at = np.interp(fixes[0], *driven(ready))
+    off_before, off_after = (stray(path, pin, fixes) for path in paths)
+    more['per_distance'] = per_distance(way_at, off_before, off_after)
     kept, far = near(ready, after, start, between)
-    found += (*check_worse(*relative, bool(ready.nominal)), *far)
+    found += (*check_worse(way_at, off_before, off_after, bool(ready.nominal)), *far)
     return more | {'evidence': evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept,
                                         start, paths, ready.config, ready.t_fit)}, found
 

@@ -75,12 +75,12 @@ def inserted(drive: PlannedDrive, k: int, t, speed, turned) -> PlannedDrive:
         s since row k, above 0 and rising; m/s; rad turned to the left since row k.
 
     """
-    rows = {'t': np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),
-            'speed': np.insert(drive.speed, k + 1, speed),
-            'slope': np.insert(drive.slope, k + 1, np.full(len(t), drive.slope[k])),
-            'yaw': np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turned,
-                                   drive.yaw[k + 1:] + turned[-1]])}
-    return replace(drive, **rows)
+    return replace(
+        drive, t=np.concatenate([drive.t[:k + 1], drive.t[k] + t, drive.t[k + 1:] + t[-1]]),
+        speed=np.insert(drive.speed, k + 1, speed),
+        slope=np.insert(drive.slope, k + 1, np.full(len(t), drive.slope[k])),
+        yaw=np.concatenate([drive.yaw[:k + 1], drive.yaw[k] + turned,
+                            drive.yaw[k + 1:] + turned[-1]]))
 
 
 def _amid(drive):

@@ -97,5 +97,5 @@ def _fit(problem, made: Ideal, levels, priors) -> Fit:
     """Return the fit that stands where it is: no step is taken."""
     state = made.state
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
-    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), weighted,
-               solve(weighted.normal()), True, False, 0)
+    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
+               np.nan, weighted, solve(weighted.normal()))

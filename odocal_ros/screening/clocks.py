@@ -1,8 +1,12 @@
 """Clocks: how far apart the topics' stamps are, and whether one was set during the leg."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from odocal_ros.data.samples import take
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import Samples, SomeSamples, take
 from odocal_ros.reasons import Code, Reason
 
 LIMIT = 0.5          # s, between topics
@@ -14,7 +18,8 @@ GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 
 
-def judge_clocks(leg, offsets, labels) -> list[Reason]:
+def judge_clocks(leg: Leg, offsets: Mapping[str, float],
+                 labels: Mapping[str, str]) -> list[Reason]:
     """
     Compare each topic's clock with the Imu's, at equal times of arrival.
 
@@ -49,24 +54,25 @@ def judge_clocks(leg, offsets, labels) -> list[Reason]:
     return found
 
 
-def _stamped(samples):
+def _stamped(samples: SomeSamples) -> SomeSamples:
     good = samples.stamp_ns > 0
     return samples if good.all() else take(samples, good)
 
 
-def _lag(samples):
+def _lag(samples: Samples) -> Floats:
     """Return arrival less stamp, s: (n,)."""
-    return (samples.received_ns - samples.stamp_ns) * 1e-9
+    lag: Floats = np.multiply(samples.received_ns - samples.stamp_ns, 1e-9)
+    return lag
 
 
-def _cure(slot, ahead):
+def _cure(slot: str, ahead: float) -> str:
     """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
     if slot not in GROUP or abs(ahead) > REACH:
         return ''
     return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
 
 
-def _was_set(samples, label, start_ns):
+def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
     """
     Name a clock that was set during the leg: its stamps step, arrivals do not, and so it stays.
 

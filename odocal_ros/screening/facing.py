@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.integral import medians
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 
 BIN = 1.0                      # s, accelerations are compared as means over it
@@ -53,7 +55,8 @@ class Facing:
     sigma: float
 
 
-def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
+def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
+           metres_per_unit: float) -> Pushes | None:
     """
     Return the pushes of a drive, None where it is too short.
 
@@ -96,7 +99,8 @@ def pushes(t, w, f, up, travel, metres_per_unit) -> Pushes | None:
                   np.diff(use, prepend=-9) == 1)
 
 
-def facing(t, w_b, f_b, travel, metres_per_unit) -> Facing | None:
+def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
+           metres_per_unit: float) -> Facing | None:
     """
     Return where the Imu faces, None where the drive does not show it.
 
@@ -134,7 +138,7 @@ def facing(t, w_b, f_b, travel, metres_per_unit) -> Facing | None:
     return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
 
 
-def toward(found: Facing | None, f):
+def toward(found: Facing | None, f: Floats) -> Floats:
     """Return scale times forward axis, (3,), turned to where the Imu faces if that is far off."""
     yaw, pitch = mounting_from_forward(f)
     if found is None or abs(float(wrap(found.yaw - yaw))) < max(NEAR, 3 * found.sigma):
@@ -142,7 +146,7 @@ def toward(found: Facing | None, f):
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
 
-def axes_reasons(found: Facing | None, nominal_yaw) -> tuple[Reason, ...]:
+def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]:
     """Return IMU_AXES, or ODOMETER_REVERSED, where the Imu faces far from its nominal yaw, rad."""
     if found is None:
         return ()

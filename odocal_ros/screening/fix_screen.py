@@ -2,9 +2,12 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.samples import FixSamples
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import GnssConfig
 
 HEIGHT = 1e5         # m, beyond it a fix is at no real position
 ALIKE = 1e-3         # correlations above and below the diagonal
@@ -15,7 +18,8 @@ LARGEST = 1e8        # m, beyond it, says nothing
 INDEPENDENT = 1e-6   # least eigenvalue of the correlations: below it an axis adds nothing
 
 
-def usable_fixes(fix, sent, gnss):
+def usable_fixes(fix: FixSamples, sent: int,
+                 gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
     """
     Judge the fixes of a leg.
 
@@ -59,14 +63,15 @@ def usable_fixes(fix, sent, gnss):
     return use, covariance, found
 
 
-def placed(fix):
+def placed(fix: FixSamples) -> Bools:
     """Tell which fixes are on the Earth, and not where both angles are zero: (n,) bool."""
     nowhere = (fix.latitude == 0) & (fix.longitude == 0)
     # NaN compares false: what is not within is nowhere
-    return (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
+    there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
+    return there
 
 
-def _away(fix, good):
+def _away(fix: FixSamples, good: Bools) -> Bools:
     """Tell which of the good fixes are on another part of the Earth than most: (n,) bool."""
     away = np.zeros(len(good), bool)
     if good.any():
@@ -75,7 +80,7 @@ def _away(fix, good):
     return away
 
 
-def covariances(fix, default_sigma):
+def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
     """
     Return covariances with the unknown ones replaced, and which those are.
 
@@ -92,11 +97,12 @@ def covariances(fix, default_sigma):
     return covariance, unknown
 
 
-def _proper(matrices):
+def _proper(matrices: Floats) -> Bools:
     """Tell which matrices are covariances that can be inverted: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
     # products and roots of what is beyond any receiver would overflow
-    sane = (np.isfinite(matrices) & (np.abs(matrices) < LARGEST**2)).all(axis=(1, 2))
+    small = np.abs(matrices) < LARGEST**2
+    sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
     sane &= (variance > SMALLEST**2).all(axis=1)
     with np.errstate(all='ignore'):
         sigma = np.sqrt(variance)
@@ -104,10 +110,11 @@ def _proper(matrices):
     unit[~sane] = np.eye(matrices.shape[1])
     # one that is not symmetric is damaged: which half holds, nobody knows
     sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ALIKE).all(axis=(1, 2))
-    return sane & (np.linalg.eigvalsh(unit)[:, 0] > INDEPENDENT)
+    sane &= np.linalg.eigvalsh(unit)[:, 0] > INDEPENDENT
+    return sane
 
 
-def origin_amid(t_fix, geodetic) -> Origin:
+def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
     """Return where n is fixed: the fix amid those about the start, so that no outlier is it."""
     near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:ABOUT_START])
     r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)

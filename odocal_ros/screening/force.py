@@ -10,15 +10,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
 from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G
 
 TILT = 0.05          # rad of road and mounting, 1 sigma of each axis
 
 
-def felt(f_i) -> bool:
+def felt(f_i: Floats) -> bool:
     """Return whether any of (n, 3) forces as sent is one, or none has come yet."""
     if not len(f_i):
         return True
@@ -27,7 +30,7 @@ def felt(f_i) -> bool:
                    for rows in chunks(len(f_i), f_i))
 
 
-def with_force(leg, config):
+def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
     Return a leg whose Imu, where it sends no force, stands upright on level ground; and why.
 

@@ -1,11 +1,17 @@
 """Values no sensor means: beyond any range, or alone against all their neighbours."""
 
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.integral import by_row, by_step
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import ImuConfig
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
 BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
@@ -31,28 +37,31 @@ SINGLE_FORCE = 2.0   # m/s^2, the same
 RARE = 0.002         # of the rows: more of them are no glitches
 ROLLS = 0.1          # of the top speed: slower on the mean, a vehicle may as well stand
 MOST = 2000          # bounds looked at
+Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
-def beyond(name, column):
+def beyond(name: str, column: NDArray[Any]) -> Bools:
     """Tell which rows hold NaN, Inf or a value beyond any sensor: (n, ...) to (n,) bool."""
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
     most = BEYOND.get(name, LARGEST)
 
-    def odd(x):
+    def odd(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
         usable = (size <= most) & ((size >= TINY) | (size == 0))
-        return ~usable.all(axis=tuple(range(1, x.ndim)))
+        odd: Bools = ~usable.all(axis=tuple(range(1, x.ndim)))
+        return odd
     with np.errstate(invalid='ignore'):
         return by_row(odd, column)
 
 
-def oriented(samples):
+def oriented(samples: Oriented) -> Oriented:
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
-    def no_attitude(wild, q_ni, variance):
+    def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = np.linalg.norm(np.where(wild[:, None], 0.0, q_ni), axis=1)
-        return (length < 1 / UNIT) | (length > UNIT) | (np.abs(variance) > WIDEST)
+        none: Bools = (length < 1 / UNIT) | (length > UNIT) | (np.abs(variance) > WIDEST)
+        return none
 
     wild = beyond('q_ni', samples.q_ni)
     none = by_row(no_attitude, wild, samples.q_ni, samples.yaw_variance)
@@ -62,7 +71,7 @@ def oriented(samples):
                    yaw_variance=np.where(none, np.nan, samples.yaw_variance))
 
 
-def about_clumps(wild):
+def about_clumps(wild: Bools) -> Bools:
     """
     Tell which rows stand in or about a clump of rows that are beyond any sensor.
 
@@ -81,7 +90,7 @@ def about_clumps(wild):
     return suspect
 
 
-def alone(t, x, least):
+def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
     Tell which rows leave their neighbours at a bound and come back at another.
 
@@ -116,7 +125,7 @@ def alone(t, x, least):
     return found if found.mean() <= RARE else np.zeros(len(x), bool)
 
 
-def single(x, least):
+def single(x: Floats, least: float) -> Bools:
     """
     Tell which rows are off alone, while nothing stirs to either side: motion begins and ends.
 
@@ -125,29 +134,32 @@ def single(x, least):
     """
     edge = BESIDE + 1
 
-    def off(x):
+    def off(x: Floats) -> Bools:
         m = len(x) - 2 * edge
         far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
         # a false row shows in those at it, too
         beside = np.max([far[BESIDE + k:][:m] for d in range(2, edge) for k in (-d, d)], axis=0)
         at = far[BESIDE:][:m]
         apart = np.abs(x[edge + 1:][:m] - x[BESIDE:][:m])
-        return ((at > np.maximum(least, SINGLE * beside)) & (apart < ALIKE * at)).any(axis=1)
+        is_off: Bools = (at > np.maximum(least, SINGLE * beside)) & (apart < ALIKE * at)
+        alone: Bools = np.any(is_off, axis=1)
+        return alone
 
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
         found[edge:-edge] = by_step(off, x, steps=2 * edge)
-    return found & (found.sum() <= max(RARE * len(x), CLUMP))
+    found &= found.sum() <= max(RARE * len(x), CLUMP)
+    return found
 
 
-def imu_glitches(t, w_i, f_i, imu):
+def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
     """Return which Imu rows hold a spike that no vehicle makes, by the imu settings' factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
     return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
             | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
 
 
-def speed_glitches(t, speed):
+def speed_glitches(t: Floats, speed: Floats) -> Bools:
     """Return which rows of an odometer that sends rates hold a spike no wheel makes."""
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
@@ -155,7 +167,7 @@ def speed_glitches(t, speed):
     return alone(t, speed[:, None], max(SPEED_STEP * top, 1e-12))
 
 
-def frozen(t, w, travel, limit) -> tuple[Reason, ...]:
+def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:
     """
     Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
 

@@ -9,6 +9,8 @@ the travel on both sides of a burst has them.
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
 
@@ -27,7 +29,8 @@ SHORT = 1.0         # s within which travel is as good as even
 FAST = 3.0          # times the speed beside: no wheel, so rows that catch up
 
 
-def on_time(samples, t, form, found, name='odometer'):
+def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
+            name: str = 'odometer') -> Floats:
     """
     Return when rows were taken: (n,) s, late ones put back.
 
@@ -54,7 +57,7 @@ def on_time(samples, t, form, found, name='odometer'):
     return true
 
 
-def interval(t):
+def interval(t: Floats) -> float:
     """Return the sender's interval, s, lost and late rows notwithstanding."""
     usual = float(np.median(np.diff(t)))
     n = min(max(int(SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
@@ -62,7 +65,7 @@ def interval(t):
     return mean if abs(mean - usual) < STEADY * usual else usual
 
 
-def _put_back(t, travel, usual, least):
+def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     """Return times with late rows put back."""
     from scipy.ndimage import minimum_filter1d
     rows = usual * np.arange(len(t))
@@ -84,7 +87,7 @@ def _put_back(t, travel, usual, least):
     return np.where((true > floor) | ~late, true, np.minimum(floor, t))
 
 
-def _off(t, travel):
+def _off(t: Floats, travel: Floats) -> Floats:
     """Return by how much each row's travel is off that of the rows some way before and after."""
     k = np.arange(len(t))
     before, after = np.maximum(k - BESIDE, 0), np.minimum(k + BESIDE, len(t) - 1)
@@ -92,13 +95,14 @@ def _off(t, travel):
     return travel - travel[before] - share * (travel[after] - travel[before])
 
 
-def _by_travel(t, travel, a, b, usual):
+def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:
     """Return the times of the rows between a and b, as sent where they do not catch up."""
     rows = np.arange(a + 1, b)
 
-    def speed(first, last):
+    def speed(first: int, last: int) -> float:
         first, last = max(first, 0), min(last, len(t) - 1)
-        return abs(travel[last] - travel[first]) / max(t[last] - t[first], usual / 10)
+        size: float = abs(travel[last] - travel[first]) / max(t[last] - t[first], usual / 10)
+        return size
 
     beside = max(speed(a - BESIDE, a), speed(b, b + BESIDE))
     if t[b] - t[a] > SHORT or not beside or speed(a + 1, b) < FAST * beside:

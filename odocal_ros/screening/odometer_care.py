@@ -6,10 +6,13 @@ be known of the travel (a reset, a gap of speeds or increments) becomes a doubt 
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from odocal_ros.data.samples import take
+from odocal_ros.data.arrays import Bools, Floats, Values
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import speed_glitches
@@ -24,7 +27,8 @@ MORE = 1.5           # times what rows tell: as long a way at speeds sent as zer
 LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
 
 
-def mended(samples, t, form, found, name='odometer'):
+def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
+           name: str = 'odometer') -> tuple[OdometerSamples, Floats]:
     """Return rows without the false ones, increments with the false ones smoothed."""
     if form.quantity == 'cumulative':
         false = false_counts(t, samples.value, form.modulus)
@@ -37,7 +41,7 @@ def mended(samples, t, form, found, name='odometer'):
         false = speed_glitches(t, samples.value.astype(float))
         if false.any():
             good = np.interp(t, t[~false], samples.value[~false].astype(float))
-            kept = np.where(false, good, samples.value).astype(samples.value.dtype)
+            kept: NDArray[Any] = np.where(false, good, samples.value).astype(samples.value.dtype)
             samples = replace(samples, value=kept)
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
                                 'increments stand alone far from their neighbours, first at '
@@ -45,7 +49,7 @@ def mended(samples, t, form, found, name='odometer'):
     return samples, t
 
 
-def counter_steps(value, modulus):
+def counter_steps(value: Values, modulus: int) -> Floats:
     """Return the steps of a counter, rollover undone, as floats: (n,) to (n - 1,)."""
     step = np.diff(value)
     if np.issubdtype(value.dtype, np.integer) and 0 < modulus < 2**63:
@@ -54,7 +58,7 @@ def counter_steps(value, modulus):
     return step.astype(float)
 
 
-def false_counts(t, value, modulus):
+def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
     Tell which rows of a counter are false: hung before a jump that catches up, or away and back.
 
@@ -68,7 +72,7 @@ def false_counts(t, value, modulus):
     rate = step / np.maximum(dt, np.median(dt))
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
-    jumps = np.flatnonzero(size > max(JUMP * top, 3 / np.median(dt)))
+    jumps = np.flatnonzero(size > max(JUMP * top, 3 / np.median(dt))).tolist()
     if len(jumps) > MOST_JUMPS:
         return false
     done = -1
@@ -86,7 +90,7 @@ def false_counts(t, value, modulus):
     return false
 
 
-def _goes_on(t, net, rate, a, b):
+def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     """Tell whether the counter after step b goes on from before step a at speeds as beside."""
     length = t[b + 1] - t[a]
     ways = [_usual(r) * length for r in (rate[max(0, a - BESIDE):a], rate[b + 1:b + 1 + BESIDE])]
@@ -94,13 +98,13 @@ def _goes_on(t, net, rate, a, b):
     return bool(min(ways) - slack <= net <= max(ways) + slack)
 
 
-def _comes_back(t, net, step, a, b, top):
+def _comes_back(t: Floats, net: float, step: Floats, a: int, b: int, top: float) -> bool:
     """Tell whether a far jump at step a is taken back at step b, but for what may be motion."""
     reach = 1.2 * top * (t[b + 1] - t[a]) + 3
     return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
 
 
-def doubted(way: Travel, value, form):
+def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Floats, Floats]:
     """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
     none = np.empty(0)
     if len(way.t) < ENOUGH:
@@ -112,10 +116,10 @@ def doubted(way: Travel, value, form):
         sent = counter_steps(value, form.modulus)
         odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
         # a reset: of the travel since the last count nothing is known but the speeds beside
-        stall = [_stall(step, k) for k in odd]
-        lost = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
+        stall = [_stall(step, k) for k in odd.tolist()]
+        most = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
                 * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
-        return way, way.t[odd], np.array(lost) / np.sqrt(3)
+        return way, way.t[odd], np.array(most) / np.sqrt(3)
     odd = np.flatnonzero(dt > max(GAP * usual, 0.2))
     before = np.array([_usual(rate[max(0, k - BESIDE):k]) for k in odd])
     after = np.array([_usual(rate[k + 1:k + 1 + BESIDE]) for k in odd])
@@ -136,7 +140,7 @@ def doubted(way: Travel, value, form):
     return way, lost, sigma
 
 
-def _hidden(way, value):
+def _hidden(way: Travel, value: Values) -> Floats:
     """
     Return how far the wheel rolls in each step at speeds that are sent as zero: (n - 1,).
 
@@ -160,11 +164,11 @@ def _hidden(way, value):
     return hidden
 
 
-def _stall(step, j):
+def _stall(step: Floats, j: int) -> int:
     """Return the first of the steps of zero that end at step j, j where there are none."""
     moves = np.flatnonzero(step[:j])
     return int(moves[-1]) + 1 if len(moves) else 0
 
 
-def _usual(rate):
+def _usual(rate: Floats) -> float:
     return float(np.median(rate)) if len(rate) else 0.0

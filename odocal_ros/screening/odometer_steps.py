@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from odocal_ros.data.samples import OdometerForm
+from odocal_ros.data.arrays import Floats, Ints, Values
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
 
 STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
 
@@ -12,14 +13,14 @@ class Steps:
 
     def __init__(self, form: OdometerForm) -> None:
         self.form = form
-        self._last: tuple | None = None
+        self._last: tuple[Ints, Values] | None = None
 
     @property
     def still(self) -> float:
         """Return the travel up to which one that stands may seem to move."""
         return STILL.get(self.form.scale_unit, 0.02)
 
-    def of(self, block):
+    def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """Return the step of each row since the row before, its stamp, ns, and its duration, s."""
         stamps, values = block.stamp_ns, block.value
         if self._last is not None:

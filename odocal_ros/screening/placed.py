@@ -1,13 +1,18 @@
 """Where a leg's fixes lie, and how far a count reaches: by one rule, before any method."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.nav.dead_reckoning import Origin, rough_scale
 from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
+
+if TYPE_CHECKING:
+    from odocal_ros.screening.screen import Inputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +32,7 @@ class Placed:
     rough: float
 
 
-def place(inputs, config) -> Placed:
+def place(inputs: 'Inputs', config: Config) -> Placed:
     """
     Return where the fixes of screened inputs lie and how far a count reaches.
 

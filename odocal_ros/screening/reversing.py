@@ -6,9 +6,14 @@ ratio at every start. Where the ratio has the other sign the vehicle went the ot
 that only once the stretch is long beside their noise; a few metres are enough for the Imu.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.integral import integral_at, twice_integral_at
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.sanity import G
 
@@ -27,7 +32,8 @@ SHOWN = 3           # stretches told in the sentence
 ALIKE = (0.5, 2.0)  # of the usual ratio: a start that is like the others
 
 
-def reversed_starts(travel, t_imu, w_b, f_b, between) -> np.ndarray:
+def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
+                    between: tuple[float, float]) -> Floats:
     """
     Return where the vehicle drives off backwards and the counter counts up: (m, 2) s.
 
@@ -73,7 +79,7 @@ def reversed_starts(travel, t_imu, w_b, f_b, between) -> np.ndarray:
     return np.stack([t[begins[back]] - HALF, t[ends[back]] + HALF], -1)
 
 
-def doubled(slips, travel, metres_per_unit) -> np.ndarray:
+def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: float) -> Floats:
     """
     Return the stretches between stops that slipped by twice their way: reversed, (m, 2) s.
 
@@ -91,7 +97,8 @@ def doubled(slips, travel, metres_per_unit) -> np.ndarray:
     return spans[(way > LEAST) & (twice > TWICE[0]) & (twice < TWICE[1])]
 
 
-def said_of(spans, travel, metres_per_unit, seen, signed=True) -> tuple[Reason, ...]:
+def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
+            signed: bool = True) -> tuple[Reason, ...]:
     """
     Return REVERSING_UNSIGNED with the stretches that are counted backwards, none without.
 
@@ -111,7 +118,7 @@ def said_of(spans, travel, metres_per_unit, seen, signed=True) -> tuple[Reason, 
                    f'{more}'),)
 
 
-def _stretches(t, travel):
+def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     """Return the first and the last step of each stretch between stops that begins with one."""
     speed = np.abs(travel.at(t + HALF / 2) - travel.at(t - HALF / 2)) / HALF
     top = np.percentile(speed, 95)
@@ -126,7 +133,7 @@ def _stretches(t, travel):
     return begins[long], ends[long]
 
 
-def _second(t, t_in, s):
+def _second(t: Floats, t_in: Floats, s: Floats) -> Floats:
     """Return the second difference of s over HALF each side, per s^2."""
     before, here, after = (np.interp(t + d, t_in, s) for d in (-HALF, 0.0, HALF))
     return (before - 2 * here + after) / HALF**2
@@ -140,7 +147,7 @@ class _Forces:
     difference of the way that f_x makes.
     """
 
-    def __init__(self, t, t_imu, w_b, f_b):
+    def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
         self.turned = integral_at(t, t_imu, w_b)
         self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-HALF, 0.0))
         before, here, after = (twice_integral_at(t + d, t_imu, f_b[:, 0])
@@ -148,7 +155,7 @@ class _Forces:
         self.push = (before - 2 * here + after) / HALF**2
 
 
-def _ratio(t, push, force, a, b):
+def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
     """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
     low = max(0, a - round((BEFORE + HALF) / STEP))
     high = min(len(t), b + 1, a + round(LONGEST / STEP))

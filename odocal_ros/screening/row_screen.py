@@ -1,10 +1,13 @@
 """Rows of one topic made usable: finite, beyond no sensor, stamps that rise, no single spikes."""
 
 from bisect import bisect_left
+from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.samples import take
+from odocal_ros.data.arrays import Bools, Floats, Ints
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import OdometerForm, Samples, take
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import (
     about_clumps,
@@ -14,6 +17,7 @@ from odocal_ros.screening.glitches import (
     SEVERAL,
     speed_glitches,
 )
+from odocal_ros.settings.config import Config
 
 LABEL = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
          'fix_velocity': 'fix velocity', 'heading': 'heading'}
@@ -21,7 +25,8 @@ NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': C
            'fix': Code.FIXES_UNUSABLE}
 
 
-def usable_rows(slot, leg, config, offset, found):
+def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
+                found: list[Reason]) -> tuple[Any, Floats]:
     """
     Return the rows of a topic that can be used, and their times from the start mark, s: (n,).
 
@@ -50,7 +55,7 @@ def usable_rows(slot, leg, config, offset, found):
     return clean, t
 
 
-def _spikes(slot, samples, t, form, config):
+def _spikes(slot: str, samples: Any, t: Floats, form: OdometerForm, config: Config) -> Bools:
     if slot == 'imu':
         return imu_glitches(t, samples.w_i, samples.f_i, config.imu)
     if slot in ('odometer', 'odometer_right') and form.quantity == 'rate':
@@ -58,13 +63,13 @@ def _spikes(slot, samples, t, form, config):
     return np.zeros(len(t), bool)
 
 
-def _where(samples, index, leg) -> str:
+def _where(samples: Samples, index: int, leg: Leg) -> str:
     """Say where a row is, in seconds from the start mark (by arrival where it has no stamp)."""
     stamp = samples.stamp_ns[index] if samples.stamp_ns[index] > 0 else samples.received_ns[index]
     return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
 
 
-def _finite(samples, slot, leg, found):
+def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
     """Tell which rows have a stamp and what a row needs, and which are beyond any sensor."""
     needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
     if slot in ('fix_velocity', 'heading'):
@@ -90,7 +95,8 @@ def _finite(samples, slot, leg, found):
     return good & ~suspect, wild
 
 
-def _damaged(wild, good, slot, found, most=np.inf):
+def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
+             most: float = np.inf) -> Bools:
     """Tell which rows are about clumps of wild ones, and say so: or of more than so many."""
     suspect = about_clumps(wild)
     if suspect.any() or wild.sum() > most:
@@ -101,7 +107,7 @@ def _damaged(wild, good, slot, found, most=np.inf):
     return suspect
 
 
-def _rising(samples, slot, leg, found):
+def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:
     """Return which rows to keep, the most whose stamps rise strictly; None for all."""
     stamp = samples.stamp_ns
     step = np.diff(stamp)
@@ -119,7 +125,7 @@ def _rising(samples, slot, leg, found):
     return keep
 
 
-def _longest_rising(stamp):
+def _longest_rising(stamp: Ints) -> Ints:
     """
     Return the indices of a longest strictly rising subsequence (patience sorting).
 

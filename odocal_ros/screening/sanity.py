@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
@@ -14,7 +15,7 @@ NOTHING = 0.01       # m/s^2, far below what gravity is in any unit
 TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up
 
 
-def imu_sanity(f_b, w_b, C_bi):
+def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats) -> tuple[tuple[Reason, ...], bool]:
     """
     Judge units and axes of an Imu.
 

@@ -6,10 +6,12 @@ start mark; the mark is an Imu stamp, so the Imu's time offset moves the others 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.gaps import gaps_in_rhythm
@@ -58,13 +60,13 @@ class Inputs:
     scale_unit: str
     felt: bool = True                  # False: f_b is made up, no accelerometer is there
 
-    def mirrored(self, spans) -> 'Inputs':
+    def mirrored(self, spans: Floats) -> 'Inputs':
         """Return them with what was counted in spans, (m, 2) s, counted the other way."""
         if not len(spans):
             return self
-        return replace(self, **{name: way and way.mirrored(spans) for name, way in (
-            ('travel', self.travel), ('travel_left', self.travel_left),
-            ('travel_right', self.travel_right))})
+        return replace(self, travel=self.travel.mirrored(spans),
+                       travel_left=self.travel_left and self.travel_left.mirrored(spans),
+                       travel_right=self.travel_right and self.travel_right.mirrored(spans))
 
 
 def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
@@ -85,7 +87,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     offset = _offsets(config)
     found += judge_clocks(leg, offset, LABEL)
 
-    def rows(slot):
+    def rows(slot: str) -> tuple[Any, Floats]:
         return usable_rows(slot, leg, config, offset[slot], found)
 
     imu, t_imu = rows('imu')
@@ -108,7 +110,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
-    if travelled.right is not None and not unfelt:
+    if travelled.left is not None and travelled.right is not None and not unfelt:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
     let_go(*vars(leg.imu).values())
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
@@ -132,7 +134,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     return inputs.mirrored(back), tuple(found)
 
 
-def _turned(vector_i, scale, C_bi):
+def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
     """Return scale * C_bi @ vector_i by row; a matrix product of (n, 3) costs 40 ns a row."""
     if np.array_equal(C_bi, np.eye(3)):
         return vector_i if scale == 1.0 else vector_i * scale
@@ -140,7 +142,7 @@ def _turned(vector_i, scale, C_bi):
     return np.stack([x * a + y * b + z * c for a, b, c in scale * C_bi], -1)
 
 
-def _offsets(config):
+def _offsets(config: Config) -> dict[str, float]:
     """Return what to add to each topic's times: the marks are Imu stamps, so the Imu's is 0."""
     imu = config.imu.time_offset
     wheel, gnss = config.odometer.time_offset - imu, config.gnss.time_offset - imu
@@ -154,7 +156,7 @@ def _offsets(config):
 
 
 
-def _gaps(slot, t, found):
+def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
     """Name the longest gap of odometer or fixes where it is far beyond their own rhythm."""
     gaps = gaps_in_rhythm(t)
     if len(gaps):
@@ -163,7 +165,7 @@ def _gaps(slot, t, found):
                             f't = {begin:.2f} s (median interval {np.median(np.diff(t)):.3f} s)'))
 
 
-def imu_gap(t_imu, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
+def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
     """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and t_stop."""
     t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]

@@ -6,10 +6,13 @@ Two wheels behind two drivers need not count alike: one sends 64 bits, the other
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats, Ints, Values
+from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.reasons import Code, Reason
 
 REACH = 7              # steps each side of the running median that tells the step a jump replaced
@@ -32,7 +35,7 @@ class Span:
     turns: NDArray[np.int64]     # (k,) +1 rolled over upwards, -1 downwards
 
 
-def hidden_span(value, step) -> Span | None:
+def hidden_span(value: Values, step: Floats) -> Span | None:
     """
     Return the span of a counter whose rollovers are not undone yet, None where it has none.
 
@@ -69,12 +72,12 @@ def hidden_span(value, step) -> Span | None:
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
 
 
-def _running_median(step):
+def _running_median(step: Floats) -> Floats:
     padded = np.pad(step, REACH, mode='edge')
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1), axis=-1)
 
 
-def _measured(value, rows, middle, slack):
+def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
     """Return a span that is no power of two, and its sigma: the roundest number that fits."""
     ends = np.stack([value[rows], value[rows + 1]]).astype(float)
     low = ends.max() - ends.min() + 1              # the counter was seen to take so many values
@@ -86,7 +89,8 @@ def _measured(value, rows, middle, slack):
     return float(round((low + high) / 2)), max(1.0, (high - low) / np.sqrt(12))
 
 
-def unrolled(t, samples, step, side):
+def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
+             side: str) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
     Return rows with hidden rollovers undone, what was found, and the doubt that is left.
 
@@ -111,7 +115,7 @@ def unrolled(t, samples, step, side):
     turns = np.zeros(len(t), np.int64)
     turns[span.rows + 1] = span.turns
     size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
-    value = samples.value + size * np.cumsum(turns)
+    value: NDArray[Any] = samples.value + size * np.cumsum(turns)
     times = len(span.rows)
     about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED.get(
         span.size, f'{span.size:.0f}')

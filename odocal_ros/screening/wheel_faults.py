@@ -7,9 +7,11 @@ them the mean of both wheels is no travel, and whatever rests on it is wrong.
 
 import numpy as np
 
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_pair import pair, robust_fit, runs, TUKEY
+from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, runs, TUKEY
 
 CELL = 0.5            # s
 STILL = 0.02          # of the other wheel's way: what still counts as not moving
@@ -22,7 +24,8 @@ BIAS = 0.02           # of the top speed: what a gyro bias times the track width
 SIDES = ('left', 'right')
 
 
-def broken_wheels(left, right, imu, between) -> tuple[Reason, ...]:
+def broken_wheels(left: Travel, right: Travel, imu: Imu,
+                  between: tuple[float, float]) -> tuple[Reason, ...]:
     """
     Return WHEEL_DEAD and WHEEL_REVERSED where one wheel fails, empty where both count.
 
@@ -68,7 +71,7 @@ def broken_wheels(left, right, imu, between) -> tuple[Reason, ...]:
                                                imu)
 
 
-def _line(A, y, floor):
+def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     Return what left wheel, turn and time make of the right wheel, and the covariance.
 
@@ -85,27 +88,28 @@ def _line(A, y, floor):
     return fits[int(np.argmin(left_over))][:2]
 
 
-def _floor(two, steps):
+def _floor(two: Pair, steps: Floats) -> float:
     return 0.3 * two.quantum + 1e-4 * float(np.median(np.abs(steps)))
 
 
-def _rolling(steps, quantum):
+def _rolling(steps: Floats, quantum: float) -> Bools:
     """Tell where each wheel rolls for certain: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
-    return np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
+    rolls: Bools = np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
+    return rolls
 
 
-def _held(two, steps, k):
+def _held(two: Pair, steps: Floats, k: int) -> Bools:
     """Tell in which cells wheel k stands, for HANG or longer, while the other one rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
-    still = two.known & (own <= STILL * other) & _rolling(steps, two.quantum)[1 - k]
+    still: Bools = two.known & (own <= STILL * other) & _rolling(steps, two.quantum)[1 - k]
     for a, b in runs(still):
         if (b - a) * CELL < HANG or other[a:b].sum() < COUNTS * two.quantum:
             still[a:b] = False
     return still
 
 
-def _not_pivoting(held, steps, A, x, k):
+def _not_pivoting(held: Bools, steps: Floats, A: Floats, x: Floats, k: int) -> Bools:
     """Return the cells in which the wheel should have rolled, not been turned about."""
     held = held.copy()
     ratio, turn_part = x[0], A[:, 1:] @ x[1:]
@@ -119,7 +123,7 @@ def _not_pivoting(held, steps, A, x, k):
     return held
 
 
-def _dead(two, steps, held):
+def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
     """Return WHEEL_DEAD with where, for the wheel that stands longer."""
     k = int(held[1].sum() > held[0].sum())
     spans = runs(held[k])
@@ -142,7 +146,8 @@ def _dead(two, steps, held):
                    f'{SIDES[1 - k]} one goes on by {lost:.6g}: the mean of both is no travel'),)
 
 
-def _reversed(two, steps, expected, ratio, variance, imu):
+def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,
+              imu: Imu) -> tuple[Reason, ...]:
     """Return WHEEL_REVERSED where the right wheel goes against what left wheel and gyro say."""
     if ratio < -SURE * np.sqrt(variance) and ratio < -0.1:
         k = _against_imu(two, steps, imu)
@@ -165,7 +170,7 @@ def _reversed(two, steps, expected, ratio, variance, imu):
                    f'first at t = {two.t[a]:.1f} s for {(b - a) * CELL:.1f} s'),)
 
 
-def _against_imu(two, steps, imu):
+def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
     """Return the wheel whose speed changes against the Imu's x axis, None where that is unsure."""
     t_imu, _, f_b = imu
     push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
@@ -176,7 +181,7 @@ def _against_imu(two, steps, imu):
     return None
 
 
-def _correlation(a, b):
+def _correlation(a: Floats, b: Floats) -> float:
     """Return the correlation of two series about zero, in sigmas of chance."""
     power = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / power * np.sqrt(len(a)) if power else 0.0

@@ -1,12 +1,16 @@
 """Two wheels and the gyro on one time grid, and the line that joins them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.nav.integral import integral_at, medians
+from odocal_ros.nav.odometer import Travel
 
+Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
 TUKEY = 4.685        # robust sigmas beyond which a row has no weight
 PASSES = 20
 GAP = 5.0            # median intervals: what lies within is not known
@@ -29,12 +33,14 @@ class Pair:
     quantum: float
 
     @property
-    def step(self):
+    def step(self) -> float:
         """Return the length of a cell, s."""
-        return self.t[1] - self.t[0]
+        length: float = self.t[1] - self.t[0]
+        return length
 
 
-def pair(left, right, imu, between, step, doubt_t=()) -> Pair | None:
+def pair(left: Travel, right: Travel, imu: Imu, between: tuple[float, float], step: float,
+         doubt_t: Sequence[float] | Floats = ()) -> Pair | None:
     """
     Return the wheels on a grid of ``step`` s, None where they share less than 20 cells.
 
@@ -61,7 +67,8 @@ def pair(left, right, imu, between, step, doubt_t=()) -> Pair | None:
                 max(left.quantum, right.quantum))
 
 
-def robust_fit(A, y, floor, prior=None, start=None):
+def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floats | None = None,
+               start: Sequence[float] | Floats | None = None) -> tuple[Floats, Floats, float]:
     """
     Return the coefficients of y = A x by least squares, rows far off left out by Tukey's weights.
 
@@ -101,7 +108,7 @@ def robust_fit(A, y, floor, prior=None, start=None):
     return x / size, np.linalg.inv(H) * sigma**2 / np.outer(size, size), sigma
 
 
-def runs(flags):
+def runs(flags: Bools) -> Ints:
     """Return begin and end of the runs of True: (k, 2), ends exclusive."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return edges.reshape(-1, 2)

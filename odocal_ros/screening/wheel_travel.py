@@ -1,15 +1,21 @@
 """Travel of one or two wheels: each counter mended by itself, then their mean."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.odometer import mean_travel, Travel, travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.late_rows import on_time
 from odocal_ros.screening.odometer_care import counter_steps, doubted, mended
 from odocal_ros.screening.wheel_counters import unrolled
+from odocal_ros.settings.config import Config
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +29,8 @@ class Wheels:
     doubt_sigma: NDArray[np.float64]    # (k,) scale units, how much
 
 
-def wheels(leg, config, rows, found) -> Wheels:
+def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
+           found: list[Reason]) -> Wheels:
     """
     Return the travel of the wheels of a leg.
 
@@ -56,7 +63,8 @@ def wheels(leg, config, rows, found) -> Wheels:
                   np.append(doubt_left, doubt_right) / 2)
 
 
-def _one(samples, t, form, config, found, side=''):
+def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
+         found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
     """Return a wheel's travel, and where and how much of it is in doubt."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     doubt_t = doubt = np.empty(0)
@@ -72,11 +80,11 @@ def _one(samples, t, form, config, found, side=''):
     return way, np.append(doubt_t, more_t), np.append(doubt, more)
 
 
-def _kind(form):
+def _kind(form: OdometerForm) -> tuple[str, str]:
     return form.quantity, form.scale_unit
 
 
-def _words(form):
+def _words(form: OdometerForm) -> str:
     """Return what values a form means, for people."""
     what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
     return f'{what[form.quantity]} ({form.scale_unit})'

@@ -7,8 +7,13 @@ made from these dataclasses. A setting's name is ``group.field``, as its ROS par
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
-from odocal_ros.settings.setting import setting, settings_of, with_settings  # noqa: F401  its other half
+from odocal_ros.settings.setting import (
+    setting,
+    settings_of as settings_of,  # for others too: they are its other half
+    with_settings as with_settings,
+)
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
@@ -260,13 +265,13 @@ class Config:
 SETTINGS = settings_of(Config)
 
 
-def value_of(config: Config, name: str):
+def value_of(config: Config, name: str) -> Any:
     """Return the value of a setting by its dotted name."""
     for part in name.split('.'):
         config = getattr(config, part)
     return config
 
 
-def flat(config: Config) -> dict:
+def flat(config: Config) -> dict[str, Any]:
     """Return every setting by its dotted name."""
     return {name: value_of(config, name) for name in SETTINGS}

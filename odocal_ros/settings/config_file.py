@@ -6,13 +6,16 @@ and taken in file order as rcl does it, and plain scalars are typed by rcl's rul
 those of YAML 1.1 (``1e-3`` is a number, ``1_000`` is text).
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 import re
+from typing import Any
 
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.outside.limits import read_text
 from odocal_ros.outside.yaml_tree import composed
-from odocal_ros.settings.config import Config, SETTINGS, with_settings
+from odocal_ros.settings.config import Config, SETTINGS
+from odocal_ros.settings.setting import with_settings
 
 NODE = '/calibrator'
 PARAMETERS = 'ros__parameters'
@@ -23,6 +26,7 @@ TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
 LONGEST = 100        # characters of a number
+Node = Any           # of PyYAML
 DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
 
@@ -42,7 +46,7 @@ def read_config_file(path: Path) -> dict[str, object]:
     return _settings(Path(path), _root(Path(path)))
 
 
-def _root(path: Path):
+def _root(path: Path) -> Node:
     """Return the root node of a parameter file."""
     try:
         return composed(read_text(path), str(path))
@@ -52,7 +56,7 @@ def _root(path: Path):
         raise BadConfig(f'{path}: not a text file; want a ROS parameter file (YAML)') from None
 
 
-def _settings(path: Path, root) -> dict[str, object]:
+def _settings(path: Path, root: Node) -> dict[str, object]:
     blocks = _blocks(root, '')
     ours = [block for key, block in blocks.items() if _means_us(key)]
     if not ours:
@@ -101,15 +105,15 @@ def parse_set(text: str) -> tuple[str, object]:
     return name, _checked(name, '' if node is None else _value(node), where)
 
 
-def _is_quoted(node):
+def _is_quoted(node: Node) -> bool:
     return node is not None and getattr(node, 'style', None) in ('"', "'")
 
 
-def _line(node):
-    return node.start_mark.line + 1
+def _line(node: Node) -> int:
+    return int(node.start_mark.line) + 1
 
 
-def _pairs(node):
+def _pairs(node: Node) -> list[tuple[str, Node]]:
     """Return the (key text, value node) pairs of a mapping, none of anything else."""
     import yaml
     if not isinstance(node, yaml.MappingNode):
@@ -117,13 +121,13 @@ def _pairs(node):
     return [(key.value, value) for key, value in node.value]
 
 
-def _blocks(node, prefix) -> dict[str, list]:
+def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
     """
     Return the parameter mappings by node key; namespaces may be nested.
 
     A key that comes again joins the block of its first appearance, as in rcl.
     """
-    found: dict[str, list] = {}
+    found: dict[str, list[Node]] = {}
     for key, value in _pairs(node):
         if key == PARAMETERS and prefix:
             found.setdefault(prefix, []).append(value)
@@ -143,7 +147,7 @@ def _means_us(key: str) -> bool:
     return re.fullmatch(pattern, NODE) is not None
 
 
-def _leaves(node, prefix):
+def _leaves(node: Node, prefix: str) -> Iterator[tuple[str, Node]]:
     """Yield (dotted name, value node) of nested and dotted keys alike."""
     import yaml
     for key, value in _pairs(node):
@@ -154,7 +158,7 @@ def _leaves(node, prefix):
             yield name, value
 
 
-def _value(node):
+def _value(node: Node) -> Any:
     import yaml
     if isinstance(node, yaml.ScalarNode):
         return node.value if _is_quoted(node) or node.style in ('|', '>') else scalar(node.value)
@@ -180,7 +184,7 @@ def scalar(text: str) -> bool | int | float | str:
         return text
 
 
-def _checked(name, value, where):
+def _checked(name: str, value: object, where: str) -> Any:
     try:
         with_settings(Config(), {name: value})
     except BadConfig as error:

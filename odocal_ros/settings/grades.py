@@ -1,8 +1,11 @@
 """IMU grades: what the sensors' errors are taken to be, 1 sigma, in SI."""
 
+from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass
 import math
+
+from odocal_ros.settings.config import ImuConfig
 
 G = 9.80665          # m/s^2
 
@@ -28,9 +31,10 @@ class Grade:
         return math.hypot(self.accel_bias, math.sqrt(2) * G * self.misalignment)
 
 
-def _from_data_sheet(gyro_noise, gyro_bias, gyro_bias_walk, accel_noise, accel_bias,
-                     accel_bias_walk, gyro_scale_error, accel_scale_error,
-                     misalignment, gyro_by_force) -> Grade:
+def _from_data_sheet(gyro_noise: float, gyro_bias: float, gyro_bias_walk: float,
+                     accel_noise: float, accel_bias: float, accel_bias_walk: float,
+                     gyro_scale_error: float, accel_scale_error: float, misalignment: float,
+                     gyro_by_force: float) -> Grade:
     """
     Take the units of data sheets.
 
@@ -70,7 +74,7 @@ SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
             'gyro_by_force': 'gyro_by_force_sigma'}     # named otherwise than the figure
 
 
-def grade_as_seen(imu, variance) -> Grade:
+def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
     """
     Return the grade of the imu settings, or a worse one that its noise at rest is nearer to.
 
@@ -87,7 +91,7 @@ def grade_as_seen(imu, variance) -> Grade:
         for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))))
 
 
-def grade_of(imu) -> Grade:
+def grade_of(imu: ImuConfig) -> Grade:
     """Return the grade of the imu settings with its single figures replaced where given."""
     grade = GRADES[imu.grade]
     names = [f.name for f in dataclasses.fields(Grade)]

@@ -1,15 +1,17 @@
 """The scale that the settings give, before anything is driven."""
 
-import numpy as np
+from math import tau
+
+from odocal_ros.settings.config import Config
 
 
-def nominal_scale(config, unit) -> float:
+def nominal_scale(config: Config, unit: str) -> float:
     """Return K0: as configured, from the wheel's size, or 1 for speeds; 0 unknown."""
     if config.odometer.nominal_scale:
         return config.odometer.nominal_scale
     wheels = config.wheels
     if unit == 'm/pulse' and wheels.radius and wheels.pulses_per_revolution:
-        return 2 * np.pi * wheels.radius / wheels.pulses_per_revolution
+        return tau * wheels.radius / wheels.pulses_per_revolution
     if unit == 'm/rad' and wheels.radius:
         return wheels.radius
     return 1.0 if unit == '1' else 0.0

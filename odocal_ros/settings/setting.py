@@ -1,21 +1,31 @@
 """One setting: how it is declared in a dataclass, and how a value for it is checked."""
 
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, Field, field, fields, is_dataclass, replace
 import difflib
 from functools import cache
 import math
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from odocal_ros.errors import BadConfig
 from odocal_ros.outside.names import is_frame, one_line
 
 LARGEST = 1e9      # no setting in SI units means a number beyond it; sums with it stay finite
-AnyConfig = TypeVar('AnyConfig', bound=Any)     # a dataclass of settings and groups of them
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
 
-def setting(default, unit='', low=None, high=None, about='', choices=(), ro=False,
-            frame=False) -> Any:
+class Settings(Protocol):
+    """A dataclass of settings and groups of them."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+AnyConfig = TypeVar('AnyConfig', bound=Settings)
+
+
+def setting(default: object, unit: str = '', low: float | None = None, high: float | None = None,
+            about: str = '', choices: Sequence[str] = (), ro: bool = False,
+            frame: bool = False) -> Any:
     """
     Declare a setting; NaN passes where the default is NaN.
 
@@ -35,7 +45,7 @@ class Setting:
     unit: str
     low: float | None
     high: float | None
-    choices: tuple
+    choices: Sequence[str]
     about: str
     read_only: bool
     frame: bool
@@ -47,7 +57,7 @@ class Setting:
             return type(self.default).__name__
         return 'strs' if self.choices else 'floats'
 
-    def checked(self, value):
+    def checked(self, value: Any) -> Any:
         """Return value as this setting's type, or raise BadConfig with what it wants."""
         if isinstance(self.default, tuple):
             if isinstance(value, str) or not hasattr(value, '__len__'):
@@ -59,16 +69,16 @@ class Setting:
             return items
         return self._one(value, type(self.default))
 
-    def _one(self, value, kind):
+    def _one(self, value: Any, kind: type[Any]) -> Any:
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not kind:
             raise BadConfig(f'{self.name}: {value!r} is not {TYPES[kind]}')
         if self.choices and value not in self.choices:
             raise BadConfig(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
-        if kind is str:
+        if isinstance(value, str):
             self._check_text(value)
-        if kind in (int, float):
+        if isinstance(value, (int, float)) and kind is not bool:
             unset = kind is float and math.isnan(value)
             if unset and not (isinstance(self.default, float) and math.isnan(self.default)):
                 raise BadConfig(f'{self.name}: NaN is not a value')
@@ -83,7 +93,7 @@ class Setting:
                                 f'{unit}'.rstrip())
         return value
 
-    def _check_text(self, value):
+    def _check_text(self, value: str) -> None:
         """Refuse what no name is: it would stand in files and on terminals."""
         if one_line(value) != value:
             raise BadConfig(f"{self.name}: '{one_line(value)}' has characters that cannot be seen")
@@ -93,9 +103,9 @@ class Setting:
                             '_ . / -, no / at its beginning')
 
 
-def _settings(owner, prefix=''):
+def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
     for f in fields(owner):
-        if is_dataclass(f.default):
+        if is_dataclass(f.default) and not isinstance(f.default, type):
             yield from _settings(f.default, f'{prefix}{f.name}.')
         else:
             m = f.metadata
@@ -109,7 +119,7 @@ def settings_of(kind: type) -> dict[str, Setting]:
     return {s.name: s for s in _settings(kind())}
 
 
-def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
+def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     """
     Return config with settings changed by dotted name, each checked.
 
@@ -119,7 +129,7 @@ def with_settings(config: AnyConfig, changes: dict) -> AnyConfig:
         Unknown name (the nearest ones are told), wrong type, out of range.
 
     """
-    groups: dict[str, dict] = {}
+    groups: dict[str, dict[str, Any]] = {}
     settings = settings_of(type(config))
     for name, value in changes.items():
         if name not in settings:

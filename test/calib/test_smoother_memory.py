@@ -7,6 +7,7 @@ from smoother_legs import made
 
 from odocal_ros.calib.smoother.chain import solve
 from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
 
@@ -26,7 +27,7 @@ def peak_of_a_pass(duration):
     weighted.after(solved)
     near = solved.neighbours()
     weighted.components(near)
-    weighted['motion'].road_noise(near)
+    weighted[MotionRows].road_noise(near)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return len(state.t), peak

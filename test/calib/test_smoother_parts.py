@@ -10,7 +10,7 @@ from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slow_error import SPREAD, USUAL
+from odocal_ros.calib.smoother.slow_error import SlowError, SPREAD, USUAL
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
@@ -189,7 +189,7 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
         state = state.moved(solved.step, solved.step_border)
     sums = problem.sums(state)
     weighted, solved, _ = at(levels)
-    quadratic, expected = weighted['slow'].components(solved.neighbours())[name]
+    quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
     score = (quadratic - expected) / 2
     if name == 'correlation_time':      # a score as it is, and what is believed of the time
         score = quadratic - expected + np.log(20.0 / USUAL) / SPREAD**2

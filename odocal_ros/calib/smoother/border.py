@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.calib.border import Border
+from odocal_ros.calib.smoother.priors import PriorRows
 from odocal_ros.calib.smoother.state import CONSTANTS
 
 
@@ -15,7 +16,7 @@ def border_of(fit, configured) -> Border:
 
     configured : (M,) values of the settings that constants are corrections to.
     """
-    at, priors = fit.weighted.state.constants, fit.weighted['priors'].priors
+    at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     weight = 1 / priors.constants**2
     return Border(
         CONSTANTS, at + configured, fit.solved.reduced - np.diag(weight),

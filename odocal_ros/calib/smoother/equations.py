@@ -4,6 +4,8 @@ The least squares of a leg at one state: the parts, their normal equations, cost
 A sensor, or a belief, that is to be heard is one more class here (``part.Part``).
 """
 
+from typing import TypeVar
+
 from odocal_ros.calib.smoother.chain import Normal
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.heading import HeadingRows
@@ -18,6 +20,7 @@ from odocal_ros.calib.smoother.state import BARE, M, WITH_SLOW
 from odocal_ros.calib.smoother.travel_error import TravelError
 from odocal_ros.calib.smoother.velocity import VelocityRows
 
+SomePart = TypeVar('SomePart', bound=Part)
 PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
                                  TravelError, SlowError, Rests, PriorRows)
 
@@ -49,8 +52,8 @@ class Weighted:
         self.parts = {name: part.weighed(levels) for name, part in equations.parts.items()
                       if part.in_use(levels)}
 
-    def __getitem__(self, name) -> Part:
-        return self.parts[name]
+    def __getitem__(self, kind: type[SomePart]) -> SomePart:
+        return next(part for part in self.parts.values() if isinstance(part, kind))
 
     def normal(self) -> Normal:
         """Return the normal equations of the step."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
+from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import (
@@ -54,38 +55,50 @@ SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there o
 KNOWN = 0.5          # of the prior's variance: what is left where the data know as much
 
 
-@dataclass(eq=False)
-class Fit:
-    """Where the iteration ended."""
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """What a fit can set out from."""
 
     state: State
     levels: Levels
     priors: Priors           # as the data left them
     first: Priors            # as they were before any gave way
     spread: np.ndarray       # (K, 3) factors on the odometer's variances: slips
-    weighted: Weighted       # both None in an outline
-    solved: Solved
+
+
+@dataclass(frozen=True, eq=False)
+class Outline(WarmStart):
+    """Where the iteration ended, without the equations: they are large."""
+
     settled: bool
     creeping: bool           # near enough, but its noise levels still move
     iterations: int
-    likelihood: float = np.nan   # restricted, its logarithm but for a constant
+    likelihood: float        # restricted, its logarithm but for a constant; NaN: not iterated
 
-    def __post_init__(self):
-        for large in (self.weighted, self.solved):
-            if large is not None:
-                large.forget()
 
-    def outline(self) -> 'Fit':
-        """Return what another fit can set out from, without the equations: they are large."""
-        return replace(self, weighted=None, solved=None)
+@dataclass(frozen=True, eq=False)
+class Fit(Outline):
+    """Where the iteration ended."""
+
+    weighted: Weighted
+    solved: Solved
+
+    def __post_init__(self) -> None:
+        self.weighted.forget()
+        self.solved.forget()
+
+    def outline(self) -> Outline:
+        """Return all but the equations, which can go where nobody else holds them."""
+        return Outline(self.state, self.levels, self.priors, self.first, self.spread,
+                       self.settled, self.creeping, self.iterations, self.likelihood)
 
     def neighbours(self) -> Neighbours:
         """Return the covariances of neighbours; not kept, for they are large."""
         return solve(self.weighted.normal()).neighbours()
 
 
-def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=False, about=None,
-        trace=None) -> Fit:
+def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=False,
+        about: WarmStart | None = None, trace=None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
 
@@ -97,8 +110,8 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         Iterations.
     frozen : bool
         Leave the noise levels alone.
-    about : Fit, optional
-        An earlier fit whose slips and beliefs are taken over.
+    about : WarmStart, optional
+        Of an earlier fit, whose slips and beliefs are taken over.
     trace : callable, optional
         Called with each pass, for benchmarks.
 
@@ -107,9 +120,11 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
     was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, 3))
-    tails, pace, slipping = 1 if about else FIRST_TAILS, {}, False
-    for count in range(1, most + 1):
-        sums = weighted = solved = None     # of the pass before: the most that a long leg takes
+    tails, slipping = 1 if about else FIRST_TAILS, False
+    pace: dict[str, tuple[float, float]] = {}
+    count = 0
+    while True:
+        count += 1
         sums = problem.sums_near(state)
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
@@ -125,7 +140,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved)
-        if settled or count == most:
+        if settled or count >= most:
             still = np.abs(solved.step_border / sigma)[:3].max()
             settled = settled or bool(max(still, change) < NEARLY)
             break
@@ -139,11 +154,12 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
             spread = found
             if tail:
                 priors = beliefs(first, priors, state, solved, near, fitted)
-            near = None
+            del near
+        del sums, weighted, solved      # the most that a long leg takes
     creeping = not settled and bool(still < CREEPS and change < CREEPS)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
-    return Fit(state, levels, priors, first, spread, weighted, solved, settled or creeping,
-               creeping, count, likelihood)
+    return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
+               likelihood, weighted, solved)
 
 
 def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Levels:
@@ -172,7 +188,7 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
 
 def slips(weighted, neighbours, spread):
     """Return factors on the odometer's variances where an interval lies far out: (K, 3)."""
-    noise, found = weighted['motion'].road_noise(neighbours)
+    noise, found = weighted[MotionRows].road_noise(neighbours)
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro

@@ -136,6 +136,8 @@ def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
     about = judge_running(now, problem.grade)
     if about is now:
         return now
-    now = about = about.outline()
-    last = fit(problem, now.state, now.levels, FEW, about=about, frozen=True, trace=trace)
-    return replace(last, iterations=now.iterations + last.iterations)
+    outline = about.outline()
+    del now, about      # the equations of one fit at a time
+    last = fit(problem, outline.state, outline.levels, FEW, about=outline, frozen=True,
+               trace=trace)
+    return replace(last, iterations=outline.iterations + last.iterations)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
@@ -40,7 +41,7 @@ def mismatch(problem, fit, config):
     widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
     if shaken > WORSE:      # what shakes a vehicle is not white, and its colour is not known
         odd.append(BY_SHAKING)
-    share = float((fit.weighted['fixes'].weight[:, 0] < 0.5).mean())
+    share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
     share = float((fit.spread[:, 0] > 1.5).mean())

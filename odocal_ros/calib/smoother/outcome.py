@@ -6,8 +6,10 @@ from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
+from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
+from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.remarks import beside, FLOOR, level_pitch, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
@@ -206,7 +208,7 @@ def _undetermined(sigma, limit, config, yaw):
 
 
 def _details(leg, problem, fit, sources, ratio, widen, sigma):
-    state, motion, fixes = fit.state, fit.weighted['motion'].motion, fit.weighted['fixes']
+    state, motion, fixes = fit.state, fit.weighted[MotionRows].motion, fit.weighted[Fixes]
     K = state.scale
     arm = state.C_bv @ motion.arm_v
     step = max(1, len(state.t) // TRACK_ROWS)
@@ -242,7 +244,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
 
 def _normalised(weighted):
     """Return how the rows of each sensor lie in their sigmas, before weights take off tails."""
-    motion, fixes = weighted['motion'].r, weighted['fixes']
+    motion, fixes = weighted[MotionRows].r, weighted[Fixes]
     white = fixes.r / np.sqrt(fixes.weight / fixes.thin)
     return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
                    'beyond_3_sigma': float((np.abs(r) > 3).mean())}
@@ -254,7 +256,8 @@ def _outside(leg, problem, fit, sigma):
     """Return what the drive says of velocity and heading from outside."""
     out = {}
     for name in problem.outside:
-        out[name] = {'messages': len(fit.weighted[name].k), 'alike': problem.thin.get(name, 1.0)}
+        out[name] = {'messages': len(fit.weighted.parts[name].k),
+                     'alike': problem.thin.get(name, 1.0)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
                            'error': float(fit.state.constants[HEADING]),

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
 
@@ -51,6 +52,9 @@ class Part:
     """
 
     name: ClassVar[str]
+    state: State
+    levels: Levels           # weighed: by these,
+    n: int                   # of so many unknowns of a keyframe
     log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
 
     @classmethod
@@ -113,13 +117,18 @@ class Part:
 class Total:
     """A sum of rows that come by parts, to the last bit as if all were there at once."""
 
-    sum: np.ndarray | None = None
+    _sum: np.ndarray | None = None
+
+    @property
+    def sum(self) -> np.ndarray:
+        """Return the sum of the rows so far; before the first it has no shape."""
+        return np.zeros(()) if self._sum is None else self._sum
 
     def add(self, rows):
         """Add rows: numpy adds them one after the other."""
-        if self.sum is not None:
-            rows = np.concatenate([self.sum[None], rows])
-        self.sum = rows.sum(axis=0)
+        if self._sum is not None:
+            rows = np.concatenate([self._sum[None], rows])
+        self._sum = rows.sum(axis=0)
 
 
 def hold(out, k, columns, variance, residual, weight=1.0):

@@ -132,9 +132,8 @@ class PointRows(Part):
             out.border[present + 1, SLOW] += np.swapaxes(X[:, n:], 1, 2)
             out.diagonal[present + 1, SLOW, SLOW] += np.swapaxes(B, 1, 2) @ B
             out.g[present + 1, SLOW] -= (np.swapaxes(B, 1, 2) @ r)[:, :, 0]
-        if corner.sum is not None:
-            out.corner += corner.sum
-            out.g_border += g_border.sum
+        out.corner += corner.sum
+        out.g_border += g_border.sum
 
     def _intervals(self):
         """

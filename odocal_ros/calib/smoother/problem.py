@@ -96,12 +96,14 @@ class Problem:
     def sums_near(self, state: State) -> 'Sums':
         """Return the last sums where they were made near a state, else those about it."""
         kept = self.kept
-        if kept is None or not kept.hold_at(state):
-            alike = kept is not None and kept.derived_at.hold_at(state, LIKE)
-            derived = kept.derived_at if alike else None
-            kept = self.kept = None        # two at a time are as much as all else
-            self.kept = self.sums(state, derived)
-        return self.kept
+        if kept is not None and kept.hold_at(state):
+            return kept
+        derived = None if kept is None else kept.derived_at
+        if derived is not None and not derived.hold_at(state, LIKE):
+            derived = None
+        kept = self.kept = None        # two at a time are as much as all else
+        self.kept = made = self.sums(state, derived)
+        return made
 
     def sums(self, state: State, derived: 'Sums | None' = None) -> 'Sums':
         """Return the preintegrated sums about a state; ``derived``: some with its derivatives."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import imperfect_sigmas
 from odocal_ros.calib.smoother.state import (
     ACCEL,
@@ -107,7 +108,7 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
 
 def _varies(fit, sigma):
     """Say where the scale is not one number through the leg."""
-    motion, c = fit.weighted['motion'].motion, fit.state.constants
+    motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
     for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from slow to fast'),
                           (BY_TIME, motion.from_mean[:, 1], 'from begin to end')):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.reasons import Code, Reason
 
 FAR_OUT = 1.5           # factor on the variance of an interval from which it is a slip
@@ -27,7 +28,7 @@ class Slip:
 
 def along(fit, neighbours):
     """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
-    rows = fit.weighted['motion']
+    rows = fit.weighted[MotionRows]
     estimate, _ = rows.road_noise(neighbours)
     return -estimate[:, 0] * rows.along_size()
 

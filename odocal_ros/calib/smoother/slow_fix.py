@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.estimate import Fit, fit, Outline
+from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.slow_error import USUAL
 
 BIN = 2.0                      # s over which residuals are averaged
@@ -48,7 +49,7 @@ def are_slow(problem, first: Fit) -> bool:
     if first.levels['fix'] < SMOOTHED**2:
         return True
     t = problem.leg.t_fix[problem.use]
-    alike, sigma = correlation(t, first.weighted['fixes'].r[:, :2])
+    alike, sigma = correlation(t, first.weighted[Fixes].r[:, :2])
     return alike > max(ALIKE, SURE * sigma) or _hidden(t, first.levels['fix'])
 
 
@@ -65,7 +66,7 @@ def _hidden(t, level) -> bool:
     return t[-1] - t[0] < TOLD and level < 1 - SURE / np.sqrt(len(t))
 
 
-def with_slow_errors(problem, first: Fit, trace=None) -> Fit:
+def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
     """
     Return the fit with slow fix errors beside the white ones.
 
@@ -73,7 +74,7 @@ def with_slow_errors(problem, first: Fit, trace=None) -> Fit:
     ----------
     problem : Problem
         The leg.
-    first : Fit
+    first : Outline
         A first, rough fit with white fix errors.
     trace : callable, optional
         As for ``fit``.

@@ -80,7 +80,7 @@ def likeliest_fit(problem, config, trace=None):
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
         fits.append(fit(problem, one.state, levels, ROUGH, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.thin = {name: alike(best.weighted[name])
+    problem.thin = {name: alike(best.weighted.parts[name])
                     for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
     slow, best, fits = are_slow(problem, best), best.outline(), []
     if slow:

@@ -34,12 +34,14 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
-    now = now.outline()
-    about = replace(now, **{name: _held(getattr(now, name), known, EXACT * coarse.step)
-                            for name in ('priors', 'first')})
-    last = fit(problem, replace(now.state, constants=constants), now.levels, FEW, about=about,
+    outline = now.outline()
+    del now             # the equations of one fit at a time
+    sure = EXACT * coarse.step
+    about = replace(outline, priors=_held(outline.priors, known, sure),
+                    first=_held(outline.first, known, sure))
+    last = fit(problem, replace(about.state, constants=constants), about.levels, FEW, about=about,
                frozen=True, trace=trace)
-    return replace(last, iterations=now.iterations + last.iterations)
+    return replace(last, iterations=about.iterations + last.iterations)
 
 
 def _held(priors, value, sigma):

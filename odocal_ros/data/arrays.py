@@ -1,0 +1,13 @@
+"""Names of array types; shapes and units stand with each array."""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Values = NDArray[np.int64] | NDArray[np.float64]     # of an odometer, as sent
+FloatOrFloats = TypeVar('FloatOrFloats', float, Floats)
