@@ -55,7 +55,8 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
         return [calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)]
     if len(good) == 1 and good[0].start_ns == leg.start_ns and good[0].stop_ns == leg.stop_ns:
         return good      # the gap lay before the mark
-    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good)))) for one in good]
+    return [replace(one, reasons=(*one.reasons, _cut(leg, one, len(good))),
+                    cut_from_ns=leg.start_ns) for one in good]
 
 
 def _cut(leg, one, count) -> Reason:

@@ -109,6 +109,12 @@ class LegResult:
     C_bi: NDArray | None = None               # (3, 3) nominal rotation used, imu frame to b
     deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
     evidence: Evidence | None = None          # what a report draws, None where no track was fit
+    cut_from_ns: int | None = None            # start mark of the leg that it is a part of
+
+    @property
+    def driven_ns(self) -> int:
+        """Return when it was driven: of parts of a leg the same, no scale walks between them."""
+        return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
     @property
     def verdict(self) -> Verdict:
