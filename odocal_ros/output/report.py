@@ -158,7 +158,9 @@ def _drawn(calibration):
                 figures[number] = drawn
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
-    return legs, together, [number for number, _ in shown if number not in figures]
+    # one whose tracks were let go had some too
+    had = [number for number, leg in numbered if leg.evidence is not None or leg.before is not None]
+    return legs, together, [number for number in had if number not in figures]
 
 
 def _leg(number, leg: LegResult, figures, several):
