@@ -117,10 +117,12 @@ def _spread(legs, spread, name, target) -> float:
     Return the sigma of a constant between legs at which they differ in it as much as they may.
 
     target : the disagreement that is left where the constant is each leg's own, and one for each
-    leg but one (Paule and Mandel 1982).
+    leg but one (Paule and Mandel 1982). No more than was believed of it: what is known to 1 %
+    does not differ by 4 %, and legs told of it without that say what their noise wants.
     """
     i = legs.names.index(name)
     high = WIDE * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
+    high = min(high, float(legs.used[i]))
     low = high * 1e-12
     for _ in range(STEPS):
         middle = float(np.sqrt(low * high))

@@ -183,13 +183,27 @@ def test_the_leg_and_the_constant_that_differ_are_named():
     small = Toy(rng, states=6, rows=40)
     constants = np.tile(TRUTH, (LEGS, 1))
     constants[3, 4] += 5.0
-    found = of(small.draw(rng, constants).borders())
+    borders = small.draw(rng, constants).borders()
+    # the belief of that leg has given way, as it does where data gainsay it
+    borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
+    found = of(borders)
     assert list(found.spread) == ['z3']
     assert np.argmax(np.abs(found.deviation[:, 4])) == 3
     # one of five off by 5: scattering by 5 / sqrt(5), the mean off by 1
     assert found.spread['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
     assert abs(found.value[4] - TRUTH[4]) < 2 * np.sqrt(found.covariance[4, 4])
     assert np.abs((found.value - TRUTH) / np.sqrt(np.diag(found.covariance))).max() < 3.5
+
+
+def test_no_constant_differs_between_legs_by_more_than_was_believed_of_it():
+    rng = np.random.default_rng(3)
+    small = Toy(rng, states=6, rows=40)
+    constants = np.tile(TRUTH, (LEGS, 1))
+    constants[3, 4] += 5.0
+    found = of(small.draw(rng, constants).borders())
+    assert found.spread == {'z3': PRIOR[4]}
+    # what that does not explain widens all
+    assert found.factor > 1.2
 
 
 def test_what_no_constant_explains_widens_all():
