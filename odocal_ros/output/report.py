@@ -159,7 +159,8 @@ def _drawn(calibration):
     legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
             for number, leg in numbered]
     # one whose tracks were let go had some too
-    had = [number for number, leg in numbered if leg.evidence is not None or leg.before is not None]
+    had = [number for number, leg in numbered if leg.evidence is not None
+           or leg.before is not None]
     return legs, together, [number for number in had if number not in figures]
 
 
