@@ -10,7 +10,7 @@ HIDDEN = 0.25       # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
-def delay_notes(run, seen) -> list[Reason]:
+def delay_notes(run, seen, scale) -> list[Reason]:
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
@@ -20,9 +20,11 @@ def delay_notes(run, seen) -> list[Reason]:
         Prepared.
     seen : dict
         'gnss' or 'odometer' -> by how many s its stamps are late, with what is set, and sigma.
+    scale : float
+        As the method that saw them found it.
 
     """
-    speed = _speed(run)
+    speed = _speed(run) * scale
     notes = []
     for name, (late, sigma) in seen.items():
         way = abs(late) * speed
@@ -38,16 +40,16 @@ def delay_notes(run, seen) -> list[Reason]:
     return notes
 
 
-def note_delays(run, seen) -> None:
+def note_delays(run, seen, scale) -> None:
     """Put the notes among the leg's reasons, in place of those of a method before."""
     run.reasons = [r for r in run.reasons if r.code is not Code.DELAY_SEEN]
-    run.reasons += delay_notes(run, seen)
+    run.reasons += delay_notes(run, seen, scale)
 
 
 def _speed(run) -> float:
-    """Return the speed driven, m/s: nine tenths of the leg are slower."""
+    """Return the speed driven, scale units per s: nine tenths of the leg are slower."""
     travel = run.inputs.travel
     grid = np.arange(max(0.0, travel.t[0]), min(run.inputs.t_stop, travel.t[-1]), 1.0)
     if len(grid) < 2:
         return 0.0
-    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90)) * run.rough
+    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90))

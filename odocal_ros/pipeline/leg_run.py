@@ -34,6 +34,7 @@ ALIGNED = ('two_point', 'wheels')
 EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
+BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres
 AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
 WORTH = 0.05            # relative sigma up to which a scale gives the distance
 # of the time that methods take, and of the tracks after them
@@ -59,7 +60,8 @@ def _way_of(t_fix, geodetic):
     """Return the way by the fixes, m: what is known of a leg that is refused."""
     if not len(t_fix):
         return 0.0
-    return way_and_chord(origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic)))[0]
+    fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
+    return way_and_chord(t_fix, fixes_n)[0]
 
 
 class LegRun:
@@ -88,6 +90,7 @@ class LegRun:
         self.nominal = nominal_scale(config, inputs.scale_unit)
         self.rough = rough_scale(inputs.travel, inputs.t_fix, self.fixes_n,
                                  self.fix_sigma) or self.nominal
+        self.metres_per_unit = self.rough       # until a method knows it better
         self.alignment, self.about_alignment, self.of_ends = alignment, (), ()
         self.facing = None
         self.lever_b = np.subtract(config.gnss.lever_arm, config.odometer.lever_arm)
@@ -116,15 +119,14 @@ class LegRun:
         if scale is None or paths.get(scale.method) is None:
             return leg_result(self.leg, self.inputs, self.reasons, methods,
                               distance=self.distance, deciding=deciding(self.config.method))
-        distance = self.distance
         if scale.value and scale.sigma < WORTH * scale.value:        # truer than the rough scale
-            distance *= scale.value / self.rough
+            self._judge_by(scale.value)
         shown = tracks(self, paths[scale.method])
         methods = {name: m if path is None else replace(
             m, details=m.details | check_of(self, path.after))
             for (name, m), path in zip(methods.items(), paths.values(), strict=True)}
-        return leg_result(self.leg, self.inputs, self.reasons, methods, distance=distance,
-                          deciding=deciding(self.config.method), **shown)
+        return leg_result(self.leg, self.inputs, self.reasons, methods,
+                          distance=self.distance, deciding=deciding(self.config.method), **shown)
 
     def passed(self, passes: int) -> None:
         """Tell that a method has made so many passes of as many as it takes."""
@@ -241,6 +243,13 @@ class LegRun:
         self.reasons += [r for r in found if r not in self.of_ends]
         if self.holdout:
             self.t_fit = self._four_fifths()
+
+    def _judge_by(self, scale):
+        """Judge way and speed by a scale that is known better than the rough one."""
+        self.metres_per_unit = scale
+        self.distance, found = judge_drive(self.track, self.inputs.t_stop, scale, self.config.leg)
+        self.reasons = [r for r in self.reasons if r.code not in BY_SCALE] + [
+            r for r in found if r.code in BY_SCALE]
 
     def _faults(self):
         """Say what is wrong with two wheels beside each other; return where one slipped."""

@@ -39,7 +39,7 @@ def smoother(run):
         return method, None
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
     note_delays(run, {name: (e.value, e.sigma) for name, e in delays.items()
-                      if e.value is not None})
+                      if e.value is not None}, method.estimates['scale_factor'].value)
     # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
     late = {name: e.value or 0.0 for name, e in delays.items()}
     travel = run.inputs.travel

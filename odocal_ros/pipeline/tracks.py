@@ -115,4 +115,4 @@ def _checked(run, path, start):
 
 def driven(run):
     """Return times of the track, s, and the way driven until then, m."""
-    return run.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s)))) * run.rough
+    return run.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s)))) * run.metres_per_unit

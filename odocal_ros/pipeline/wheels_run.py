@@ -48,7 +48,8 @@ def wheels(run):
     # the methods that follow hold them too
     run.wheel_slips = with_unseen(run.wheel_slips, method.details['slips'])
     note_delays(run, {'gnss': (method.details['fix_latency_seen'],
-                               method.details['fix_latency_sigma'])})
+                               method.details['fix_latency_sigma'])},
+                method.estimates['scale_factor'].value)
     found = _search(run, leg, method.details['pitch']['value']) if two else None
     more = {} if found is None else {'search': found.as_dict()}
     # what positions alone cannot tell, the gyro may have: of that the estimate speaks itself
