@@ -70,9 +70,11 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.foresee.smoother_so_far import SmootherSoFar
     from odocal_ros.foresee.thinned_leg import ThinnedLeg
     from odocal_ros.live.jobs import compute
+    from odocal_ros.live.memory import give_back, hold_little
     import odocal_ros.live.node  # noqa: F401 all that a node holds
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.settings.config import Config
+    hold_little()
     print(f'node, modules loaded: {peak_mib():.0f} MiB', flush=True)
     config, recorder, thinned, smoother = Config(), LegRecorder(), ThinnedLeg(), SmootherSoFar()
     last, begin, done = {}, [], []
@@ -105,6 +107,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
         if looks and gone > (len(done) + 1) * hours * 3600 / looks * 0.999:
             done.append(gone)
             forecast_of(thinned.leg(begin[0]), thinned.fix_rate(), config, lambda: True, smoother)
+            give_back()
             print(f'node, {gone / 3600:.1f} h recorded, estimate running: {peak_mib():.0f} MiB '
                   f'(goal {NODE_GOAL})', flush=True)
         if gone > hours * 3600:
@@ -117,6 +120,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
             bag.read(readers, take_in)
         recorder.form = readers['/odometer'].form
     print(f'node, recorded: {peak_mib():.0f} MiB (goal {NODE_GOAL})', flush=True)
+    give_back()     # as the worker does after each look
     stop = recorder.newest_ns('imu')
     began = time.perf_counter()
     result, = compute(recorder.snapshot(), begin[0], stop, [], config).results

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -81,3 +82,13 @@ def errors_in_sigmas(result, truth):
 def rejecting(result):
     """Return the codes for which a leg is rejected."""
     return {c for c in everything_said(result) if c.gravity.value == 'rejected'}
+
+
+def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
+    """Return rows with arrivals as a line has them that stops now and then, and which it held."""
+    t = (samples.stamp_ns - samples.stamp_ns[0]) * 1e-9
+    free = np.where(t % every_s < how_long_s, t - t % every_s + how_long_s, t)
+    for k in range(1, len(free)):        # one after the other
+        free[k] = max(free[k], free[k - 1] + drain_s)
+    stamps = samples.stamp_ns[0] + np.round(free * 1e9).astype(np.int64)
+    return OdometerSamples(stamps, stamps, samples.value), free - t > drain_s

@@ -362,6 +362,19 @@ def test_a_quarter_turn_is_told_with_the_setting_that_undoes_it(town):
     assert result.distance == pytest.approx(town.truth.distance, rel=0.05)
 
 
+def test_a_stray_fix_is_no_way_of_a_leg_that_is_refused(town):
+    on_its_side = replace(town.imu, f_i=town.imu.f_i[:, [2, 1, 0]])
+    leg = replace(town.leg(), imu=on_its_side)
+    plain, _ = run(leg, settings(town))
+
+    def stray(latitude):
+        latitude[[400, 401, 900]] += np.deg2rad([4.0, 4.0, -0.01])      # 445 km, 1.1 km
+        return latitude
+    result, said = run(replace(leg, fix=changed(leg.fix, latitude=stray)), settings(town))
+    assert Code.IMU_AXES in said
+    assert result.distance == pytest.approx(plain.distance, rel=0.01)
+
+
 def test_a_leg_too_short(made, leg):
     short = replace(leg, stop_ns=leg.start_ns + 14 * 10**9)
     result, said = run(short, settings(made))

@@ -14,7 +14,7 @@ from odocal_ros.screening.glitches import about_clumps
 
 @pytest.fixture(scope='module')
 def made():
-    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+    return drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
 
 
 def garbage(rng, column, first, last):

@@ -14,7 +14,18 @@ from odocal_ros.reasons import Code, Verdict
 
 @pytest.fixture(scope='module')
 def made():
-    return drive(scenario='town', duration=200.0, imu_grade='industrial', seed=4)
+    return drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
+
+
+@pytest.fixture(scope='module')
+def config(made):
+    return settings(made, method='auto')
+
+
+@pytest.fixture(scope='module')
+def whole(made, config):
+    """Return what the leg says with nothing wrong."""
+    return calibrate(made.leg(), config)
 
 
 @pytest.mark.parametrize('matrix', [
@@ -24,13 +35,11 @@ def made():
     [[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]],    # only with the height
     [[2.0, 0.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 9.0]],    # not symmetric
     np.diag([1e-300, 1e-300, 1.0]), np.diag([1e300, 1.0, 1.0]), np.full((3, 3), 5e-324)])
-def test_a_covariance_that_is_none(made, matrix):
+def test_a_covariance_that_is_none(made, config, whole, matrix):
     leg = made.leg()
 
     def one(covariance):
         covariance[len(covariance) // 2] = matrix
-    config = settings(made, method='auto')
-    whole = calibrate(leg, config)
     result = calibrate(replace(leg, fix=changed(leg.fix, covariance_n=one)), config)
     assert Code.METHOD_FAILED not in everything_said(result)
     for name in ('smoother', 'two_point'):
@@ -39,15 +48,12 @@ def test_a_covariance_that_is_none(made, matrix):
 
 
 @pytest.mark.parametrize('broken', ['two_point', 'smoother'])
-def test_a_fault_in_a_method_costs_that_method(made, monkeypatch, broken):
-    leg, config = made.leg(), settings(made, method='auto')
-    whole = calibrate(leg, config)
-
+def test_a_fault_in_a_method_costs_that_method(made, config, whole, monkeypatch, broken):
     def breaks(run):
         run.reasons.append('half a finding')
         raise np.linalg.LinAlgError('Singular\nmatrix')
     monkeypatch.setitem(leg_methods.METHODS, broken, breaks)
-    result = calibrate(leg, config)
+    result = calibrate(made.leg(), config)
     reason, = (r for r in result.methods[broken].reasons if r.code is Code.METHOD_FAILED)
     assert f'method {broken} broke: LinAlgError (Singular matrix) in breaks' in reason.text
     assert 'half a finding' not in result.reasons

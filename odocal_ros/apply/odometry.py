@@ -170,12 +170,14 @@ class Odometry:
         w = np.concatenate(self._w_look)
         resting = heard and self.wheels.still(self._t_look, self._t) and bool(
             (w.std(axis=0) < TURN).all() and (np.abs(w.mean(axis=0) - self.bias) < TURN).all())
+        # a rest that begins with this look may begin with the last of the braking
+        standing = resting and self._rested
         if self.config.levelling and heard and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
-            noise = 2 * self.wheels.quantum / SPEED_OVER / T if not resting else 0.0
+            noise = 2 * self.wheels.quantum / SPEED_OVER / T
             self._correct(self.errors.by_gravity(
-                matrix_from_quat(self.q), off_n, T, 0.0 if resting else np.hypot(SHAKE, noise)))
-        if self.config.levelling and resting and self._rested:
+                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKE, noise)))
+        if self.config.levelling and standing:
             variance = np.maximum(self.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             earth_b = matrix_from_quat(self.q).T @ self._start.earth_n
             self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))

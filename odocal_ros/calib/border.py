@@ -1,6 +1,6 @@
 """What the data of a leg tell of the constants of the vehicle: information, no prior in it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,8 @@ class Border:
     names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
     centre, sigma : (m,) what was believed beforehand, inf where nothing is.   used : (m,) the
-    sigmas with those beliefs widened that the leg gainsaid.
+    sigmas with those beliefs widened that the leg gainsaid.   usual : (m,) of what may be there or
+    not, and which of both the leg's own evidence says, the sigma of what is there; 0 of others.
     """
 
     names: tuple[str, ...]
@@ -34,6 +35,10 @@ class Border:
     centre: Floats
     sigma: Floats
     used: Floats
+    usual: Floats = field(default_factory=lambda: np.zeros(()))
+
+    def __post_init__(self):
+        object.__setattr__(self, 'usual', np.broadcast_to(self.usual, np.shape(self.value)))
 
     def widened(self, factor: float) -> 'Border':
         """Return what data are worth whose sigmas are too small by a factor."""

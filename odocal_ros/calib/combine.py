@@ -26,7 +26,7 @@ def combine_method(name, results) -> MethodResult:
 
     Returns
     -------
-    MethodResult: each parameter the mean weighted by the legs' own variances; the sigma holds
+    MethodResult: each parameter the mean with the least variance; the sigma holds
     what is shared once. A spread beyond the sigmas widens them (LEGS_DISAGREE).
 
     """
@@ -92,12 +92,12 @@ def _combine(parameter, i, have):
     own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
                     for r in have])
     own = np.maximum(own, 1e-18)
-    weight = (1 / own) / (1 / own).sum()
-    mean = weight @ y
     names = {s.name for r in have for s in r.sources if s.shared}
     by_leg = {n: np.stack([_effect(r, n, i) for r in have]) for n in sorted(names)}
+    weight = _weights(np.diag(own) + sum(g @ g.T for g in by_leg.values()))
+    mean = weight @ y
     shared = {n: weight @ g for n, g in by_leg.items()}
-    variance = 1 / (1 / own).sum()
+    variance = weight**2 @ own
     # what legs may differ by: their own errors, and shared ones that act differently
     apart = own + sum(((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
                       for n, g in by_leg.items())
@@ -111,6 +111,19 @@ def _combine(parameter, i, have):
                           f'{factor:.1f} times more than their sigmas allow'),)
     mean = np.exp(mean) if relative else wrap(mean) if angle else mean
     return float(mean), float(variance), shared, reasons
+
+
+def _weights(covariance):
+    """
+    Return the weights, none below zero, of the mean with the least variance.
+
+    By own errors alone, a leg that a shared error hardly touches would count for little beside
+    one that it rules, and the mean would be worse than that leg.
+    """
+    from scipy.optimize import nnls
+    root = np.linalg.cholesky(covariance / np.trace(covariance))
+    weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
+    return weight / weight.sum()
 
 
 def _effect(result, name, i):

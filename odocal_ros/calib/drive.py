@@ -8,6 +8,7 @@ from odocal_ros.reasons import Code, Reason
 
 MOVED = 20.0     # m over which fixes must spread to say that the vehicle moved
 EDGE = 0.5       # s of odometer missing at a mark worth saying
+FASTEST, ASTRAY = 100.0, 50.0     # m/s that no land vehicle drives; m by which any fix may be off
 TURNS = 0.1      # of the distance: more of it in turns is worth saying
 
 
@@ -95,19 +96,36 @@ def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
                    if wheels_move else 'the vehicle did not move'),)
 
 
-def way_and_chord(fixes_n) -> tuple[float, float]:
+def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
     """
-    Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes.
+    Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
     The way goes from fix to fix at least ten times their white noise apart: nearer ones would
-    add it up.
+    add it up. Those that no vehicle gets to are none of it.
     """
-    p = fixes_n[:, :2]
+    p = fixes_n[within_reach(t_fix, fixes_n), :2]
     if len(p) < 2:
         return 0.0, 0.0
     knots = [*knots_of(p, max(2.0, 10 * white_noise(p))), len(p) - 1]
     way = float(np.hypot(*np.diff(p[knots], axis=0).T).sum())
     return way, float(np.hypot(*(p[-1] - p[0])))
+
+
+def within_reach(t_fix, fixes_n):
+    """Tell which fixes a vehicle gets to from the one amid them, fix by fix: (k,) bool."""
+    p = fixes_n[:, :2]
+    if len(p) < 2 or (np.hypot(*np.diff(p, axis=0).T) <= FASTEST * np.diff(t_fix) + ASTRAY).all():
+        return np.ones(len(p), bool)
+    amid = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
+    keep, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
+    for order in (range(amid, len(p)), range(amid, -1, -1)):
+        t, x, y = rows[amid]
+        for k in order:
+            far = np.hypot(rows[k][1] - x, rows[k][2] - y)
+            if far <= FASTEST * abs(rows[k][0] - t) + ASTRAY:
+                keep[k] = True
+                t, x, y = rows[k]
+    return keep
 
 
 def white_noise(fixes_n) -> float:

@@ -1,5 +1,7 @@
 """The rows of several legs as one least squares: constants they share, one that walks, beliefs."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.calib.border import Border, UNIT
@@ -22,8 +24,9 @@ class LinkedLegs:
             about = last.value[self.names.index(name)]
             self.borders = [b.turned(name, about) for b in self.borders]
         self.centre = last.centre
-        self.sigma, self.used = (np.max([getattr(b, which) for b in self.borders], axis=0)
-                                 for which in ('sigma', 'used'))
+        self.sigma, self.used, self.usual = (
+            np.max([getattr(b, which) for b in self.borders], axis=0)
+            for which in ('sigma', 'used', 'usual'))
         self.unit = np.where(np.isfinite(self.used), self.used, UNIT)
         self.drifting = self.names.index(drifting)
         self.steps = np.maximum(steps, LEAST_STEP)
@@ -59,41 +62,67 @@ class LinkedLegs:
     def solve(self, spread=None):
         """Return the unknowns and their covariance, of leg j at ``place``."""
         A, b = self.system(spread)
-        held = np.flatnonzero(np.isfinite(self.used))
-        prior = np.zeros((len(held), A.shape[1]))
-        prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
+        prior, centre = self._beliefs(A.shape[1])
         Q, R = np.linalg.qr(np.concatenate([A, prior]))
         inverse = np.linalg.inv(R)
-        x = inverse @ (Q.T @ np.concatenate([b, self.centre[held] / self.used[held]]))
-        scale = np.empty(A.shape[1])
+        x = inverse @ (Q.T @ np.concatenate([b, centre]))
+        scale = np.empty(len(x))
         for j in range(len(self.borders)):
             scale[self.place(j)] = self.unit
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
+    def _beliefs(self, columns, but=()):
+        """Return what is believed of constants, but for some, as rows and what they should be."""
+        held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
+        prior = np.zeros((len(held), columns))
+        prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
+        return prior, self.centre[held] / self.used[held]
+
     def carried(self, value, spread=None) -> Border:
         """Return what all legs tell, of the last leg's constants, where those are ``value``."""
-        A, b = self.system(spread)
-        last = self.place(len(self.borders) - 1)
-        gone = np.setdiff1d(np.arange(A.shape[1]), last)
-        # orthogonal rows of which only the first hold what is eliminated
-        R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, last], b]), mode='r'))
-        R = R[len(gone):]
-        rows = R[:, len(gone):-1] / self.unit
-        return Border(self.names, value, rows.T @ rows, rows.T @ (R[:, -1] - rows @ value),
-                      self.centre, self.sigma, self.used)
+        rows, b = _left(*self.system(spread), self.place(len(self.borders) - 1))
+        rows = rows / self.unit
+        every = np.all([b.usual > 0 for b in self.borders], axis=0)
+        return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
+                      self.centre, self.sigma, self.used, self.usual * every)
+
+    def evidence(self, at):
+        """
+        Return what legs tell of some constants, what is believed of the others taken in.
+
+        Returns
+        -------
+        information (k, k), and the pull where all of them are zero, (k,).
+
+        """
+        A, b = self.system()
+        prior, centre = self._beliefs(A.shape[1], at)
+        rows, b = _left(np.concatenate([A, prior]), np.concatenate([b, centre]),
+                        self.place(0)[at])
+        rows = rows / self.unit[at]
+        return rows.T @ rows, rows.T @ b
+
+    def believing(self, at, sigmas) -> list[Border]:
+        """Return the borders with what is to be believed of some constants."""
+        first, used = self.sigma.copy(), self.used.copy()
+        first[at] = used[at] = sigmas
+        return [replace(b, sigma=first, used=used) for b in self.borders]
 
     def disagreement(self, spread=None):
         """
-        Return by how much the least cost rises when legs are one vehicle's, and freedom.
+        Return the legs' cost when they are one vehicle's, and what it should be.
 
         Of what legs tell at least as well as it was believed: farther off than that their
         equations need not be true.
         """
         A, b = self.system(spread, [b.told(self.unit, TELLS) for b in self.borders])
-        U, size, _ = np.linalg.svd(A, full_matrices=False)
-        U = U[:, size > SAME * size[0]]
-        rest = b - U @ (U.T @ b)
-        return float(rest @ rest), A.shape[0] - U.shape[1]
+        # beliefs hold what no leg tells: else two legs that tell half of the constants each, in
+        # directions that are never the same, would have one set of them, however far apart
+        prior, centre = self._beliefs(A.shape[1])
+        U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
+        of_legs, U = slice(len(A)), U[:, size > SAME * size[0]]
+        rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
+        return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
 
     def deviations(self, spread=None):
         """
@@ -115,6 +144,14 @@ class LinkedLegs:
         return out
 
 
+def _left(A, b, keep):
+    """Return rows of some unknowns, the others taken out, and what they should be."""
+    gone = np.setdiff1d(np.arange(A.shape[1]), keep)
+    # orthogonal rows of which only the first hold what is eliminated
+    R = np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r')[len(gone):]
+    return R[:, len(gone):-1], R[:, -1]
+
+
 def _on(border: Border, names) -> Border:
     """Return a border on more names, of which it says and believes nothing."""
     if border.names == names:
@@ -130,4 +167,4 @@ def _on(border: Border, names) -> Border:
         return out
     # a belief that a leg does not have is none that it has widened
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
-                  on(border.sigma, 0.0), on(border.used, 0.0))
+                  on(border.sigma, 0.0), on(border.used, 0.0), on(border.usual, 0.0))

@@ -1,6 +1,6 @@
 """What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -110,6 +110,12 @@ class LegResult:
     C_bi: NDArray[np.float64] | None = None   # (3, 3) nominal rotation used, imu frame to b
     deciding: tuple[str, ...] = ()            # methods whose verdict counts, all where empty
     evidence: Evidence | None = None          # what a report draws, None where no track was fit
+    cut_from_ns: int | None = None            # start mark of the leg that it is a part of
+
+    @property
+    def driven_ns(self) -> int:
+        """Return when it was driven: of parts of a leg the same, no scale walks between them."""
+        return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
     @property
     def verdict(self) -> Verdict:
@@ -119,6 +125,14 @@ class LegResult:
                     if name in (self.deciding or self.methods)), key=order.index,
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
+
+    def numbers(self) -> 'LegResult':
+        """Return all that a combination and its tables take, without the rows that are drawn."""
+        methods = {name: replace(method, details={
+            key: value for key, value in method.details.items()
+            if not isinstance(value, np.ndarray)}) for name, method in self.methods.items()}
+        return replace(self, methods=methods, track_n=None, track_before_n=None,
+                       reference_n=None, evidence=None)
 
 
 @dataclass(frozen=True, eq=False)

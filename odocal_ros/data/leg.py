@@ -29,6 +29,7 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
+from odocal_ros.nav.integral import by_row
 
 EMPTY: dict[str, Callable[[], Samples]] = {
     'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
@@ -144,12 +145,16 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
 
 def _key(samples: Samples) -> Ints:
     """Return the stamp by which a row is placed: rows without one go by their arrival."""
-    key: Ints = np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+    return _placed(samples.stamp_ns, samples.received_ns)
+
+
+def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
+    key: Ints = np.where(stamp_ns > 0, stamp_ns, received_ns)
     return key
 
 
 def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
-    key = _key(samples)
+    key = by_row(_placed, samples.stamp_ns, samples.received_ns)
     after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)

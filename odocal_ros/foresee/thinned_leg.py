@@ -12,6 +12,7 @@ import numpy as np
 
 from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.data.samples import ImuSamples, join, OdometerForm, OdometerSamples, take
+from odocal_ros.live.late_so_far import LateSoFar
 
 CELL_NS = 100_000_000
 MOST = 16_000           # cells of a topic: 26 minutes of 0.1 s, pre-roll and all
@@ -26,6 +27,7 @@ class ThinnedLeg:
         self._cells: dict = {}       # slot -> rows, one a cell
         self._open: dict = {}        # slot -> rows of the cell that is not over
         self._width_ns: dict = {}
+        self._late: dict = {}        # slot -> the newest counts
         self._last: dict = {}        # slot -> last count as sent, and as unrolled
         self._fix_steps: list = []
 
@@ -38,7 +40,9 @@ class ThinnedLeg:
             before = self._open.get('fix', take(samples, slice(0, 0))).stamp_ns[-1:]
             self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
         if slot.startswith('odometer') and self.form.quantity != 'rate':
-            samples = self._unrolled(slot, samples)
+            samples = self._late.setdefault(slot, LateSoFar()).feed(self._unrolled(slot, samples))
+            if not len(samples.stamp_ns):
+                return
         rows = join([self._open[slot], samples]) if slot in self._open else samples
         width_ns = self._width_ns.setdefault(slot, CELL_NS)
         cell = rows.stamp_ns // width_ns
@@ -55,14 +59,23 @@ class ThinnedLeg:
 
     def leg(self, start_ns: int) -> Leg:
         """Return what there is as a leg that ends with the last cell of the Imu."""
-        form = self.form
+        form, cells = self.form, self._cells | {slot: self._newest(slot) for slot in self._late}
         if form.quantity != 'rate':
-            whole = np.issubdtype(self._cells['odometer'].value.dtype, np.integer) \
-                if 'odometer' in self._cells else True
+            whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
+                if 'odometer' in cells else True
             form = replace(COUNTER if whole else FLOATS, scale_unit=form.scale_unit,
                            sides=form.sides)
         stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
-        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **self._cells)
+        return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
+
+    def _newest(self, slot) -> OdometerSamples:
+        """Return the cells of a counter with rows that those to come may still move."""
+        rows = self._late[slot].rest()
+        if slot in self._open:
+            rows = join([self._open[slot], rows])
+        width_ns = self._width_ns.get(slot, CELL_NS)
+        cells = _gathered(rows, rows.stamp_ns // width_ns, ())
+        return join([self._cells[slot], cells]) if slot in self._cells else cells
 
     def fix_rate(self) -> float:
         """Return fixes a second by the median of their intervals, NaN where there are too few."""

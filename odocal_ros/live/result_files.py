@@ -82,6 +82,8 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
                 folder.rmdir()      # empty: its name was only reserved
             raise
         stays = folders.file(folder, marks(calibration.legs), force)
+        if config.leg.automatic:
+            folders.prune(folder, config.output.automatic_kept)
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
                           'output.directory to a folder that can') from None

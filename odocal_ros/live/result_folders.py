@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+import re
+import shutil
 import uuid
 
 from odocal_ros.output.worse import replacing, stored_in
 from odocal_ros.outside.whole import locked
 
 LATEST = 'latest'
+NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # of a result, by its time
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class ResultFolders:
     Keeps ``latest`` at the best that is known, in this session and over earlier ones.
 
     The link does not go from a good calibration to a worse one unless forced, and it goes back
-    when the legs of what it points at are undone. Nothing written is ever removed.
+    when the legs of what it points at are undone. Nothing that an operator has had written is
+    ever removed.
     """
 
     def __init__(self) -> None:
@@ -51,6 +55,28 @@ class ResultFolders:
         self._filed.append(Filed(folder, legs, before))
         return ''
 
+    def prune(self, newest: Path, kept: int) -> None:
+        """
+        Remove the oldest results of ``leg.automatic`` beside a new one, all but so many; 0: none.
+
+        What ``latest`` shows, what it would go back to, and the newest good one stay.
+        """
+        root = newest.parent
+        with locked(root):
+            names = sorted((p.name for p in root.iterdir() if NAME.fullmatch(p.name)), key=_age)
+            old = names[:-kept] if kept else []
+            shown = _target(root / LATEST)
+            stay = {newest.name, shown, *(f.before for f in self._filed if f.folder.name == shown)}
+            for name in reversed(names if old else []):
+                found = stored_in(root / name)
+                if found and found.usable:
+                    stay.add(name)
+                    break
+            for name in (n for n in old if n not in stay):
+                found = stored_in(root / name)
+                if found and found.config.get('leg.automatic'):
+                    shutil.rmtree(root / name, ignore_errors=True)
+
     def withdraw(self, left: frozenset[int]) -> Path | None:
         """
         Take back what holds legs that are dropped; ``left`` are the start marks of the others.
@@ -68,6 +94,12 @@ class ResultFolders:
             else:
                 link.unlink(missing_ok=True)
         return self._filed[-1].folder if self._filed else None
+
+
+def _age(name):
+    """Return by what names of results are sorted: their time, and which of that second."""
+    when, count = NAME.fullmatch(name).groups()
+    return when, int(count or 1)
 
 
 def _target(link: Path) -> str:

@@ -53,7 +53,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey_drive(inputs, config)
-    way, chord = way_and_chord(drive.fixes_n)
+    way, chord = way_and_chord(drive.t_fix, drive.fixes_n)
     driven = _driven(inputs, drive)
     found['drive'] = {
         'way': way, 'chord': chord, 'fix_sigma': drive.sigma,
@@ -119,8 +119,8 @@ def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
 
     def described(start_ns, stop_ns, **more):
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
-        way, chord = way_and_chord(
-            drive.fixes_n[(drive.t_fix >= start) & (drive.t_fix <= stop)])
+        here = (drive.t_fix >= start) & (drive.t_fix <= stop)
+        way, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here])
         return {'start': base + start, 'stop': base + stop, 'way': way, 'chord': chord} | more
 
     marks = marked_legs(bag)

@@ -5,7 +5,7 @@ import numpy as np
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
-from odocal_ros.screening.sanity import G
+from odocal_ros.settings.grades import G
 
 GAP = 5.0             # in median intervals: longer is a gap
 LEAST_GAP = 0.1       # s, shorter is jitter

@@ -14,7 +14,7 @@ def compared(calibration: Calibration, name: str) -> list[tuple]:
     """Draw scale, yaw and pitch by method and leg; empty where there is but one to show."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
             for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
-    for number, leg in enumerate(calibration.legs[:MOST_LEGS], 1):
+    for number, leg in list(enumerate(calibration.legs, 1))[-MOST_LEGS:]:
         rows += [(f'leg {number}, {m.replace("_", " ")}', m, found.estimates)
                  for m, found in leg.methods.items()]
     panels = [(title, points, band) for title, points, band in (
@@ -67,5 +67,6 @@ def _draw(panels, name, legs):
         ax.set_xlabel(title)
     says = 'Each bar is one sigma to either side; the grey band is the result.' + (
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
-        'chance would have it.' if legs > 1 else '')
+        'chance would have it.' if legs > 1 else '') + (
+        f' Of {legs} legs, the newest {MOST_LEGS}.' if legs > MOST_LEGS else '')
     return 'Side by side', says, svg(figure, f'{name}-compared', says)

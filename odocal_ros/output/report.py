@@ -135,25 +135,33 @@ def _budgets(methods):
 
 
 def _drawn(calibration):
-    """Return what is told of each leg, the figure of all, and how many legs have no figures."""
+    """
+    Return what is told of each leg, the figure of all, and the numbers of legs without figures.
+
+    Of more legs than a page has room for, the newest have theirs.
+    """
     from odocal_ros.output.plots import leg_figures
     from odocal_ros.output.plots_compare import compared
     from odocal_ros.output.plots_svg import look
-    legs, size, missing = [], 0, 0
+    numbered, size = list(enumerate(calibration.legs, 1)), 0
+    figures: dict[int, list] = {}
+    shown = [(number, leg) for number, leg in numbered if leg.evidence is not None]
     with look():
         together = compared(calibration, 'all')
-        for number, leg in enumerate(calibration.legs, 1):
-            figures = []
-            if leg.evidence is not None and size < MOST_BYTES:
-                figures = leg_figures(leg.evidence, f'leg{number}', _relative(leg),
-                                      before_label([leg]), _smoothed(leg))
-                size += sum(len(drawing) for _, _, drawing in figures)
-                if size > MOST_BYTES:
-                    figures, missing = [], missing + 1
-            elif leg.evidence is not None:
-                missing += 1
-            legs.append(_leg(number, leg, figures, several=len(calibration.legs) > 1))
-    return legs, together, missing
+        for number, leg in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
+            if figures and size > MOST_BYTES:
+                break
+            drawn = leg_figures(leg.evidence, f'leg{number}', _relative(leg),
+                                before_label([leg]), _smoothed(leg))
+            size += sum(len(drawing) for _, _, drawing in drawn)
+            if not figures or size <= MOST_BYTES:
+                figures[number] = drawn
+    legs = [_leg(number, leg, figures.get(number, []), several=len(numbered) > 1)
+            for number, leg in numbered]
+    # one whose tracks were let go had some too
+    had = [number for number, leg in numbered if leg.evidence is not None
+           or leg.before is not None]
+    return legs, together, [number for number in had if number not in figures]
 
 
 def _leg(number, leg: LegResult, figures, several):

@@ -12,6 +12,7 @@ import numpy as np
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import let_go
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
@@ -95,6 +96,7 @@ def _screened(leg, config, notes=()):
         return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
     reasons += tuple(with_axes(sanity, inputs))
+    let_go(*vars(leg.imu).values())
     if z_down:
         inputs = turned_over(inputs)
     return inputs, reasons, not UNUSABLE & {r.code for r in sanity}

@@ -48,7 +48,7 @@ def combine(legs, config: Config, carried: Carried | None = None) -> Calibration
     names = dict.fromkeys(n for leg in used for n in leg.methods)
     carried = carried if carried and _belongs(carried, used) else None
     methods = {n: _combined(n, [
-        (leg.methods[n], leg.start_ns, i) for i, leg in enumerate(legs, 1)
+        (leg.methods[n], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
         if leg in used and n in leg.methods], config, carried) for n in names}
     on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
     estimates, giving = choose(methods, config.method)
@@ -125,7 +125,7 @@ def _combined(name, driven, config, carried=None):
     """
     Return a method's combination of the legs where it is not rejected, of all if of none.
 
-    driven : list of (MethodResult, start_ns, number).
+    driven : list of (MethodResult, driven_ns, number).
     """
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)

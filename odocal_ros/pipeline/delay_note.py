@@ -13,7 +13,8 @@ HIDDEN = 0.25       # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
-def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]]) -> list[Reason]:
+def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
+                scale: float) -> list[Reason]:
     """
     Return DELAY_SEEN for each delay that is there for certain and matters at the speed driven.
 
@@ -23,9 +24,11 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]]) 
         The leg.
     seen : dict
         'gnss' or 'odometer' -> by how many s its stamps are late, with what is set, and sigma.
+    scale : float
+        As the method that saw them found it.
 
     """
-    speed = _speed(prepared)
+    speed = _speed(prepared) * scale
     notes = []
     for name, (late, sigma) in seen.items():
         way = abs(late) * speed
@@ -42,9 +45,9 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]]) 
 
 
 def _speed(prepared: PreparedLeg) -> float:
-    """Return the speed driven, m/s: nine tenths of the leg are slower."""
+    """Return the speed driven, scale units per s: nine tenths of the leg are slower."""
     travel = prepared.inputs.travel
     grid = np.arange(max(0.0, travel.t[0]), min(prepared.inputs.t_stop, travel.t[-1]), 1.0)
     if len(grid) < 2:
         return 0.0
-    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90)) * prepared.rough
+    return float(np.percentile(np.abs(np.diff(travel.at(grid))), 90))

@@ -10,6 +10,7 @@ from odocal_ros.calib.choice import choose, deciding, passed_over
 from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.result import LegResult
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
+from odocal_ros.pipeline.prepare import judged_by
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.reasons import Code
@@ -39,7 +40,8 @@ def _way_of(t_fix, geodetic):
     """Return the way by the fixes, m: what is known of a leg that is refused."""
     if not len(t_fix):
         return 0.0
-    return way_and_chord(origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic)))[0]
+    fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
+    return way_and_chord(t_fix, fixes_n)[0]
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> LegResult:
@@ -56,10 +58,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
     if scale is None or runs[scale.method].paths is None:
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                           distance=prepared.distance, deciding=deciding(asked))
-    distance = prepared.distance
     # truer than the rough scale
     if scale.value and scale.sigma is not None and scale.sigma < WORTH * scale.value:
-        distance *= scale.value / prepared.rough
+        prepared = judged_by(prepared, scale.value)
     shown, said = tracks(prepared, runs[scale.method].paths)
     found += said
     for name, run in runs.items():
@@ -68,7 +69,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
             methods[name] = replace(run.result, details=run.result.details | check)
             found += said
     return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
-                      distance=distance, deciding=deciding(asked), **shown)
+                      distance=prepared.distance, deciding=deciding(asked), **shown)
 
 
 def _once(found):

@@ -61,13 +61,14 @@ def run_methods(names, prepared: PreparedLeg, begun: Callable) -> dict[str, Meth
 def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     """Return what methods found of the data, each said once, the delays by the best of them."""
     found: list[Reason] = []
-    delays: dict[str, tuple] = {}
+    notes: list[Reason] = []
     for name in METHODS:
         if name in runs:
             found += runs[name].found
-            told = runs[name].delays
-            delays = delays if told is None else told
-    return found + delay_notes(prepared, delays)
+            delays, scale = runs[name].delays, runs[name].result.estimates['scale_factor'].value
+            if delays is not None and scale is not None:
+                notes = delay_notes(prepared, delays, scale)
+    return found + notes
 
 
 def _doubted(run, prepared, slips) -> MethodRun:

@@ -16,8 +16,8 @@ def planar_of(ready, leg, pitch) -> PlanarLeg:
                       (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
 
 
-def search_of(ready, leg, pitch) -> SearchResult:
-    """Return what array, response surface and least squares find; arguments of planar_of."""
+def search_of(ready, leg, pitch) -> SearchResult | None:
+    """Return what the search finds, None with too few fixes; arguments as of planar_of."""
     a, wheels = ready.alignment, ready.config.wheels
     course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
     return search(planar_of(ready, leg, pitch), ranges_of(wheels, course), wheels.robust)

@@ -1,5 +1,7 @@
 """From screened inputs to a leg that methods can be run on: placed, faced, aligned, reckoned."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
@@ -19,6 +21,7 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import imu_gap
 
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
+BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
@@ -81,10 +84,19 @@ def _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout):
         **vars(placed), leg=leg, inputs=inputs, config=config, facing=faces,
         lever_b=np.subtract(config.gnss.lever_arm, config.odometer.lever_arm), spans=spans,
         alignment=alignment, about_alignment=about, epochs=epochs, track=track,
-        wheel_slips=slips, distance=distance,
+        wheel_slips=slips, metres_per_unit=placed.rough, distance=distance,
         t_fit=_four_fifths(track, inputs.t_stop) if holdout else inputs.t_stop, holdout=holdout,
         reasons=(*reasons, *gap, *coarse_reasons(inputs, placed), *apart,
                  *(r for r in judged if r not in of_ends)), of_ends=of_ends)
+
+
+def judged_by(prepared: PreparedLeg, scale) -> PreparedLeg:
+    """Return a leg whose way and speed are judged by a scale known better than the rough one."""
+    distance, judged = judge_drive(prepared.track, prepared.inputs.t_stop, scale,
+                                   prepared.config.leg)
+    return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
+        *(r for r in prepared.reasons if r.code not in BY_SCALE),
+        *(r for r in judged if r.code in BY_SCALE)))
 
 
 def _standing(inputs, placed):

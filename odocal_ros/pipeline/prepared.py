@@ -31,8 +31,9 @@ class PreparedLeg(Placed):
     unseen.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
     standstills.   alignment : and what it had to say.   epochs : the attitude as aligned, t (m,)
     s and q_nb (m, 4).   track : of the odometer (the mean of the wheels), dead reckoned so.
-    wheel_slips : of one wheel against the other.   distance : m, by the rough scale.   t_fit : s;
-    fixes after it are held out, where ``holdout`` is.   reasons : what was found of the leg;
+    wheel_slips : of one wheel against the other.   metres_per_unit : the rough scale, until a
+    method knows it better.   distance : m, by it.   t_fit : s; fixes after it are held out, where
+    ``holdout`` is.   reasons : what was found of the leg;
     of_ends : what matters to its ends alone.
     """
 
@@ -47,6 +48,7 @@ class PreparedLeg(Placed):
     epochs: tuple[NDArray[np.float64], NDArray[np.float64]]
     track: Track
     wheel_slips: WheelSlips
+    metres_per_unit: float
     distance: float
     t_fit: float
     holdout: bool

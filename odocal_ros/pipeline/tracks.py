@@ -110,4 +110,5 @@ def _checked(ready, path, start):
 
 def driven(ready):
     """Return times of the track, s, and the way driven until then, m."""
-    return ready.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s)))) * ready.rough
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
+    return ready.track.t, way * ready.metres_per_unit

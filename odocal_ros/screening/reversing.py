@@ -15,7 +15,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.sanity import G
+from odocal_ros.settings.grades import G
 
 STEP = 0.1          # s, grid
 HALF = 0.6          # s each side that accelerations are taken over

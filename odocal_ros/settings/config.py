@@ -202,6 +202,9 @@ class OutputConfig:
                              '.')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')
+    automatic_kept: int = setting(100, '', 0, 10**6, about='Result folders that are kept of those '
+                                  'written with leg.automatic; the oldest go first, but never '
+                                  'what latest shows and the newest good one. 0: all.')
     formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
                                        'calibration.json.')
 

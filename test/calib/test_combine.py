@@ -70,6 +70,15 @@ def test_yaws_about_half_a_turn_have_a_mean_there():
     assert combined.estimates[YAW].value == pytest.approx(2e-4 / 3 - np.pi, abs=1e-12)
 
 
+def test_a_mean_is_never_worse_than_its_best_leg():
+    # one knows much of its own, and the heading rules it; another the other way round
+    legs = [method(own=OWN / 10, heading=1e-2), method(own=OWN, heading=1e-4)]
+    whole = combine_method('two_point', legs).estimates[YAW]
+    assert whole.sigma <= legs[1].estimates[YAW].sigma * (1 + 1e-9)
+    # by own errors alone it would be 1e-2: that of the other
+    assert whole.sigma < 1.5e-4
+
+
 def test_a_shared_error_of_opposite_effect_cancels():
     """An antenna that is off by as much on the way there and back leaves the mean alone."""
     def with_antenna(sign):

@@ -11,6 +11,7 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.imperfect import believed_together
 from odocal_ros.calib.smoother.remarks import FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.slips import NO_SLIPS
@@ -166,7 +167,8 @@ def test_chi_square_has_its_mean_and_variance():
     found = [drawn() for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
-    assert freedom == 22 + 4 - 9
+    # (beliefs take up a little of what these are told to)
+    assert freedom == pytest.approx(22 + 4 - 9, abs=0.05)
     assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
     assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
     # each of five constants in one of 300, and all together in one of 20
@@ -181,13 +183,27 @@ def test_the_leg_and_the_constant_that_differ_are_named():
     small = Toy(rng, states=6, rows=40)
     constants = np.tile(TRUTH, (LEGS, 1))
     constants[3, 4] += 5.0
-    found = of(small.draw(rng, constants).borders())
+    borders = small.draw(rng, constants).borders()
+    # the belief of that leg has given way, as it does where data gainsay it
+    borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
+    found = of(borders)
     assert list(found.spread) == ['z3']
     assert np.argmax(np.abs(found.deviation[:, 4])) == 3
     # one of five off by 5: scattering by 5 / sqrt(5), the mean off by 1
     assert found.spread['z3'] == pytest.approx(5 / np.sqrt(5), rel=0.5)
     assert abs(found.value[4] - TRUTH[4]) < 2 * np.sqrt(found.covariance[4, 4])
     assert np.abs((found.value - TRUTH) / np.sqrt(np.diag(found.covariance))).max() < 3.5
+
+
+def test_no_constant_differs_between_legs_by_more_than_was_believed_of_it():
+    rng = np.random.default_rng(3)
+    small = Toy(rng, states=6, rows=40)
+    constants = np.tile(TRUTH, (LEGS, 1))
+    constants[3, 4] += 5.0
+    found = of(small.draw(rng, constants).borders())
+    assert found.spread == {'z3': PRIOR[4]}
+    # what that does not explain widens all
+    assert found.factor > 1.2
 
 
 def test_what_no_constant_explains_widens_all():
@@ -253,7 +269,10 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
 def test_legs_of_the_smoother_add_up_their_information(legs):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
-    used = np.max([r.border.used for r in results], axis=0)      # priors as any leg left them
+    used = believed_together([r.border for r in results], np.zeros(2))[0].used
+    widest = np.max([r.border.used for r in results], axis=0)
+    assert (used < 0.5 * widest).any()       # what one leg alone could not tell from none
+    assert (used <= 1.02 * widest).all()
     C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
     sigma = np.hypot(np.sqrt(np.diag(C))[:3], FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
@@ -281,6 +300,8 @@ def test_sources_of_legs_combined_make_their_sigma(legs):
 
 def test_a_shared_source_is_what_an_error_of_that_belief_does(legs):
     _, config, results = legs
+    # as legs that weigh no evidence: it would move with the belief
+    results = [replace(r, border=replace(r.border, usual=0.0)) for r in results]
 
     def combined(name, sigmas):
         at = results[0].border.names.index(name)
@@ -339,6 +360,20 @@ def test_a_dispute_names_leg_and_parameter(legs):
     # and what is not disputed is as sharp as before
     assert whole.estimates[SCALE].sigma == pytest.approx(
         combine_legs(results, [0, 1, 2], config).estimates[SCALE].sigma, rel=0.1)
+
+
+@pytest.mark.parametrize('off', [1e-3, -3e-3])
+def test_two_legs_whose_scales_differ_dispute_it(legs, off):
+    _, config, (one, other, _) = legs
+    scale = np.arange(len(other.border.names)) == 0
+    changed = replace(other.border, value=other.border.value + off * scale)
+    whole = combine_legs([one, replace(other, border=changed)], [0, 1], config)
+    (said,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
+    assert said.startswith('scale_factor differs between the 2 legs')
+    e = whole.estimates[SCALE]
+    assert 0.3 * abs(off) < e.sigma / e.value < 1.5 * abs(off)
+    assert not any(r.code is Code.LEGS_DISAGREE
+                   for r in combine_legs([one, other], [0, 1], config).reasons)
 
 
 def leg_result(method, number, *codes):

@@ -13,8 +13,10 @@ from odocal_ros.calib.budget import total_covariance
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.leg import positions, wheel_factors
+from odocal_ros.calib.wheels.model import PARAMETERS
 from odocal_ros.calib.wheels.result import _rows, fit_wheels
 from odocal_ros.reasons import Code
+from odocal_ros.sim.real import Real
 
 TOWN = {'scenario': 'town', 'duration': 300.0, 'two_wheels': True}
 STRAIGHT = {'scenario': 'straight', 'duration': 300.0, 'two_wheels': True}
@@ -149,6 +151,21 @@ def test_a_gyro_that_reads_too_much_is_seen_through(error):
     assert seen['sigma'] < 2e-3
 
 
+@pytest.mark.parametrize('options', [TOWN | {'fix_noise': 'rtk'}, STRAIGHT], ids=str)
+def test_a_receiver_that_smooths_is_seen_through(options):
+    made, leg, method = fitted(True, **options, real=Real(receiver_lag=0.8), seed=2)
+    for name, true in truth(made, leg).items():
+        estimate = method.estimates[name]
+        if estimate.value is not None:
+            assert abs(estimate.value - true) < 3.5 * estimate.sigma, name
+    # late by its time constant, whatever is believed of stamps (50 ms)
+    seen = method.details['fix_latency_seen'], method.details['fix_latency_sigma']
+    assert abs(seen[0] - 0.8) < 3 * seen[1] < 0.3
+    if 'fix_noise' in options:
+        said = next(r for r in method.reasons if r.code is Code.FIXES_SMOOTHED)
+        assert '0.80 s' in said.text
+
+
 def test_where_fixes_tell_no_turn_the_width_is_no_better_than_the_gyro():
     _, config, leg = leg_of(**TOWN, seed=4)
     errors = 150.0 * np.random.default_rng(1).standard_normal(leg.fixes_n.shape)
@@ -180,7 +197,7 @@ def test_rows_are_the_derivatives_of_what_is_stated():
         return np.array([*np.log([scale, *wheel_factors(scale, ratio)]),
                          -(state.heading + step[2]), state.width + step[5]])
 
-    step = 1e-5 * np.eye(9)
+    step = 1e-5 * np.eye(len(PARAMETERS))
     by = np.stack([(stated(x) - stated(-x)) / 2e-5 for x in step], -1)
     assert_allclose(_rows(solution), by, atol=1e-8)
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, seconds, settings
+from drives import changed, drive, held_up, seconds, settings
 import numpy as np
 import pytest
 
@@ -11,6 +11,7 @@ from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
 from odocal_ros.pipeline.calibrate import calibrate, faults
 from odocal_ros.reasons import Code, Verdict
+from odocal_ros.screening.screen import screen
 
 
 @pytest.fixture(scope='module')
@@ -68,6 +69,27 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     assert {r.code for r in faults(leg, config)} == lowering
     assert {r.code for r in faults_in_cells(sketched(leg), config)} == lowering
     assert (lowering == set()) == (wrong is sound)
+
+
+def test_late_rows_are_put_back_so_far_as_in_the_result(made):
+    leg = made.leg()
+    late = replace(leg, odometer=held_up(leg.odometer, how_long_s=0.4)[0])
+    wanted = screen(late, settings(made))[0].travel
+    thinned = ThinnedLeg(leg.form)
+    sent_ns = late.odometer.stamp_ns
+    for begin in np.arange(sent_ns[0], sent_ns[-1] + 1, 5 * 10**9):       # look by look
+        thinned.feed('odometer', take(late.odometer, (sent_ns >= begin)
+                                     & (sent_ns < begin + 5 * 10**9)))
+    thinned.feed('imu', leg.imu)
+    cells = thinned.leg(leg.start_ns).odometer
+    count = np.interp(seconds(leg, cells), wanted.t, wanted.s)
+    # a row is 0.05 s; as sent, cells are off by up to 0.4 s of driving
+    speed = np.gradient(wanted.s, wanted.t).max()
+    base = late.odometer.value[0]
+    off = cells.value - base - (count - wanted.s[0])
+    assert np.abs(off - np.median(off)).max() < 0.05 * speed
+    raw = np.interp(seconds(leg, cells), seconds(leg, late.odometer), late.odometer.value - base)
+    assert np.abs(raw - (count - wanted.s[0])).max() > 0.2 * speed
 
 
 def test_a_gap_of_the_imu_is_seen_at_once_and_stays(made):

@@ -16,8 +16,9 @@ from odocal_ros.offline.legs import marked_legs
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SCALE = 1.02      # true
-SPEED = 10.0      # times real time: 760 messages a second
+SPEED = 10.0      # times real time: 380 messages a second
 BEFORE_S, START_S, LAST_S = 30.0, 60.0, 170.0    # of the drive: played from, marked, played to
+NUMBERS = ('--set', 'output.formats=[params]')   # no report is drawn
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,14 @@ class Remains:
 def drive():
     """Return types and messages of a drive that starts at 60 s."""
     return messages_of(simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=50.0, odometer_rate=21.0, fix_rate=5.0,
+        scenario='straight', duration=180.0, imu_rate=25.0, odometer_rate=11.0, fix_rate=2.0,
         odometer='speed', fix_noise='rtk', scale=SCALE)))
 
 
-def killed(driven, moment_s: float, folder: Path) -> Remains:
+def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
     """Kill a node that records a leg of a drive ``moment_s`` after its start mark."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}'), Client()
+    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
     try:
         player = Player(client.node, types)
         wait_for(player.matched, 'subscriptions')
@@ -73,7 +74,7 @@ def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int) -> Remai
     with open_bag(journal) as bag:
         newest_ns = max(time_ns for time_ns, _ in bag.messages('/imu/data'))
         marks, files = marked_legs(bag), len(bag.files)
-    code, result, said = replayed(journal)
+    code, result, said = replayed(journal, *NUMBERS)
     return Remains(moment_s, (end_ns - newest_ns) * 1e-9, files, marks, start_ns, code,
                    result['legs'] if result else [], said, result)
 
@@ -97,10 +98,10 @@ class Files:
     journal: tuple         # code, calibration.json and words of a replay of the journal
 
 
-def killed_at_files(driven, stage: str, moment_s: float, folder: Path) -> Files:
+def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: str) -> Files:
     """Kill a node ``moment_s`` after ~/stop_leg was asked, or ~/save after that (stage)."""
     types, sent = driven
-    node, client = NodeProcess('-p', f'output.directory:={folder}'), Client()
+    node, client = NodeProcess('-p', f'output.directory:={folder}', *args), Client()
     try:
         player = Player(client.node, types)
         wait_for(player.matched, 'subscriptions')
@@ -127,7 +128,8 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path) -> Files:
     latest = folder / 'latest'
     return Files([c for c in contents.values() if c],
                  [path for path, c in contents.items() if c is None and any(path.iterdir())],
-                 not latest.is_symlink() or bool(whole_content(latest)), replayed(journal))
+                 not latest.is_symlink() or bool(whole_content(latest)),
+                 replayed(journal, *NUMBERS))
 
 
 def wrong(left: Files | Remains) -> list[float]:

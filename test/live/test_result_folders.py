@@ -8,7 +8,8 @@ from kills import drive, LAST_S, START_S, whole_content
 from player import part, Player
 import pytest
 
-SCALE, SPEED = 1.02, 15.0
+SCALE, SPEED = 1.02, 30.0
+QUICK = ('-p', 'method:=two_point')     # the files are the same
 OBEY = (f'import sys; sys.path.insert(0, {str(Path(__file__).resolve().parents[1])!r})\n'
         'from faults import obey_permissions; obey_permissions()\n')
 
@@ -54,7 +55,7 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
     folder = tmp_path / 'shut'
     folder.mkdir()
     folder.chmod(0o555)
-    node = start('-p', f'output.directory:={folder}', before=OBEY)
+    node = start('-p', f'output.directory:={folder}', *QUICK, before=OBEY)
     client = connect()
     leg(driven, [client])
     status = wait_for(lambda: client.status['save_trouble'] and client.status, 'the warning')
@@ -76,7 +77,7 @@ def test_a_folder_that_nobody_may_write_is_told_and_used_once_it_can_be(
 
 def test_a_folder_removed_while_a_leg_is_driven_is_made_again(start, connect, driven, tmp_path):
     folder = tmp_path / 'gone'
-    start('-p', f'output.directory:={folder}')
+    start('-p', f'output.directory:={folder}', *QUICK)
     client = connect()
 
     def remove():
@@ -94,7 +95,7 @@ def test_a_folder_removed_while_a_leg_is_driven_is_made_again(start, connect, dr
 def test_two_nodes_that_save_into_one_folder_have_a_result_each(
         start, connect, driven, tmp_path):
     names = ('first', 'second')
-    nodes = [start('-r', f'__node:={name}', '-p', 'output.formats:=[params, transform]')
+    nodes = [start('-r', f'__node:={name}', '-p', 'output.formats:=[params, transform]', *QUICK)
              for name in names]
     clients = [connect(name) for name in names]
     leg(driven, clients)

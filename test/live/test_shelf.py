@@ -2,6 +2,7 @@
 
 from pathlib import Path
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,6 +40,32 @@ def test_latest_goes_with_each_result_but_not_to_a_worse_one(make, tmp_path):
     assert folders.file(bad, frozenset({1, 2, 3}), True) == ''
     assert latest(tmp_path) == Path('bad')
     assert sorted(p.name for p in tmp_path.iterdir()) == ['a', 'b', 'bad', 'latest']
+
+
+def test_results_of_automatic_legs_are_bounded_but_for_the_good_and_the_operators(tmp_path,
+                                                                                  monkeypatch):
+    of = {}       # name: (automatic, usable)
+
+    def stored(path):
+        automatic, usable = of.get(path.resolve().name, (False, False))
+        return SimpleNamespace(config={'leg.automatic': automatic}, usable=usable)
+    monkeypatch.setattr(module, 'stored_in', stored)
+    monkeypatch.setattr(module, 'replacing',
+                        lambda old, new: '' if of[new.name][1] else 'it is rejected')
+    folders = ResultFolders()
+    for day, made in enumerate([(False, True), *[(True, True)] * 3, *[(True, False)] * 4], 1):
+        folder = tmp_path / f'2026-05-{day:02}T09-12-00Z'
+        folder.mkdir()
+        of[folder.name] = made
+        folders.file(folder, frozenset({day}), False)
+        folders.prune(folder, 0)
+    (tmp_path / 'journal').mkdir()
+    assert len(list(tmp_path.glob('2026*'))) == 8        # 0: all
+    folders.prune(folder, 2)
+    # the operator's; 4 is what latest shows, 3 what it would go back to; the last two
+    assert [p.name[8:10] for p in sorted(tmp_path.glob('2026*'))] == ['01', '03', '04', '07', '08']
+    assert latest(tmp_path) == Path('2026-05-04T09-12-00Z')
+    assert (tmp_path / 'journal').is_dir()
 
 
 def test_a_result_of_an_earlier_session_counts_too(make, tmp_path):

@@ -20,7 +20,7 @@ SLOW = ('import odocal_ros.output.files as f\n'
 def sent():
     """Return types and messages of a drive."""
     return messages_of(simulate(SimOptions(
-        scenario='straight', duration=180.0, imu_rate=100.0, odometer_rate=25.0, fix_noise='rtk',
+        scenario='straight', duration=180.0, imu_rate=25.0, odometer_rate=11.0, fix_noise='rtk',
         odometer='speed', heading=0.7)))
 
 
@@ -29,7 +29,7 @@ def sent():
 def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
         start, connect, sent, tmp_path, how, before):
     node = start('-p', 'alignment.heading_source:=fixed', '-p', 'alignment.heading:=0.7',
-                 before=before)
+                 '-p', 'method:=two_point', before=before)
     client = connect()
     player = Player(client.node, sent[0])
     wait_for(player.matched, 'subscriptions')

@@ -15,7 +15,7 @@ import pytest
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, Source
 from odocal_ros.calib.sections import Sections
-from odocal_ros.output import report
+from odocal_ros.output import plots_compare, report
 from odocal_ros.output.files import as_json, write_results
 from odocal_ros.output.plots import leg_figures
 from odocal_ros.output.plots_svg import look
@@ -237,8 +237,22 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
               for *_, drawing in leg['figures'])
     monkeypatch.setattr(report, 'MOST_BYTES', 3 * one // 2)
     leg = replace(good.legs[0], evidence=evidence())
-    _, text, _ = page_of(replace(good, legs=(leg,) * 3))
-    assert '2 more legs have no figures here' in text
+    legs = tuple(replace(leg, start_ns=leg.start_ns + k * 10**12) for k in range(3))
+    _, text, _ = page_of(replace(good, legs=legs))
+    assert 'No figures here of legs 1, 2, to keep the page small' in text
+    # one alone is shown however large it is: the newest
+    monkeypatch.setattr(report, 'MOST_BYTES', 10)
+    told, _, missing = report._drawn(replace(good, legs=legs))
+    assert [bool(leg['figures']) for leg in told] == [False, False, True]
+    assert missing == [1, 2]
+
+
+def test_of_many_legs_the_newest_are_side_by_side(good, monkeypatch):
+    monkeypatch.setattr(plots_compare, 'MOST_LEGS', 2)
+    with look():
+        (_, says, drawing), = plots_compare.compared(replace(good, legs=good.legs[:1] * 3), 'all')
+    assert 'Of 3 legs, the newest 2.' in says
+    assert [f'leg {k}, two' in drawing for k in (1, 2, 3)] == [False, True, True]
 
 
 def test_a_page_is_the_same_each_time(good):

@@ -60,11 +60,25 @@ def test_the_counts_of_a_result_are_those_of_the_leg(made):
     result = calibrate(leg, settings(made))
     assert (result.start_ns, result.stop_ns) == (leg.start_ns, leg.stop_ns)
     assert result.duration == pytest.approx((leg.stop_ns - leg.start_ns) * 1e-9)
-    assert result.distance == pytest.approx(made.truth.distance, rel=0.02)     # rough scale
+    assert result.distance == pytest.approx(made.truth.distance, rel=0.02)
     assert result.imu_samples == len(leg.imu.stamp_ns)
     # fixes between the marks, each at 0.2 s and 3 ms, half a second of slack at each side
     assert abs(result.fixes - (result.duration + 0.5) * 5) <= 3
     assert result.rejected_fixes == 0
+
+
+def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
+    # of fixes that state 15 m the rough scale is by chords of 120 m, through the corners of a town
+    leg = replace(town.leg(), fix=changed(
+        town.fix, covariance_n=lambda c: np.tile(225 * np.eye(3), (len(c), 1, 1))))
+    result = calibrate(leg, settings(town, heading_sigma=None, method='smoother',
+                                     leg__min_speed=50.0, gnss__max_sigma=0.0))
+    text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
+    said = float(text.split('the fastest second was ')[1].split(' m/s')[0])
+    t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
+    way = town.odometer.value * town.truth.scale
+    fastest = (np.interp(t + 0.5, t, way) - np.interp(t - 0.5, t, way))[20:-20].max()
+    assert said == pytest.approx(fastest, rel=2e-3)
 
 
 def test_notes_of_the_door_are_kept_and_weigh(made):

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from drives import drive, everything_said, settings
+from drives import drive, everything_said, held_up, settings
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
+from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening.late_rows import COUNTS
@@ -19,16 +19,6 @@ SLIP_M, SLIP_S = 0.5, 200.0
 def made():
     return drive(scenario='town', duration=400.0, imu_grade='industrial', odometer_rate=50.0,
                  seed=8)
-
-
-def held_up(samples, every_s=15.0, how_long_s=0.12, drain_s=1e-3):
-    """Return rows with arrivals as a line has them that stops now and then, and which it held."""
-    t = (samples.stamp_ns - samples.stamp_ns[0]) * 1e-9
-    free = np.where(t % every_s < how_long_s, t - t % every_s + how_long_s, t)
-    for k in range(1, len(free)):        # one after the other
-        free[k] = max(free[k], free[k - 1] + drain_s)
-    stamps = samples.stamp_ns[0] + np.round(free * 1e9).astype(np.int64)
-    return OdometerSamples(stamps, stamps, samples.value), free - t > drain_s
 
 
 def spun(made, samples):

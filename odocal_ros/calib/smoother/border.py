@@ -4,21 +4,26 @@ import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.smoother.priors import PriorRows
-from odocal_ros.calib.smoother.state import CONSTANTS
+from odocal_ros.calib.smoother.problem import imperfect_sigmas
+from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT
 
 
-def border_of(fit, configured) -> Border:
+def border_of(fit, configured, grade) -> Border:
     """
     Return the border of a fit, at its last linearisation.
 
     The normal matrix with the states eliminated, less what was believed of the constants: the
     elimination leaves their corner's prior as it is.
 
-    configured : (M,) values of the settings that constants are corrections to.
+    configured : (M,) values of the settings that constants are corrections to.   grade : Grade,
+    that the Imu is taken for.
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
-    weight = 1 / priors.constants**2
+    weight, usual = 1 / priors.constants**2, np.zeros(len(at))
+    if not fit.levels.correlation_time:       # no evidence of what is imperfect otherwise
+        t = fit.weighted.state.t
+        usual[IMPERFECT] = imperfect_sigmas(grade, t[-1] - t[0])
     return Border(
         CONSTANTS, at + configured, fit.solved.reduced - np.diag(weight),
         fit.solved.g_reduced + weight * (at - priors.centre), priors.centre + configured,
-        fit.first.constants, priors.constants)
+        fit.first.constants, priors.constants, usual)

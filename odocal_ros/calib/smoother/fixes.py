@@ -23,6 +23,7 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew
 
 NO_HEIGHT = 1e6       # m, sigma of a height that is not there
@@ -58,10 +59,11 @@ class Fixes(PointRows):
             self.C_t, np.cross(here.intervals.mean_rate[k], arm_b))
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
-        # of a receiver that smooths, the place is v tau late as for a delay, and a tau^2 / 2 more
-        self.accel_n = (np.diff(state.v_n, axis=0) / np.diff(state.t)[:, None])[k]
-        lag = state.constants[FIX_LAG2] / 2 * self.accel_n
-        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - lag
+        # of a receiver that smooths the mean age is a delay
+        smoothed, self.by_lag = smoothing(
+            state.t, *_antenna(state, here.intervals.mean_rate, arm_b),
+            state.t[k] + points.tau, state.constants[FIX_LAG2])
+        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - smoothed
 
     def jacobians(self, n):
         """
@@ -85,7 +87,7 @@ class Fixes(PointRows):
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
-        c[:, :, FIX_LAG2] = -self.accel_n / 2
+        c[:, :, FIX_LAG2] = -self.by_lag
         c[:, :, ACCEL] = self.C @ self.points.FF
         return J, c
 
@@ -109,6 +111,13 @@ class Fixes(PointRows):
         known = np.ones((len(self.k), 3), bool)
         known[:, 2] = self.root[:, 2, 2] > 1e-5
         return known
+
+
+def _antenna(state, mean_rate, arm_b):
+    """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
+    rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
+    return (state.p_n + state.C_nb @ arm_b,
+            state.v_n + turn(state.C_nb, np.cross(rate, arm_b)))
 
 
 def whitener(covariance_n, no_height):

@@ -15,9 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib.border import Border
+from odocal_ros.calib.linked_legs import LinkedLegs
 from odocal_ros.calib.smoother.estimate import Fit, fit
 from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR
-from odocal_ros.calib.smoother.state import IMPERFECT, KINDS
+from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K
 
 BELIEF = 0.5         # that an imperfection is there
 NONE = 1e-3          # of the usual sigma: as good as no error
@@ -109,6 +111,33 @@ def judged_priors(now: Fit, grade, found=True):
     sigmas = np.full(len(usual), NO_ERROR)
     sigmas[there] = taken
     return with_imperfect(now.priors, sigmas)
+
+
+def believed_together(borders, steps) -> list[Border]:
+    """
+    Return borders of one vehicle with what all of them tell of imperfections believed.
+
+    A leg that tells nothing of a kind believes it to be as usual; another, that there is none.
+    Those whose fixes err slowly have no say.
+
+    borders : by time.   steps : (J - 1,) sigmas by which the scale walks between them.
+    """
+    legs = LinkedLegs(borders, CONSTANTS[LN_K], steps)
+    telling = [j for j, b in enumerate(legs.borders) if b.usual.any()]
+    if not telling or len(borders) < 2:
+        return borders
+    walked = np.append(0.0, np.cumsum(np.square(steps)))[telling]
+    of = LinkedLegs([legs.borders[j] for j in telling], CONSTANTS[LN_K],
+                    np.sqrt(np.diff(walked)))
+    at = np.flatnonzero(of.usual > 0)
+    data, gradient = of.evidence(at)
+    sigma = of.usual[at]
+    data = data * np.multiply.outer(sigma, sigma)
+    kind = [np.isin(at, [of.names.index(n) for n in CONSTANTS[IMPERFECT][own]]) for own in KINDS]
+    prior = weigh_kinds(data + 1e-3 * np.eye(len(at)), gradient * sigma,
+                        [own for own in kind if own.any()])
+    taken = np.where(prior > STAYS, np.maximum(of.used[at], sigma), np.sqrt(prior) * sigma)
+    return legs.believing(at, taken)
 
 
 def judge_running(now: Fit, grade) -> Fit:

@@ -108,7 +108,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                         | {'slips': [vars(s) for s in slips],
                            'beside': beside(c, covariance, problem.grade),
                            'level_pitch_angle': level_pitch(fit, near, widen)},
-                        border_of(fit, configured(leg)).widened(widen))
+                        border_of(fit, configured(leg), problem.grade).widened(widen))
 
 
 def floored(covariance):

@@ -35,8 +35,7 @@ from odocal_ros.calib.smoother.state import (
     SPEED_OFFSET,
     State,
 )
-from odocal_ros.screening.sanity import G
-from odocal_ros.settings.grades import Grade, grade_as_seen
+from odocal_ros.settings.grades import G, Grade, grade_as_seen
 
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
 # forward axis, times of odometer and of fixes s. NEAR, to do without another pass: first order

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.receiver_lag import lag_reasons
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import imperfect_sigmas
 from odocal_ros.calib.smoother.state import (
@@ -26,9 +27,9 @@ SURE = 3.0             # sigmas at which something is there
 AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4
 SCALES_OFF = 4.0       # of the grade's sigma: another Imu
 AXES_OFF = 3.0
-LEAST_LAG = 0.1        # s that are worth a word
-LEAST_CHANGE = 3e-4    # of the scale within the leg, the same
+LEAST_CHANGE = 3e-4    # of the scale within the leg, worth a word
 LEAST_ARM = 0.3        # m, the same; that of the wheel up is where a body tilts about
+NOISY = 1.5            # of the sigma that fixes state
 NEXT_DRIVE = 1e-3      # by how much the scale of one vehicle differs from drive to drive
 # what the model does not hold (docs/conventions.md): relative, rad
 FLOOR = np.array([3e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
@@ -83,11 +84,8 @@ def level_pitch(fit, near, widen) -> dict:
 def remarks(problem, fit, sigma, config) -> list[Reason]:
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
     c, leg = fit.state.constants, problem.leg
-    said = []
-    if c[FIX_LAG2] > max(SURE * sigma[FIX_LAG2], LEAST_LAG**2):
-        said.append(Reason(Code.FIXES_SMOOTHED, 'the receiver smooths its fixes over about '
-                           f'{np.sqrt(c[FIX_LAG2]):.2f} s; the values allow for it'))
-    said += _varies(fit, sigma)
+    said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
+            *_varies(fit, sigma)]
     usual = imperfect_sigmas(grade_of(config.imu), leg.t_stop - leg.t_begin)
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
@@ -104,6 +102,16 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade; the values allow for it'))
     return said + _arms(c, sigma, leg)
+
+
+def _noisy(problem, levels):
+    """Say where fixes, white and slow errors together, err by more than they state."""
+    slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
+    factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
+    if factor <= NOISY:
+        return []
+    return [Reason(Code.FIXES_NOISIER_THAN_SAID, f'the fixes stray from the track {factor:.1f} '
+                   'times as far as their covariance says')]
 
 
 def _varies(fit, sigma):

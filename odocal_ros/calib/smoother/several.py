@@ -8,6 +8,7 @@ from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE, scale_steps
+from odocal_ros.calib.smoother.imperfect import believed_together
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
 from odocal_ros.calib.smoother.priors import SHARED
 from odocal_ros.calib.smoother.remarks import beside, FLOOR
@@ -53,7 +54,10 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE
-    found = joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
+    found = _joint(borders, steps)
+    if not found.spread and found.factor == 1:
+        # legs that agree tell together what is imperfect; what they differ in would seem to be it
+        found = _joint(believed_together(borders, steps), steps)
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
     sigma = np.sqrt(np.diag(C))
@@ -73,6 +77,10 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
                         sources, _details(found, found.value[at], C, sources, len(legs))
                         | {'beside': beside(found.value[at], C, grade_of(config.imu))},
                         found.carried)
+
+
+def _joint(borders, steps) -> Joint:
+    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
 
 
 def _changed(change, times_ns, numbers) -> Reason:

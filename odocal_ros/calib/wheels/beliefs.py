@@ -6,8 +6,7 @@ import numpy as np
 
 from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import (
-    GYRO,
-    LATENCY,
+    NUISANCES,
     OFFSET,
     PARAMETERS,
     RATIO,
@@ -21,6 +20,8 @@ WIDE = 10.0          # m, sigma of a track width of which nothing is known
 GUESS = 0.8          # m, sigma of that of a car
 WIDTH_SIGMA = 0.02   # of a track width given: taped, and tyres are wide
 FIRM = 1e-7          # s, relative: the least sigma of latency and gyro scale, 0 asked for
+LAG = 1.0            # s^2, sigma of fix_lag_square
+GAINSAID = 3.0       # sigmas of a latency found from which its belief gives way
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Beliefs:
     gyro_scale: float
 
     def steps(self, leg: WheelLeg, state: State, told, rounds):
-        """Return inverse variances and values, (9,) each, as steps from a state."""
+        """Return inverse variances and values, (p,) each, as steps from a state."""
         weight, value = np.zeros((2, len(PARAMETERS)))
         given = self.width or ANY_WIDTH
         loose = WIDE if told else GUESS if rounds > 2 else WIDTH_SIGMA * given
@@ -49,17 +50,21 @@ class Beliefs:
         value[RATIO] = -state.log_ratio
         weight[OFFSET] = 1e-6
         value[OFFSET] = -state.offset
-        weight[LATENCY] = 1 / max(self.latency, FIRM)**2
-        value[LATENCY] = -state.latency
-        weight[GYRO] = 1 / max(self.gyro_scale, FIRM)**2
-        value[GYRO] = -state.gyro_scale
+        weight[NUISANCES] = 1 / np.maximum(self._nuisances(state), FIRM)**2
+        value[NUISANCES] = -state.latency, -state.gyro_scale, -state.fix_lag_square
         if leg.start.surveyed:
             variance = np.diag(leg.start.covariance_n)[:2]
             weight[3:5] = 1 / np.maximum(variance, 1e-8)
             value[3:5] = leg.start.position_n[:2] - state.start_n[:2]
         return weight, value
 
-    def nuisances(self, X):
-        """Return the covariance that latency and gyro scale add to rows of derivatives, (k, k)."""
-        X = X[:, [LATENCY, GYRO]] * [self.latency, self.gyro_scale]
+    def nuisances(self, X, state):
+        """Return the covariance that NUISANCES add to rows of derivatives, (k, k)."""
+        X = X[:, NUISANCES] * self._nuisances(state)
         return X @ X.T
+
+    def _nuisances(self, state):
+        # a receiver that smooths over a second is late by one, whatever was thought of its stamps
+        late = abs(state.latency)
+        latency = late if late > GAINSAID * self.latency else self.latency
+        return [latency, self.gyro_scale, LAG]

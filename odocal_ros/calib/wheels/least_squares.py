@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.model import (
     Equations,
+    FIX_LAG2,
     GYRO,
     LATENCY,
     OFFSET,
@@ -24,7 +25,7 @@ class Fit:
     """
     A solved step.
 
-    step : (9,).   normal : (9, 9) its inverse covariance.   B : (9, 3N) observations to step.
+    step : (p,).   normal : (p, p) its inverse covariance.   B : (p, 3N) observations to step.
     use : (3N,) observations used, u of them.   P : (u, u) inverse covariance less what the
     parameters take up.   left : (u,) V^-1 times what is left.   phi : (N + 1,) rad, drift
     of the heading at the nodes but for the gyro's scale.   phi_sigma : (N + 1,) rad, of that and
@@ -61,13 +62,13 @@ def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
 
     Parameters
     ----------
-    V, r, X : (3N, 3N), (3N,), (3N, 9) arrays
+    V, r, X : (3N, 3N), (3N,), (3N, p) arrays
         Covariance, residuals, derivatives.
     drift : Drift
         Of the heading.
     use : (3N,) bool array
         Observations to use.
-    weight, value : (9,) arrays
+    weight, value : (p,) arrays
         Inverse variance and value of what is believed of each step.
 
     """
@@ -90,13 +91,13 @@ def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
 
 
 def design(eq: Equations):
-    """Return the derivatives of the observations by the parameters, (3N, 9)."""
+    """Return the derivatives of the observations by the parameters, (3N, p)."""
     n = len(eq.turn)
     X = np.zeros((3 * n, len(PARAMETERS)))
     for axis in range(2):
         rows = slice(axis * n, (axis + 1) * n)
         X[rows, :3] = eq.by[:, axis, :3]
         X[rows, 3 + axis] = 1.0
-        X[rows, LATENCY], X[rows, GYRO] = eq.by[:, axis, 4:].T
+        X[rows, LATENCY], X[rows, GYRO], X[rows, FIX_LAG2] = eq.by[:, axis, 4:].T
     X[2 * n:, [SCALE, RATIO, WIDTH, OFFSET, GYRO]] = eq.turn_by
     return X

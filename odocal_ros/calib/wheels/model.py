@@ -1,7 +1,7 @@
 """
 The two equations of the wheels, linearised about a state, on bins of time.
 
-    fix(t)  = p0 + sum to t - D of C (K_L dP_L + K_R dP_R) / 2 d + lever arm + fix error
+    fix(t)  = p0 + sum to t - D of C (K_L dP_L + K_R dP_R) / 2 d + lever arm + lag + fix error
     0       = K_R s_R - K_L s_L - w psi - d0 + count error
 
 d is the forward axis in b, D the latency of the fixes, w the track width, psi the turn of the
@@ -9,6 +9,8 @@ vehicle by gyro. What the gyro errs by, phi(t) (true attitude = exp(phi) compute
 both: a random process with its values at nodes, linear in between, and -g / (1 + g) times the turn
 so far of a gyro that reads (1 + g) times the rate. D and g are believed to a sigma and estimated
 with all else: their squares matter (50 ms in a bend: 5 ppm of 2 km; 1 % of a full turn: 2000 ppm).
+So is the lag of a receiver that smooths, beyond a delay: a town of RTK fixes lagging by 1 s was
+500 ppm off at 5 ppm stated without it.
 
 Fixes and turns are averaged over the bins between the nodes: the equations are linear in what is
 averaged, so that nothing is approximated but the little that a bin knows beyond its mean.
@@ -21,12 +23,15 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.leg import C_bv, WheelLeg
 from odocal_ros.calib.wheels.way import Way
+from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import exp_so3, matrix_from_quat
 
 Array = NDArray[np.float64]
 PARAMETERS = ('scale', 'log_ratio', 'heading', 'east', 'north', 'width', 'turn_offset', 'latency',
-              'gyro_scale')
-SCALE, RATIO, HEADING, EAST, NORTH, WIDTH, OFFSET, LATENCY, GYRO = range(len(PARAMETERS))
+              'gyro_scale', 'fix_lag_square')
+SCALE, RATIO, HEADING, EAST, NORTH, WIDTH, OFFSET, LATENCY, GYRO, FIX_LAG2 = range(
+    len(PARAMETERS))
+NUISANCES = [LATENCY, GYRO, FIX_LAG2]      # estimated, believed beforehand, and no result
 HALF = 0.25     # s each side that a velocity is taken over
 
 
@@ -37,6 +42,7 @@ class State:
 
     phi : (nodes, 3) rad, n.   latency : s by which stamps of the fixes are late.
     gyro_scale : relative error of the gyro's scale, positive where it reads too much.
+    fix_lag_square : s^2, of the time constant by which the receiver smooths.
     """
 
     scale: float
@@ -49,6 +55,7 @@ class State:
     phi: Array
     latency: float = 0.0
     gyro_scale: float = 0.0
+    fix_lag_square: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +85,8 @@ class Equations:
     The linearised equations, by bin (N) and node (N + 1).
 
     residual : (N, 3) fix less model, m; detail : (k, 3) of each fix.
-    by : (N, 3, 6) derivative of the model's position by ln scale, ln ratio, heading, pitch,
-    latency, gyro scale.                     by_phi : (N, N + 1, 3) way that turns with each node.
+    by : (N, 3, 7) derivative of the model's position by ln scale, ln ratio, heading, pitch,
+    latency, gyro scale, fix_lag_square.     by_phi : (N, N + 1, 3) way that turns with each node.
     turn : (N,) residual of the turn equation, m.
     turn_by : (N, 5) of its model by ln scale, ln ratio, width, d0, gyro scale.
     velocity : (N, 3) m/s at the fixes.      late : (N, 3) what an odometer late by 1 s does, m.
@@ -133,14 +140,15 @@ def equations(leg: WheelLeg, bins: Bins, state: State, since: float) -> Equation
     """
     way = Way(leg, bins, state, since)
     t = leg.t_fix[bins.fix] - state.latency
-    C = leg.left.C_nb_at(t) - leg.left.C_nb_at(np.array(leg.start.t))
-    arm = exp_so3(way.phi(t)) @ C @ C_bv(state.heading, state.pitch)
-    detail = leg.fixes_n[bins.fix] - (state.start_n + way.at('v', t) + arm @ leg.lever_b)
+    arm = _arm(leg, state, way, t)
+    smoothed, by_lag = _smoothed(leg, state, way, t)
+    detail = leg.fixes_n[bins.fix] - (state.start_n + way.at('v', t) + arm @ leg.lever_b
+                                      + smoothed)
     before, after = (np.clip(t + x, *way.t[[0, -1]]) for x in (-HALF, HALF))
     velocity = (way.at('v', after) - way.at('v', before)) / np.maximum(
         after - before, 1e-6)[:, None]
     by = np.stack([*(way.at(name, t) for name in ('v', 'ratio', 'heading', 'pitch')), -velocity,
-                   way.at('gyro_scale', t)], -1)
+                   way.at('gyro_scale', t), by_lag], -1)
     turn, turn_by, yaw = way.turn(state)
     rests, moving, counts = way.rests()
     step_n = np.diff(way.at('v', bins.edges), axis=0)
@@ -149,6 +157,19 @@ def equations(leg: WheelLeg, bins: Bins, state: State, since: float) -> Equation
         bins.mean(velocity), bins.mean(way.at('late', t) - velocity), bins.mean(arm),
         way.forward(), moving, rests, counts, _axes(leg, bins.edges, since), yaw,
         np.interp(bins.edges, way.t, way.by_gyro_scale), step_n)
+
+
+def _arm(leg, state, way, t):
+    """Return the attitude of v less that at the start mark, (k, 3, 3)."""
+    C = leg.left.C_nb_at(t) - leg.left.C_nb_at(np.array(leg.start.t))
+    return exp_so3(way.phi(t)) @ C @ C_bv(state.heading, state.pitch)
+
+
+def _smoothed(leg, state, way, t):
+    """Return what smoothing adds to places at times, and its derivative: (k, 3) m each."""
+    grid = np.arange(way.t[0], way.t[-1], 2 * HALF)
+    place = way.at('v', grid) + _arm(leg, state, way, grid) @ leg.lever_b
+    return smoothing(grid, place, np.gradient(place, grid, axis=0), t, state.fix_lag_square)
 
 
 def _axes(leg, edges, since):

@@ -3,9 +3,10 @@
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, HEIGHT_UNKNOWN, total_covariance
+from odocal_ros.calib.receiver_lag import lag_reasons
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
-from odocal_ros.calib.wheels.model import GYRO, HEADING, LATENCY, RATIO, SCALE, WIDTH
+from odocal_ros.calib.wheels.model import FIX_LAG2, GYRO, HEADING, LATENCY, RATIO, SCALE, WIDTH
 from odocal_ros.calib.wheels.observable import (
     correlation,
     HEADING_LIMIT,
@@ -74,7 +75,8 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
     about_heading = judge_heading(leg, heading, config)
     yaw_known = Code.YAW_NOT_SEPARABLE not in {r.code for r in about_heading}
     sources = _sources(leg, solution)
-    reasons += why + about_heading + judge_fit(solution)
+    reasons += why + about_heading + judge_fit(solution) + lag_reasons(
+        solution.state.fix_lag_square, sigma[FIX_LAG2])
     if told:
         reasons += judge_width(solution.state.width, sigma[WIDTH], config.odometer.track_width)
     total = np.sqrt(np.diag(total_covariance(sources)))
@@ -108,7 +110,7 @@ def refused(leg, reason) -> MethodResult:
 
 
 def _rows(solution):
-    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, 9)."""
+    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, p)."""
     ratio = np.exp(solution.state.log_ratio)
     rows = np.zeros((5, len(solution.beliefs)))
     rows[:3, SCALE] = 1.0
@@ -136,7 +138,8 @@ def _sources(leg, solution: Solution):
     # what was believed beforehand is a source too: of the width given, of a surveyed start
     beliefs = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.beliefs)
     keep = solution.beliefs > 0
-    for name, column in (('fix_latency', LATENCY), ('gyro_scale', GYRO)):
+    for name, column in (('fix_latency', LATENCY), ('gyro_scale', GYRO),
+                         ('receiver_smoothing', FIX_LAG2)):
         sources.append(Source(name, rows @ beliefs[:, [column]], True))
         keep[column] = False
     sources.append(Source('beliefs', rows @ beliefs[:, keep]))

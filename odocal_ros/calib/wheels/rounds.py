@@ -10,6 +10,7 @@ from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_turns, TurnNo
 from odocal_ros.calib.wheels.least_squares import design, Drift, least_squares
 from odocal_ros.calib.wheels.model import (
     equations,
+    FIX_LAG2,
     GYRO,
     HEADING,
     LATENCY,
@@ -156,7 +157,7 @@ class Rounds:
         known = sum(p.whole()[turn, turn] for p in known_parts(
             self.leg, eq, self.bins, state, self.since, TurnNoise(counts=0.0), self.config))
         walk = walk_root(eq.moving)
-        known = known + self.beliefs.nuisances(X[turn])
+        known = known + self.beliefs.nuisances(X[turn], state)
         columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
         if self.width:      # given, and so no free column: its belief is part of what is known
             known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
@@ -172,7 +173,7 @@ class Rounds:
         k = np.array([SCALE, HEADING, 3, 4])
         white = white_share(leg.t_fix, eq.detail[:, :2], leg.covariance_n, bins)
         good = self._used(n)[level]
-        known = known[level, level] + self.beliefs.nuisances(X[level])
+        known = known[level, level] + self.beliefs.nuisances(X[level], state)
         known += np.diag(np.where(good, 0.0, 1e12))     # dropped bins say nothing
         self.noise = judge_fixes(
             r[level], X[level][:, k], known, bins, leg.t_fix, leg.covariance_n, white,
@@ -189,4 +190,5 @@ def _stepped(state, fit, height, widen):
         offset=state.offset + float(step[OFFSET]), pitch=height.pitch,
         start_n=np.append(state.start_n[:2] + step[3:5], height.start),
         phi=np.column_stack([height.phi, fit.phi]), latency=state.latency + float(step[LATENCY]),
-        gyro_scale=state.gyro_scale + float(np.clip(step[GYRO], -0.3, 0.3)))
+        gyro_scale=state.gyro_scale + float(np.clip(step[GYRO], -0.3, 0.3)),
+        fix_lag_square=state.fix_lag_square + float(step[FIX_LAG2]))

@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 from odocal_ros.calib.wheels.height import Height
 from odocal_ros.calib.wheels.judge_noise import FixNoise, TurnNoise
 from odocal_ros.calib.wheels.least_squares import Fit
-from odocal_ros.calib.wheels.model import Bins, Equations, GYRO, LATENCY, State
+from odocal_ros.calib.wheels.model import Bins, Equations, NUISANCES, State
 from odocal_ros.calib.wheels.noise import Part
-
-NUISANCES = [LATENCY, GYRO]      # estimated, believed beforehand, and no result
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +17,8 @@ class Solution:
     """
     The estimate: state, and how the observations make it.
 
-    residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, 9).
-    beliefs : (9,) inverse variance known beforehand.   parts : of the covariance.
+    residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, p).
+    beliefs : (p,) inverse variance known beforehand.   parts : of the covariance.
     kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
     against that of the alignment.   width_told : the drive turns enough for the track width.
     """

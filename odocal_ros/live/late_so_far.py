@@ -1,0 +1,40 @@
+"""Counts as they come while a leg is recorded, late ones put back as the result has them."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.data.samples import join, OdometerForm, OdometerSamples, take
+from odocal_ros.screening.late_rows import on_time, WINDOW
+
+SETTLED_NS = round(WINDOW * 1e9)    # after which no row to come moves one
+BESIDE_NS = 3 * SETTLED_NS          # of rows before, that tell the rhythm
+COUNT = OdometerForm('cumulative', 0, '')
+
+
+class LateSoFar:
+    """The newest rows of one counter that never rolls over; ``feed`` takes them as sent."""
+
+    def __init__(self) -> None:
+        self._rows: OdometerSamples | None = None
+        self._given = 0             # of these, given away
+
+    def feed(self, rows: OdometerSamples) -> OdometerSamples:
+        """Take rows, and return those that stay where they are now."""
+        rows = rows if self._rows is None else join([self._rows, rows])
+        settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
+        settled = max(settled, self._given)
+        out = take(_on_time(rows), slice(self._given, settled))
+        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - BESIDE_NS))
+        self._rows, self._given = take(rows, slice(first, None)), settled - first
+        return out
+
+    def rest(self) -> OdometerSamples:
+        """Return the rows that are not given away, where they seem to belong."""
+        return take(_on_time(self._rows), slice(self._given, None))
+
+
+def _on_time(rows):
+    since_s = (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
+    true_ns = rows.stamp_ns[0] + np.rint(on_time(rows, since_s, COUNT, []) * 1e9).astype(np.int64)
+    return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

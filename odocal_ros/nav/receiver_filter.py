@@ -1,0 +1,66 @@
+"""
+What a receiver that smooths makes of a way: the mean of its past, weighted exp(-age / tau) / tau.
+
+A stamp's delay is the mean age; what is computed here is the rest of it, by the square of tau: the
+smoothed place at t + tau less the place at t. Of small tau that is a tau^2 / 2, a series that does
+not end soon: of 0.6 s in town its next terms are decimetres.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+LEAST = 1e-4         # s^2: below, as much in proportion (and of an estimate below zero)
+STEP = 1e-4          # relative, of the difference that gives a derivative
+BEYOND = 10.0        # s that the way goes on at its last velocity
+
+
+def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float):
+    """
+    Return by how far smoothed places lie off the true ones, and the derivative by ``square``.
+
+    t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
+    at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, of tau.
+    """
+    def late(square):
+        return _late(t, place, velocity, at, np.sqrt(square))
+
+    if square <= LEAST:
+        rate = late(LEAST) / LEAST
+        return rate * square, rate
+    here = late(square)
+    return here, (late(square * (1 + STEP)) - here) / (square * STEP)
+
+
+def _late(t, place, velocity, at, tau):
+    """
+    Return the smoothed places at ``at + tau`` less those at ``at``, (k, 3).
+
+    On a cubic the filter's answer is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is
+    left of before dies away.
+    """
+    t = np.append(t, t[-1] + BEYOND)
+    place = np.concatenate([place, place[-1:] + BEYOND * velocity[-1:]])
+    velocity = np.concatenate([velocity, velocity[-1:]])
+    T = np.diff(t)[:, None]
+    mean = np.diff(place, axis=0) / T
+    bend = (3 * mean - 2 * velocity[:-1] - velocity[1:]) / T             # p'' / 2 at its begin
+    twist = (velocity[:-1] + velocity[1:] - 2 * mean) / T**2             # p''' / 6
+    # where two cubics meet, their answers differ by jumps of p'' and p'''
+    first = tau**2 * (2 * bend - 6 * tau * twist)
+    last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
+    left = np.concatenate([-first[:1], last[:-1] - first[1:]])
+    for k, decay in enumerate(np.exp(-T[:-1] / tau), 1):
+        left[k] += decay * left[k - 1]
+
+    def cubics(at):
+        k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
+        return k, (at - t[k])[:, None]
+
+    k, s = cubics(at)
+    before = place[k] + s * (velocity[k] + s * (bend[k] + s * twist[k]))
+    k, s = cubics(at + tau)
+    p = place[k] + s * (velocity[k] + s * (bend[k] + s * twist[k]))
+    rate = velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
+    after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
+    return after + left[k] * np.exp(-np.maximum(s, 0.0) / tau) - before

@@ -1,0 +1,36 @@
+"""What a receiver's filter makes of a way, against its answer to a sine."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from odocal_ros.nav.receiver_filter import LEAST, smoothing
+
+
+def swaying(t):
+    """Return place and velocity of a way that sways, (n, 2)."""
+    phase = np.multiply.outer(t, [0.5, 0.7])
+    return [20.0, 3.0] * np.sin(phase), [10.0, 2.1] * np.cos(phase)
+
+
+@pytest.mark.parametrize('tau', [0.005, 0.3, 1.0, 2.5])
+def test_a_sine_comes_out_as_a_first_order_filter_has_it(tau):
+    t, at = np.arange(0.0, 60.0, 0.2), np.linspace(25.0, 50.0, 40)
+    late, rate = smoothing(t, *swaying(t), at, tau**2)
+    w = np.array([0.5, 0.7])
+    sines = np.exp(1j * np.multiply.outer(at, w)) * (np.exp(1j * w * tau) / (1 + 1j * w * tau) - 1)
+    want = [20.0, 3.0] * sines.imag
+    # the bend of a cubic over 0.2 s errs by (0.2 w)^2 / 12
+    assert_allclose(late, want, rtol=0, atol=3e-3 * np.abs(want).max())
+    h = 1e-3 * max(tau**2, LEAST)
+    above, below = (smoothing(t, *swaying(t), at, tau**2 + x)[0] for x in (h, -h))
+    # the product's own difference is one-sided, 1e-4 of tau^2 long
+    assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
+
+
+def test_past_its_ends_a_way_goes_straight_on():
+    t = np.arange(0.0, 10.0)
+    place = np.stack([3.0 * t, 0 * t], -1)
+    late, _ = smoothing(t, place, np.tile([3.0, 0.0], (10, 1)), np.array([0.0, 5.0, 9.0]), 4.0)
+    # a steady way is late by tau, no more: that is in the delay
+    assert_allclose(late, 0.0, atol=1e-12)
