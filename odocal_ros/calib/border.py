@@ -37,7 +37,7 @@ class Border:
     used: Floats
     usual: Floats = field(default_factory=lambda: np.zeros(()))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, 'usual', np.broadcast_to(self.usual, np.shape(self.value)))
 
     def widened(self, factor: float) -> 'Border':

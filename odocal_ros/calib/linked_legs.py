@@ -80,7 +80,8 @@ class LinkedLegs:
 
     def carried(self, value, spread=None) -> Border:
         """Return what all legs tell, of the last leg's constants, where those are ``value``."""
-        rows, b = _left(*self.system(spread), self.place(len(self.borders) - 1))
+        A, b = self.system(spread)
+        rows, b = _left(A, b, self.place(len(self.borders) - 1))
         rows = rows / self.unit
         every = np.all([b.usual > 0 for b in self.borders], axis=0)
         return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),

@@ -79,7 +79,7 @@ def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     return out
 
 
-def pieces(times: Floats, t: Floats, *columns: Array) -> Iterator[tuple[slice, slice]]:
+def pieces(times: Array, t: Array, *columns: Array) -> Iterator[tuple[slice, slice]]:
     """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
     done = 0
     for rows in chunks(len(t) - 1, *columns):

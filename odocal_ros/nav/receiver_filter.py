@@ -7,22 +7,23 @@ not end soon: of 0.6 s in town its next terms are decimetres.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from odocal_ros.data.arrays import Floats, Ints
+
 LEAST = 1e-4         # s^2: below, as much in proportion (and of an estimate below zero)
 STEP = 1e-4          # relative, of the difference that gives a derivative
 BEYOND = 10.0        # s that the way goes on at its last velocity
 
 
-def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float):
+def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
+              ) -> tuple[Floats, Floats]:
     """
     Return by how far smoothed places lie off the true ones, and the derivative by ``square``.
 
     t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
     at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, of tau.
     """
-    def late(square):
+    def late(square: float) -> Floats:
         return _late(t, place, velocity, at, np.sqrt(square))
 
     if square <= LEAST:
@@ -32,7 +33,7 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     return here, (late(square * (1 + STEP)) - here) / (square * STEP)
 
 
-def _late(t, place, velocity, at, tau):
+def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
     """
     Return the smoothed places at ``at + tau`` less those at ``at``, (k, 3).
 
@@ -50,10 +51,10 @@ def _late(t, place, velocity, at, tau):
     first = tau**2 * (2 * bend - 6 * tau * twist)
     last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
     left = np.concatenate([-first[:1], last[:-1] - first[1:]])
-    for k, decay in enumerate(np.exp(-T[:-1] / tau), 1):
-        left[k] += decay * left[k - 1]
+    for m, decay in enumerate(np.exp(-T[:-1] / tau), 1):
+        left[m] += decay * left[m - 1]
 
-    def cubics(at):
+    def cubics(at: Floats) -> tuple[Ints, Floats]:
         k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
         return k, (at - t[k])[:, None]
 
@@ -63,4 +64,5 @@ def _late(t, place, velocity, at, tau):
     p = place[k] + s * (velocity[k] + s * (bend[k] + s * twist[k]))
     rate = velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
     after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
-    return after + left[k] * np.exp(-np.maximum(s, 0.0) / tau) - before
+    off: Floats = after + left[k] * np.exp(-np.maximum(s, 0.0) / tau) - before
+    return off

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import Samples, SomeSamples, take
+from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.nav.integral import by_step, pieces
 from odocal_ros.reasons import Code, Reason
 
@@ -61,12 +61,13 @@ def _lag(samples: Samples) -> Floats:
     return lag
 
 
-def _lag_at(arrival_ns, imu):
+def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
     """Return the lag of the Imu at times of arrival: (m,) s; in pieces, for it may be long."""
     base = imu.received_ns[0]
 
-    def seconds(received_ns):
-        return (received_ns - base) * 1e-9
+    def seconds(received_ns: Ints) -> Floats:
+        since: Floats = np.multiply(received_ns - base, 1e-9)
+        return since
 
     if not by_step(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
         # what queued arrives at once: its mean tells
@@ -89,8 +90,8 @@ def _cure(slot: str, ahead: float) -> str:
     return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
 
 
-def _may_be_odd(stamp_ns):
-    step = np.diff(stamp_ns) * 1e-9
+def _may_be_odd(stamp_ns: Ints) -> Bools:
+    step: Floats = np.diff(stamp_ns) * 1e-9
     return (step <= 0) | (step > SET)
 
 

@@ -337,9 +337,8 @@ def test_a_leg_widened_for_its_model_counts_less(legs):
 
 def test_a_slip_that_the_smoother_does_not_hold_is_in_its_border_too(legs):
     _, config, results = legs
-    run = SimpleNamespace(wheel_slips=replace(NO_SLIPS, change=8e-4), distance=1000.0,
-                          nominal=0.0, config=config)
-    loose = held(results[0], run)
+    run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config)
+    loose = held(results[0], run, replace(NO_SLIPS, change=8e-4))
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
     C = joint([loose.border], []).covariance
