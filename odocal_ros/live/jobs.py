@@ -11,6 +11,7 @@ from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
 from odocal_ros.leg import LegRecorder
 from odocal_ros.live.outputs import paths
+from odocal_ros.output.stored import known_imu
 from odocal_ros.parts import calibrate_parts
 from odocal_ros.pipeline import combine
 from odocal_ros.reasons import Reason
@@ -49,14 +50,14 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
     carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
     left = [one for leg in kept[folded:] for one in leg]
-    calibration = combine([*left, *results], config, carried)
+    calibration = combine([*left, *results], config, carried, known_imu(config))
     return Computed(results, paths, calibration, None, carried, folded)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
               ) -> tuple[Calibration, tuple]:
     """Return the combination of the legs left, and the paths of the last."""
-    return combine(kept, config, carried), leg_paths(kept[-1], config)
+    return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> tuple:
