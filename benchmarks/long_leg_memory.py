@@ -68,11 +68,13 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     from odocal_ros.leg import LegRecorder
     from odocal_ros.live.foresight import outlook_of
     from odocal_ros.live.jobs import compute
+    from odocal_ros.live.memory import give_back, hold_little
     import odocal_ros.live.node  # noqa: F401 all that a node holds
     from odocal_ros.live.sketch import Sketch
     from odocal_ros.live.smoother_so_far import SmootherSoFar
     from odocal_ros.messages import make_reader
     from odocal_ros.samples import take
+    hold_little()
     print(f'node, modules loaded: {peak_mib():.0f} MiB', flush=True)
     config, recorder, sketch, smoother = Config(), LegRecorder(), Sketch(), SmootherSoFar()
     last, begin, done = {}, [], []
@@ -105,6 +107,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
         if looks and gone > (len(done) + 1) * hours * 3600 / looks * 0.999:
             done.append(gone)
             outlook_of(sketch.leg(begin[0]), sketch.fix_rate(), config, lambda: True, smoother)
+            give_back()
             print(f'node, {gone / 3600:.1f} h recorded, estimate running: {peak_mib():.0f} MiB '
                   f'(goal {NODE_GOAL})', flush=True)
         if gone > hours * 3600:
@@ -117,6 +120,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
             bag.read(readers, take_in)
         recorder.form = readers['/odometer'].form
     print(f'node, recorded: {peak_mib():.0f} MiB (goal {NODE_GOAL})', flush=True)
+    give_back()     # as the worker does after each look
     stop = recorder.newest_ns('imu')
     began = time.perf_counter()
     result, = compute(recorder.snapshot(), begin[0], stop, [], config).results

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from odocal_ros.nav.integral import by_step, pieces
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.samples import take
 
@@ -31,17 +32,12 @@ def judge_clocks(leg, offsets, labels) -> list[Reason]:
     imu = _stamped(leg.imu)
     if len(imu.stamp_ns) < 2:
         return found
-    base = imu.received_ns[0]
-    arrival, lag = (imu.received_ns - base) * 1e-9, _lag(imu)
-    if not (np.diff(arrival) > 0).all():     # what queued arrives at once: its mean tells
-        arrival, group, count = np.unique(arrival, return_inverse=True, return_counts=True)
-        lag = np.bincount(group, lag) / count
     for slot in TOPICS:
         samples = _stamped(getattr(leg, slot))
         if not len(samples.stamp_ns):
             continue
-        there = np.interp((samples.received_ns - base) * 1e-9, arrival, lag)
-        ahead = float(np.median(there - _lag(samples))) + offsets[slot]
+        ahead = float(np.median(_lag_at(samples.received_ns, imu) - _lag(samples)))
+        ahead += offsets[slot]
         if abs(ahead) > LIMIT:
             found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '
                                 's against the Imu stamps of the same moment'
@@ -59,11 +55,37 @@ def _lag(samples):
     return (samples.received_ns - samples.stamp_ns) * 1e-9
 
 
+def _lag_at(arrival_ns, imu):
+    """Return the lag of the Imu at times of arrival: (m,) s; in pieces, for it may be long."""
+    base = imu.received_ns[0]
+
+    def seconds(received_ns):
+        return (received_ns - base) * 1e-9
+
+    if not by_step(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
+        # what queued arrives at once: its mean tells
+        arrival, group, count = np.unique(seconds(imu.received_ns), return_inverse=True,
+                                          return_counts=True)
+        lag = np.bincount(group, _lag(imu)) / count
+        return np.interp(seconds(arrival_ns), arrival, lag)
+    order = np.argsort(arrival_ns, kind='stable')
+    times_ns, found = arrival_ns[order], np.empty(len(order))
+    for where, rows in pieces(times_ns, imu.received_ns, imu.received_ns, imu.stamp_ns):
+        found[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
+                                        _lag(take(imu, rows)))
+    return found
+
+
 def _cure(slot, ahead):
     """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
     if slot not in GROUP or abs(ahead) > REACH:
         return ''
     return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
+
+
+def _may_be_odd(stamp_ns):
+    step = np.diff(stamp_ns) * 1e-9
+    return (step <= 0) | (step > SET)
 
 
 def _was_set(samples, label, start_ns):
@@ -73,6 +95,8 @@ def _was_set(samples, label, start_ns):
     Rows out of order or with a false stamp step there and back, and leave the lag as it was.
     """
     samples = _stamped(samples)
+    if not by_step(_may_be_odd, samples.stamp_ns).any():
+        return []
     step = np.diff(samples.stamp_ns) * 1e-9
     if len(step) < 3:
         return []

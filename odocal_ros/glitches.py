@@ -101,15 +101,17 @@ def alone(t, x, least):
     """
     found = np.zeros(len(x), bool)
     bound = by_step(lambda x: np.abs(np.diff(x, axis=0)).max(axis=1, initial=0.0), x)
-    if not (bound > least).any():
+    far = np.flatnonzero(bound > least)
+    if not len(far):
         return found
-    least = max(least, CLEAR * float(np.median(bound)))
+    size = bound[far]
+    clear = size > CLEAR * float(np.median(bound, overwrite_input=True))
     done = -1
-    for i in np.flatnonzero(bound > least)[:MOST]:
+    for i, bound in zip(far[clear][:MOST], size[clear], strict=False):
         if i < done:
             continue
         within = np.searchsorted(t, t[i] + CLOSE, side='right')
-        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= HOME * bound[i]
+        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= HOME * bound
         if home.any():
             done = i + 2 + int(np.argmax(home))
             found[i + 1:done] = True

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from odocal_ros.errors import BadData
+from odocal_ros.nav.integral import by_row
 from odocal_ros.samples import (
     FixSamples,
     HeadingSamples,
@@ -138,11 +139,15 @@ def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
 
 def _key(samples) -> np.ndarray:
     """Return the stamp by which a row is placed: rows without one go by their arrival."""
-    return np.where(samples.stamp_ns > 0, samples.stamp_ns, samples.received_ns)
+    return _placed(samples.stamp_ns, samples.received_ns)
+
+
+def _placed(stamp_ns, received_ns):
+    return np.where(stamp_ns > 0, stamp_ns, received_ns)
 
 
 def _cut(samples, first_ns: int, stop_ns: int):
-    key = _key(samples)
+    key = by_row(_placed, samples.stamp_ns, samples.received_ns)
     after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)

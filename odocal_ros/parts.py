@@ -7,25 +7,19 @@ import numpy as np
 from odocal_ros.calib.result import LegResult
 from odocal_ros.config import Config
 from odocal_ros.leg import Leg, part_of
-from odocal_ros.nav.gaps import gaps_longer
+from odocal_ros.nav.integral import by_step
 from odocal_ros.pipeline import calibrate
 from odocal_ros.reasons import Code, Reason, Verdict
 
 SHORTEST_NS = 10**9              # of a part: less is lost with the gap
 MOST = 20                        # an Imu with more gaps stutters: its leg is rejected
+MARGIN_NS = 1000                 # below the limit: more than seconds in floating point are off
 BEFORE_NS = 60 * 10**9           # what lies nearer to the start mark belongs to the leg
 
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
-    stamps = leg.imu.stamp_ns
-    near = stamps[(stamps >= leg.start_ns - BEFORE_NS) & (stamps <= leg.stop_ns)]
-    if len(near) < 2:
-        return [leg]
-    # seconds since the mark hold a nanosecond; a gap up to a mark is one, too
-    t = np.unique(np.concatenate([near, [max(leg.start_ns, near.min()), leg.stop_ns]]))
-    gaps = np.round(gaps_longer((t - leg.start_ns) * 1e-9, limit_s) * 1e9).astype(np.int64) \
-        + leg.start_ns
+    gaps = _gaps(leg, limit_s)
     if not 0 < len(gaps) < MOST:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
@@ -33,6 +27,27 @@ def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
              for first, last in zip(begins, ends, strict=True)]
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= SHORTEST_NS] or [leg]
+
+
+def _gaps(leg, limit_s):
+    """Return begin and end of the gaps of the Imu, ns: (k, 2); one up to a mark is one, too."""
+    near = _near(leg.imu.stamp_ns, leg.start_ns - BEFORE_NS, leg.stop_ns)
+    if len(near) < 2:
+        return np.empty((0, 2), np.int64)
+    least_ns = round(limit_s * 1e9) - MARGIN_NS
+    k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
+    begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
+    if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
+        begin, end = (np.sort(np.append(stamps, leg.start_ns)) for stamps in (begin, end))
+    t = (np.stack([begin, end], -1) - leg.start_ns) * 1e-9
+    return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
+
+
+def _near(stamps, first_ns, stop_ns):
+    """Return the stamps between two, rising: a view where they rise as they came."""
+    if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
+        return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
+    return np.unique(stamps[(stamps >= first_ns) & (stamps <= stop_ns)])
 
 
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),

@@ -20,6 +20,7 @@ from odocal_ros.leg_run import leg_result, LegRun
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.samples import let_go
 from odocal_ros.screen import Inputs, screen
 
 __all__ = ['calibrate', 'combine', 'faults']
@@ -92,6 +93,7 @@ def _begun(leg, config, alignment=None, notes=(), holdout=False):
         return inputs, reasons + [r for r in missing if r.code not in seen], None
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
     reasons += with_axes(sanity, inputs)
+    let_go(*vars(leg.imu).values())
     if z_down:
         inputs = turned_over(inputs)
     if UNUSABLE & {r.code for r in sanity}:

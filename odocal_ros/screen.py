@@ -94,6 +94,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
     imu, heading = oriented(imu), oriented(heading)
+    let_go(*vars(leg.imu).values())
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)

@@ -33,9 +33,10 @@ def imu_sanity(f_b, w_b, C_bi):
     """
     mean, rest = medians(f_b), medians(w_b)
     size = float(np.linalg.norm(mean))
-    fast = float(np.percentile(by_row(lambda w: np.linalg.norm(w - rest, axis=1), w_b), 99.9))
+    fast = float(np.percentile(by_row(lambda w: np.linalg.norm(w - rest, axis=1), w_b), 99.9,
+                               overwrite_input=True))
     reasons = []
-    if not w_b.any():       # what messages hold that have none
+    if not by_row(lambda w: w.any(axis=1), w_b).any():       # what messages hold that have none
         reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '
                               'imu.gyro_scale is 0'))
     if size < NOTHING:

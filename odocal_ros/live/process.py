@@ -14,6 +14,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
 
 from odocal_ros.errors import BadConfig, OdocalError
+from odocal_ros.live.memory import hold_little
 from odocal_ros.outside import one_line, said_by
 
 
@@ -44,6 +45,7 @@ def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
     Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help was asked
     for; 1 when it cannot start, with one line that says why.
     """
+    hold_little()
     # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
     signal.signal(signal.SIGINT, lambda *_: None)
     try:

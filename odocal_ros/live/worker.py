@@ -4,6 +4,8 @@ from collections.abc import Callable
 import queue
 import threading
 
+from odocal_ros.live.memory import give_back
+
 GRACE_S, FILES_S = 1.0, 4.0      # launch asks a second time, and harder, after 5 s
 
 
@@ -17,16 +19,15 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._jobs: queue.Queue = queue.Queue()
         self._done: queue.SimpleQueue = queue.SimpleQueue()
-        self._at_work = False
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
     @property
     def busy(self) -> bool:
         """Return whether a job is under way or waits."""
-        return self._at_work or not self._jobs.empty()
+        return self._jobs.unfinished_tasks > 0
 
     def submit(self, job: Callable[[], object],
                then: Callable[[object, Exception | None], None]) -> None:
@@ -47,10 +48,15 @@ class Worker:
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
-            job, then = entry
-            self._at_work = True
-            try:
-                self._done.put((then, job(), None))
-            except Exception as error:  # every failure of a job is an answer to the operator
-                self._done.put((then, None, error))
-            self._at_work = False
+            self._done.put(_outcome(*entry))
+            del entry       # a job holds a leg: not until the next one comes
+            give_back()
+            self._jobs.task_done()
+
+
+def _outcome(job, then):
+    """Do a job; every failure of it is an answer to the operator."""
+    try:
+        return then, job(), None
+    except Exception as error:
+        return then, None, error

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
+from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
@@ -87,9 +88,12 @@ def dead_reckon(t, q_nb, travel: Travel) -> Track:
 
     """
     s = travel.at(t)
-    C_nb = matrix_from_quat(q_nb)
-    P = np.zeros_like(C_nb)
-    np.cumsum((C_nb[:-1] + C_nb[1:]) * (np.diff(s) / 2)[:, None, None], axis=0, out=P[1:])
+    half, P = (np.diff(s) / 2)[:, None, None], np.zeros((len(t), 3, 3))
+    for rows in chunks(len(t) - 1):
+        C_nb = matrix_from_quat(q_nb[rows.start:rows.stop + 1])
+        sums = (C_nb[:-1] + C_nb[1:]) * half[rows]
+        sums[0] += P[rows.start]
+        np.cumsum(sums, axis=0, out=P[rows.start + 1:rows.stop + 1])
     return Track(t, q_nb, s, P)
 
 
