@@ -140,7 +140,10 @@ def one_leg(day, client, node, folder, leg, truth) -> Look:
         calls.append((time.perf_counter() - asked) * 1e3)
     asked, begin = client.ask('stop_leg'), time.perf_counter()
     day.play(DRIVE_S - 5, DRIVE_S)
-    wait_for(asked.done, 'the answer of ~/stop_leg', LONGEST_S)
+    wait_for(lambda: asked.done() or node.process.poll() is not None,
+             'the answer of ~/stop_leg', LONGEST_S)
+    if not asked.done():
+        sys.exit(f'the node has ended with {node.process.poll()}: {node.lines[-5:]}')
     stop_s = time.perf_counter() - begin
     status = client.status
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))

@@ -12,12 +12,14 @@ class Computing:
     """
     At most one job that counts; what a dropped one brings is thrown away.
 
-    ``failed(trouble)`` hears of a job that raised; ``done()`` is called after each that counted.
+    ``failed(trouble)`` hears of a job that raised, or whose result could not be taken;
+    ``done()`` is called after each that counted. ``alive()`` is false while the node is shut
+    down: what breaks then is no failure.
     """
 
     def __init__(self, worker: Worker, failed: Callable[[str], None],
-                 done: Callable[[], None]) -> None:
-        self._worker, self._failed, self._done = worker, failed, done
+                 done: Callable[[], None], alive: Callable[[], bool]) -> None:
+        self._worker, self._failed, self._done, self._alive = worker, failed, done, alive
         self._job: object | None = None
         self._waiting: list[Future] = []
         self.at: tuple[float, str] = 0.0, ''      # share done, and what is being done
@@ -35,9 +37,14 @@ class Computing:
             if token is not self._job:
                 return
             self._job = None
-            if error is None:
-                take(result)
-            else:
+            try:
+                if error is None:
+                    take(result)
+            except Exception as wrong:      # else nobody who waits would ever be answered
+                if not self._alive():
+                    raise
+                error = wrong
+            if error is not None:
                 self._failed(answers.one_line(error))
             self._done()
 

@@ -51,7 +51,8 @@ class LegWay:
         self._worker = Worker()
         self._watch = Watch(self._worker, self._log)
         self._node_name = node.get_fully_qualified_name()
-        self._computing = Computing(self._worker, self._fail, self.show_status)
+        self._computing = Computing(self._worker, self._fail, self.show_status,
+                                    node.context.ok)
         self._ability: Ability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
@@ -202,7 +203,8 @@ class LegWay:
             session.carried, session.by_itself, self._computing.tell), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
-        self.session.fail(trouble)
+        if self.session.state is State.COMPUTING:      # else the result itself is there
+            self.session.fail(trouble)
         self._log.error(f'leg {self.session.leg_id} failed: {trouble}')
         remedy = ('the leg is kept: call ~/stop_leg to compute it again, or ~/cancel_leg to drop '
                   'it') if self.session.open_leg else 'call ~/reset'

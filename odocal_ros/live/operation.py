@@ -74,6 +74,8 @@ class Operation(AutomaticWay):
         if not left:
             self._outlets.set_results(None)
             self._outlets.show_paths(jobs.leg_paths(None, self._config()))
+            self._computing.drop()      # an undo just before may still be combined
+            self._computing.answer(True, f'{text}, none is left')
             self.show_status()
             return True, f'{text}, none is left'
 

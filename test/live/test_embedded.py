@@ -6,7 +6,7 @@ from bench import Client, wait_for
 from player import messages_of, part, Player
 import pytest
 
-from odocal_ros.live import jobs, operation
+from odocal_ros.live import answers, jobs, operation
 from odocal_ros.live.topic_input import Input
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
@@ -95,6 +95,24 @@ def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkey
     assert not client.call('start_leg').success
     monkeypatch.undo()
     assert operation.jobs.compute is jobs.compute
-    retried = client.call('stop_leg')
-    assert 'scale factor' in retried.message
+    # a fault after the numbers are there is an answer, too, and the node lives
+    monkeypatch.setattr(answers, 'outcome', explode)
+    assert 'MemoryError: not enough for this leg' in client.call('stop_leg').message
     client.until(state='calibrated', leg_id='1', legs='1')
+    monkeypatch.undo()
+    assert 'scale factor' in client.call('stop_leg').message
+    # of two legs undone at once none is left, though the first undoing is still combined
+    assert client.call('start_leg').success
+    player.play(part(messages, 82, 100), 30)
+    stopping = client.ask('stop_leg')
+    player.play(part(messages, 100, 102), 30)
+    assert wait_for(lambda: stopping.done() and stopping.result(), 'the answer').message
+    client.until(state='calibrated', leg_id='2', legs='2')
+    gate = threading.Event()
+    node.operation._worker.submit(gate.wait, lambda *_: None)
+    undoing = [client.ask('undo_leg') for _ in range(2)]
+    client.until(legs='0')
+    gate.set()
+    for one in undoing:
+        assert wait_for(lambda one=one: one.done() and one.result(), 'the answer').success
+    assert (client.call('save').success, client.status['scale_factor']) == (False, 'nan')
