@@ -1,6 +1,6 @@
 """What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +118,14 @@ class LegResult:
                     if name in (self.deciding or self.methods)), key=order.index,
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
+
+    def numbers(self) -> 'LegResult':
+        """Return all that a combination and its tables take, without the rows that are drawn."""
+        methods = {name: replace(method, details={
+            key: value for key, value in method.details.items()
+            if not isinstance(value, np.ndarray)}) for name, method in self.methods.items()}
+        return replace(self, methods=methods, track_n=None, track_before_n=None,
+                       reference_n=None, evidence=None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ The operator's session: which leg is open, which are kept, what has come of them
 A state machine without ROS, clock or thread; a wrong call raises ``Refused`` with the remedy.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from odocal_ros.calib.carried import Carried
@@ -13,6 +13,8 @@ from odocal_ros.config import Config
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Reason, Verdict
+
+MOST_DRAWN = 30     # newest legs whose tracks are kept: a day of legs must not fill the memory
 
 
 class Refused(OdocalError):
@@ -104,6 +106,9 @@ class Session:
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
+        self.legs[:-MOST_DRAWN] = [
+            replace(leg, results=tuple(one.numbers() for one in leg.results))
+            for leg in self.legs[:-MOST_DRAWN]]
         self.unused = None
         self._settle(calibration)
 

@@ -150,7 +150,7 @@ def _drawn(calibration):
                 size += sum(len(drawing) for _, _, drawing in figures)
                 if size > MOST_BYTES:
                     figures, missing = [], missing + 1
-            elif leg.evidence is not None:
+            elif leg.before is not None:        # it had some
                 missing += 1
             legs.append(_leg(number, leg, figures, several=len(calibration.legs) > 1))
     return legs, together, missing

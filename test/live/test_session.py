@@ -1,10 +1,18 @@
 """The operator's session: every command in every state."""
 
+from dataclasses import replace
+import json
+
+from drives import drive, settings
 import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.config import Config
-from odocal_ros.live.session import Refused, Session, State
+from odocal_ros.live.session import MOST_DRAWN, Refused, Session, State
+from odocal_ros.output.files import as_json
+from odocal_ros.output.geojson import geojson
+from odocal_ros.output.report import report_html
+from odocal_ros.pipeline import calibrate, combine
 from odocal_ros.reasons import Code, Reason
 
 CONFIG = Config()
@@ -140,3 +148,24 @@ def test_what_is_carried_on_goes_with_a_reset():
     assert [leg.leg_id for leg in session.legs] == [3]
     session.begin_reset()
     assert session.carried is None
+
+
+def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
+    made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
+    whole, config = calibrate(made.leg(), settings(made, method='auto')), settings(made)
+    session = Session()
+    for leg in range(MOST_DRAWN + 2):
+        session.start(10 * leg + 1, CONFIG)
+        session.stop(10 * leg + 5)
+        session.finish((whole,), calibration())
+    drawn = [leg.results[0].evidence is not None for leg in session.legs]
+    assert drawn == [False] * 2 + [True] * MOST_DRAWN
+    bare = session.legs[0].results[0]
+    later = replace(whole, start_ns=whole.stop_ns, stop_ns=2 * whole.stop_ns - whole.start_ns)
+    full, both = (combine([first, later], config) for first in (whole, bare))
+    assert both.estimates == full.estimates
+    content = [as_json(one, config, [], '') for one in (full, both)]
+    assert content[0] == content[1]
+    assert '1 more leg has no figures here' in report_html(both, config, content[1])
+    track, = geojson(both, config, content[1]).values()
+    assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}
