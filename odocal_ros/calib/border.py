@@ -63,6 +63,16 @@ class Border:
         return replace(self, information=(information + information.T) / 2,
                        pull=self.pull - taken @ (A.T @ self.pull))
 
+    def only(self, names) -> 'Border':
+        """Return what is told of some constants, where of the others is known what is believed."""
+        at = np.isin(self.names, names)
+        free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
+                              if n not in names})
+        D, off = free.information, np.where(np.isfinite(self.used), self.centre - self.value, 0.0)
+        return Border(tuple(n for n in self.names if n in names), self.value[at],
+                      D[np.ix_(at, at)], free.pull[at] - D[np.ix_(at, ~at)] @ off[~at],
+                      self.centre[at], self.sigma[at], self.used[at])
+
     def turned(self, name, about: float) -> 'Border':
         """Return the border with an angle, rad, given within half a turn of another."""
         value, i = self.value.copy(), self.names.index(name)

@@ -1,6 +1,6 @@
 """What earlier legs tell of a vehicle, without the legs: for days to come, and over a restart."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -27,6 +27,16 @@ class Carried:
     def goes_on_from(self, other: 'Carried') -> bool:
         """Return whether all that another holds is in it."""
         return self.first_ns == other.first_ns and self.legs > other.legs
+
+    def only(self, names, keeps) -> 'Carried':
+        """
+        Return what it tells of some constants.
+
+        keeps : of what is believed of each, by how much it may have changed until it is used.
+        """
+        border = self.border.only(names)
+        return replace(self, border=border.loosened(
+            dict(zip(border.names, (keeps * border.used).tolist(), strict=True))))
 
     def as_dict(self) -> dict:
         """Return it as calibration.json has it."""

@@ -115,4 +115,5 @@ def _checked(run, path, start):
 
 def driven(run):
     """Return times of the track, s, and the way driven until then, m."""
-    return run.track.t, np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s)))) * run.metres_per_unit
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(run.track.s))))
+    return run.track.t, way * run.metres_per_unit
