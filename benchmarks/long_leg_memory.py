@@ -123,7 +123,8 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     give_back()     # as the worker does after each look
     stop = recorder.newest_ns('imu')
     began = time.perf_counter()
-    result, = compute(recorder.snapshot(), begin[0], stop, [], config).results
+    result, = compute(recorder.snapshot(), begin[0], stop, [], config,
+                      progress=lambda *_: give_back()).results
     scale = result.methods['smoother'].estimates['scale_factor']
     print(f'node, computed ({result.imu_samples} Imu rows, {time.perf_counter() - began:.0f} s, '
           f'scale {scale.value} +- {scale.sigma}): {peak_mib():.0f} MiB (goal {NODE_GOAL})',

@@ -1,13 +1,13 @@
 """What the data of a leg tell of the constants of the vehicle: information, no prior in it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 
-Floats = NDArray[np.float64]
 LEAST = 1e-12      # of the largest eigenvalue: what is below is rounding
 # unit of a constant without a prior, ln K and angles: where a leg's equations stop being linear
 UNIT = 0.05
@@ -62,6 +62,16 @@ class Border:
         information = D - taken @ DA.T
         return replace(self, information=(information + information.T) / 2,
                        pull=self.pull - taken @ (A.T @ self.pull))
+
+    def only(self, names: Sequence[str]) -> 'Border':
+        """Return what is told of some constants, where of the others is known what is believed."""
+        at = np.isin(self.names, names)
+        free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
+                              if n not in names})
+        D, off = free.information, np.where(np.isfinite(self.used), self.centre - self.value, 0.0)
+        return Border(tuple(n for n in self.names if n in names), self.value[at],
+                      D[np.ix_(at, at)], free.pull[at] - D[np.ix_(at, ~at)] @ off[~at],
+                      self.centre[at], self.sigma[at], self.used[at])
 
     def turned(self, name: str, about: float) -> 'Border':
         """Return the border with an angle, rad, given within half a turn of another."""

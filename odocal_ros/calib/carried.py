@@ -1,6 +1,7 @@
 """What earlier legs tell of a vehicle, without the legs: for days to come, and over a restart."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,16 @@ class Carried:
     def goes_on_from(self, other: 'Carried') -> bool:
         """Return whether all that another holds is in it."""
         return self.first_ns == other.first_ns and self.legs > other.legs
+
+    def only(self, names: Sequence[str], keeps: float | Floats) -> 'Carried':
+        """
+        Return what it tells of some constants.
+
+        keeps : of what is believed of each, by how much it may have changed until it is used.
+        """
+        border = self.border.only(names)
+        return replace(self, border=border.loosened(
+            dict(zip(border.names, (keeps * border.used).tolist(), strict=True))))
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as calibration.json has it."""

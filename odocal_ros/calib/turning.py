@@ -10,6 +10,8 @@ from odocal_ros.reasons import Code, Reason
 TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
 APART = 5.0, 10.0    # m, and fix sigmas: between fixes that give a course
 ALIKE = 0.9          # correlation from which they are the same turns
+SURE = 8.0           # sigmas of the slope: of a few courses chance makes some alike
+ABOUT = 2.0          # rad from one course to the next
 RIGHT = 0.6, 1.6     # of the ratio: no scale error, skid or lean is so large
 NOTHING = 0.01     # of the turns of the fixes: no unit makes that of a turn
 DEGREES = 40.0, 80.0     # the same, of deg/s
@@ -38,14 +40,17 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     # the mean angle over each chord; what a bias adds goes with the time
     ends = t_fix[knots]
     gyro = np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends)
-    drift = np.stack([np.ones_like(t), t], -1)
+    # where the course turns about at once a vehicle may have backed up: by how much is left open
+    about = np.flatnonzero(np.abs(np.diff(course)) > ABOUT)
+    drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
     if course @ course < TURNED**2 or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
-    alike = abs(slope) * np.sqrt(power / (course @ course))
-    return 1 / slope if alike > ALIKE else None
+    alike = slope**2 * power / (course @ course)
+    certain = alike * (len(t) - 1 - drift.shape[1]) > SURE**2 * (1 - alike)
+    return 1 / slope if alike > ALIKE**2 and certain else None
 
 
 def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:

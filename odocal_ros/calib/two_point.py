@@ -110,7 +110,8 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
         if chord_length <= CHORD_SHARE * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
-                           f'{chord_length:.1f} m, under a fifth of the {path:.1f} m driven'),)
+                           f'{chord_length:.1f} m, under a fifth of the way driven, about '
+                           f'{path:.0f} m'),)
     return ()
 
 

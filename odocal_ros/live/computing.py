@@ -5,6 +5,7 @@ from collections.abc import Callable
 from rclpy.task import Future
 
 from odocal_ros.live import answers
+from odocal_ros.live.memory import give_back
 from odocal_ros.live.worker import Worker
 
 
@@ -27,6 +28,7 @@ class Computing:
     def tell(self, share: float, stage: str) -> None:
         """Take over how far the job is; called by the worker's thread."""
         self.at = share, stage
+        give_back()      # what the pass before needed
 
     def submit(self, job, take) -> None:
         """Run a job in the worker and hand its result to ``take``."""

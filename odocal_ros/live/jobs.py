@@ -9,6 +9,7 @@ from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live.result_files import paths
+from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.pipeline.parts import calibrate_parts
@@ -55,14 +56,14 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
     carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
     left = [one for leg in kept[folded:] for one in leg]
-    calibration = combine([*left, *results], config, carried)
+    calibration = combine([*left, *results], config, carried, known_imu(config))
     return Computed(results, paths, calibration, carried, folded)
 
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
               ) -> tuple[Calibration, tuple]:
     """Return the combination of the legs left, and the paths of the last."""
-    return combine(kept, config, carried), leg_paths(kept[-1], config)
+    return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
 def leg_paths(result: LegResult | None, config: Config) -> tuple:

@@ -20,6 +20,7 @@ from odocal_ros.live.process import complain, run, SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
+from odocal_ros.output.stored import known_imu
 
 TICK_S = 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
@@ -57,6 +58,7 @@ class Calibrator(SettledNode):
 
     def _build(self) -> None:
         self.config = params.declare(self)
+        known_imu(self.config)      # refused at once, not after the first leg
         params.declare_results(self)
         params.check_qos(self, map(self.resolve_topic_name, TOPICS.values()))
         self.publishing = Publishing(self)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.integral import by_step
 
 FACTOR = 5.0         # of the median interval: what is longer is a gap
 SHORTEST = 0.2       # s
@@ -11,7 +12,7 @@ FEWEST = 10          # rows that show a rhythm
 
 def gaps_longer(t: Floats, limit: float) -> Floats:
     """Return begin and end of the steps of times, (n,) s, longer than ``limit`` s: (k, 2)."""
-    k = np.flatnonzero(np.diff(t) > limit)
+    k = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
     return np.stack([t[k], t[k + 1]], -1)
 
 

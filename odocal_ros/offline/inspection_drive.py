@@ -55,10 +55,13 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
     drive = survey_drive(inputs, config)
     way, chord = way_and_chord(drive.t_fix, drive.fixes_n)
     driven = _driven(inputs, drive)
+    scale = way / driven if way > 50 and driven else drive.scale
+    # speeds by the scale that is shown
+    truer = scale / drive.scale if scale and drive.scale else 1.0
     found['drive'] = {
         'way': way, 'chord': chord, 'fix_sigma': drive.sigma,
-        'rough_scale': way / driven if way > 50 and driven else drive.scale,
-        'scale_unit': inputs.scale_unit, 'slowest': drive.slowest, 'fastest': drive.fastest,
+        'rough_scale': scale, 'scale_unit': inputs.scale_unit,
+        'slowest': drive.slowest * truer, 'fastest': drive.fastest * truer,
         'usable_fixes': len(drive.t_fix), 'travel': driven}
     found['standstills'] = [[base + a, base + b] for a, b in drive.stops.tolist()]
     options += _axes(inputs, w_i, f_i, drive, config, found, findings)

@@ -60,7 +60,9 @@ def run(args) -> int:
     from odocal_ros.offline.cli import trace_file
     from odocal_ros.offline.journal import journal_notes
     from odocal_ros.output.frames import framed
+    from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
+    imu = known_imu(_config(args))
     paths, again = once([Path(bag) for bag in args.bags])
     for path in again:
         _tell(args, f'{path} is given twice: it is read once')
@@ -93,7 +95,7 @@ def run(args) -> int:
     legs, inputs = told_apart(used, legs, inputs)
     for name, trace in traces(legs):
         warn(f'odocal: method {name} broke; please report it with {trace_file(trace)}')
-    calibration, config = framed(combine(legs, config), config, imu_frame)
+    calibration, config = framed(combine(legs, config, imu=imu), config, imu_frame)
     return _report(calibration, config, inputs, output, args)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, TrackCheck
+from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
@@ -18,6 +19,8 @@ from odocal_ros.output.track_table import in_pieces, overall
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1
+IMU_CONSTANTS = (*CONSTANTS[GYRO], *CONSTANTS[ACCEL])
+IMU_KEEPS = 0.1      # of what is believed of them: by how much warmth and time change them
 MAIN = 'calibration.json'
 # what every result names, determined or not; a scale's unit is known only with its data
 ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
@@ -54,7 +57,11 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
                               'rpy': calibration.imu_rotation_rpy}
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
-    carried = calibration.carried if config.leg.automatic else None
+    left: dict = {}
+    if calibration.carried:
+        left['imu'] = calibration.carried.only(IMU_CONSTANTS, IMU_KEEPS).as_dict()
+        if config.leg.automatic:
+            left['carried'] = calibration.carried.as_dict()
     return _plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
@@ -66,7 +73,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
         'check': {name: _check(check) for name, check in checks.items()} | {
             'per_distance': _per_distance(calibration.legs)},
         'inputs': inputs,
-        'config': flat(config)} | ({'carried': carried.as_dict()} if carried else {}))
+        'config': flat(config)} | left)
 
 
 def _method(method: MethodResult) -> dict:

@@ -10,7 +10,10 @@ from odocal_ros.calib.result import BESIDE, Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import MAIN, SCHEMA
 from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config, flat
 
+# what the Imu's constants are of
+SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade')
 BIGGEST = 2**28      # bytes; a day of legs is a thousandth of it
 
 
@@ -34,6 +37,7 @@ class Stored:
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
     carried: Carried | None = None      # what it leaves for legs to come, with leg.automatic
+    imu: Carried | None = None          # what it tells of the Imu
 
     @property
     def usable(self) -> bool:
@@ -102,7 +106,40 @@ def _stored(content, name) -> Stored:
         {key: _shares(methods, entry.get('method'), key) for key, entry in result.items()
          if key not in BESIDE},
         str(content.get('vehicle') or ''),
-        carried_from(content['carried']) if isinstance(content.get('carried'), dict) else None)
+        *(carried_from(content[part]) if isinstance(content.get(part), dict) else None
+          for part in ('carried', 'imu')))
+
+
+def known_imu(config: Config) -> Carried | None:
+    """
+    Return what the result at ``imu.constants`` tells of the Imu, None where none is named.
+
+    Raises
+    ------
+    BadUsage
+        It cannot be read, tells nothing, or is of another vehicle or Imu.
+
+    """
+    if not config.imu.constants:
+        return None
+    try:
+        found = read_stored(Path(config.imu.constants).expanduser())
+    except BadUsage as error:
+        raise BadUsage(f'imu.constants: {error}') from None
+    here = flat(config)
+    other = ['vehicle'] * (found.vehicle != config.vehicle) + [
+        name for name in SAME_IMU if found.config.get(name) != _plain(here[name])]
+    if other:
+        raise BadUsage(f'imu.constants: {found.name} is of another {" and ".join(other)}: the '
+                       'same Imu, mounted as it was, is wanted')
+    if found.imu is None:
+        raise BadUsage(f'imu.constants: {found.name} tells nothing of the Imu: no leg of it has a '
+                       'value by the smoother')
+    return found.imu
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _part(content, key, kind):

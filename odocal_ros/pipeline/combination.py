@@ -22,7 +22,8 @@ SMOOTHER = 'smoother'      # the method whose legs are combined on their border
 OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 
 
-def combine(legs, config: Config, carried: Carried | None = None) -> Calibration:
+def combine(legs, config: Config, carried: Carried | None = None,
+            imu: Carried | None = None) -> Calibration:
     """
     Combine legs of one vehicle.
 
@@ -34,6 +35,8 @@ def combine(legs, config: Config, carried: Carried | None = None) -> Calibration
         Limits, frames.
     carried : Carried, optional
         What earlier legs tell of the vehicle.
+    imu : Carried, optional
+        What other legs tell of its Imu, where nothing is carried.
 
     Returns
     -------
@@ -47,12 +50,13 @@ def combine(legs, config: Config, carried: Carried | None = None) -> Calibration
     used = good or legs
     names = dict.fromkeys(n for leg in used for n in leg.methods)
     carried = carried if carried and _belongs(carried, used) else None
+    before = carried or (imu if imu and _of_others(imu, used) else None)
     methods = {n: _combined(n, [
         (leg.methods[n], leg.driven_ns, i) for i, leg in enumerate(legs, 1)
-        if leg in used and n in leg.methods], config, carried) for n in names}
+        if leg in used and n in leg.methods], config, before) for n in names}
     on_border = {n for leg in used for n, m in leg.methods.items() if m.border}
     estimates, giving = choose(methods, config.method)
-    reasons = _leg_reasons(legs, good, twice, giving, estimates, carried is not None)
+    reasons = _leg_reasons(legs, good, twice, giving, estimates, before is not None)
     if giving:
         known = {(r.code, r.text) for r in reasons}
         rejecting = {r.code for r in reasons if r.code.gravity is Verdict.REJECTED}
@@ -79,6 +83,11 @@ def _belongs(carried, legs):
     smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
     return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
         and min(leg.start_ns for leg in legs) > carried.last_ns
+
+
+def _of_others(imu, legs):
+    """Tell whether none of the legs may be among those that told of the Imu."""
+    return not any(imu.first_ns <= leg.start_ns <= imu.last_ns for leg in legs)
 
 
 def _carried_on(methods, good, before):
@@ -115,7 +124,7 @@ def together(name, results, times_ns, config, numbers=None, carried=None) -> Met
         unknown = {n: Estimate(None, None, e.unit) for n, e in results[0].estimates.items()}
         results = [MethodResult(name, (), unknown, border=carried.border), *results]
         numbers = [0, *(numbers or range(1, len(results)))]
-        times_ns = [carried.last_ns, *times_ns]
+        times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
     if len(results) > 1 and all(r.border for r in results):
         return combine_legs(results, times_ns, config, numbers)
     return combine_method(name, results)

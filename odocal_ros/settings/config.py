@@ -88,6 +88,9 @@ class ImuConfig:
     mounting_rpy: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad', -6.3, 6.3, ro=True, about=(
         'Nominal rotation that takes the Imu frame to the body frame b (forward, left, up), fixed '
         'axes roll, pitch, yaw.'))
+    constants: str = setting('', ro=True, about='calibration.json of an earlier result of this '
+                             'vehicle, or its folder: what that tells of the Imu (scales, axes; '
+                             'not the mounting) counts as one more leg of the smoother.')
     lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
         'IMU position in base_link.'))
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to Imu stamps.')

@@ -216,3 +216,19 @@ class TestCheck:
         np.testing.assert_array_equal(track, course)
         np.testing.assert_array_equal(stretch, 1.0)
         assert len(pieces(p * 0, p * 0, t, 1.0)[0]) == 0
+
+
+def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():
+    """Yards of nine pieces of 20 m, now and then backwards: courses half a turn off."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 180.0, 0.2)
+    k = np.minimum((t / 20).astype(int), 8)
+    ends = np.array([20.0 * i + x for i in range(9) for x in (1, 19)])
+    for _ in range(300):
+        way = np.cumsum(rng.uniform(-1.5, 1.5, 9))      # rad, where it faces
+        sign = rng.choice([-1.0, 1.0], 9, p=[0.2, 0.8])
+        faces = np.interp(t, ends, np.repeat(way, 2))
+        step = sign[k, None] * np.stack([np.cos(faces), np.sin(faces)], -1) * 0.2
+        fixes = np.cumsum(step, axis=0)[::5]
+        ratio = turn_ratio(t, np.gradient(faces, t), t[::5], fixes, 1.5)
+        assert gyro_reasons(ratio, 1.0) == ()

@@ -140,6 +140,18 @@ def test_the_prior_counts_once(toy):
     assert np.sqrt(np.diag(found.covariance))[1:] == pytest.approx(PRIOR[1:], rel=1e-3)
 
 
+def test_some_constants_of_a_leg_are_told_as_with_beliefs_about_the_rest(toy):
+    whole = toy.border(0)
+    believed = np.where(np.isin(NAMES, ('z1', 'z2')), 0.0, PRIOR**-2.0)
+    H = whole.information + np.diag(believed)
+    x = np.linalg.solve(H, whole.pull + whole.information @ whole.value)
+    some = whole.only(('z1', 'z2'))
+    C = np.linalg.inv(some.information)
+    assert some.names == ('z1', 'z2')
+    assert np.linalg.inv(H)[2:4, 2:4] == pytest.approx(C, rel=1e-9)
+    assert some.value + C @ some.pull == pytest.approx(x[2:4], abs=1e-9)
+
+
 def test_the_order_of_legs_is_no_matter_where_nothing_walks(toy):
     borders = toy.borders()
     one = of(borders, np.zeros(LEGS - 1))

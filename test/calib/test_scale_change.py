@@ -12,7 +12,9 @@ from odocal_ros.calib.carried import carried_from
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.scale_steps import CHANGED, scale_steps
 from odocal_ros.calib.smoother import smooth
+from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import as_json
+from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
@@ -135,6 +137,30 @@ def test_a_result_on_the_disk_goes_on(session):
     for other in (replace(carried, last_ns=10**18), replace(carried, unit='1')):
         alone = combine(legs[2:], config, other)
         assert alone.estimates[SCALE].value == results[2].estimates[SCALE].value
+
+
+def test_what_is_known_of_an_imu_helps_the_next_calibration(session, tmp_path):
+    config, results = session
+    config = with_settings(config, {'leg.automatic': False, 'vehicle': 'van'})
+    legs = legs_of(results)
+    path = tmp_path / 'calibration.json'
+    path.write_text(json.dumps(as_json(combine(legs[:2], config), config, [], 'now')))
+    own = with_settings(config, {'imu.constants': str(path)})
+    imu = known_imu(own)
+    assert {name.split('_')[0] for name in imu.border.names} == {'gyro', 'accelerometer'}
+    alone, found, whole = (combine(some, config, imu=of) for some, of in (
+        (legs[2:], None), (legs[2:], imu), (legs, None)))
+    for name in (SCALE, YAW):
+        a, b, c = (x.estimates[name] for x in (alone, found, whole))
+        # no mounting and no scale are taken along: less than all legs together tell
+        assert 0.9 * c.sigma < b.sigma < a.sigma, name
+        assert abs(b.value - a.value) < 2 * a.sigma
+    # a leg that is in it already does not count twice, an Imu of another vehicle not at all
+    assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
+        1].estimates[YAW].sigma
+    for other in ({'vehicle': 'lorry'}, {'imu.mounting_rpy': (0.0, 0.0, 1.5)}):
+        with pytest.raises(BadUsage, match=f'of another {list(other)[0]}'):
+            known_imu(with_settings(own, other))
 
 
 def test_legs_folded_into_what_is_carried_count_as_before(session):

@@ -27,6 +27,8 @@ class Remains:
 
     moment_s: float        # wall time from the mark to the kill
     lost_s: float          # wall time from the newest Imu message in the journal to the kill
+    told_s: float          # how long the leg was by the last status, in the time that it played
+    short_s: float         # by how much the journal is shorter than that
     files: int
     marks: list            # (start, stop) as replay finds them
     start_ns: int          # the mark, as the node had published it
@@ -58,7 +60,9 @@ def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
         with player.playing(part(sent, START_S, LAST_S), SPEED):
             status = client.until(state='recording')
             time.sleep(max(0.0, moment_s - (time.monotonic() - marked)))
-            end_ns = time.time_ns()
+            # a busy machine: by then the node must have heard of most of it
+            wait_for(lambda: told(client) >= moment_s - 1.0, 'the leg in the status')
+            told_s, end_ns = told(client), time.time_ns()
             node.process.kill()
             node.wait()
             moment_s = time.monotonic() - marked
@@ -66,17 +70,25 @@ def killed(driven, moment_s: float, folder: Path, *args: str) -> Remains:
         node.end()
         client.close()
     journal, = (folder / 'journal').iterdir()
-    return remains(journal, moment_s, end_ns, int(status['leg_start_ns']))
+    return remains(journal, moment_s, end_ns, int(status['leg_start_ns']), told_s)
 
 
-def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int) -> Remains:
+def told(client) -> float:
+    """Return how long the leg is by the newest status, in s as it is played."""
+    return float(client.status['duration_s']) / SPEED
+
+
+def remains(journal: Path, moment_s: float, end_ns: int, start_ns: int,
+            told_s: float = 0.0) -> Remains:
     """Return what is left in a journal."""
     with open_bag(journal) as bag:
-        newest_ns = max(time_ns for time_ns, _ in bag.messages('/imu/data'))
+        rows = [(time_ns, m.header.stamp) for time_ns, m in bag.messages('/imu/data')]
+        newest_ns = max(time_ns for time_ns, _ in rows)
+        kept_s = max(s.sec * 10**9 + s.nanosec - start_ns for _, s in rows) * 1e-9 / SPEED
         marks, files = marked_legs(bag), len(bag.files)
     code, result, said = replayed(journal, *NUMBERS)
-    return Remains(moment_s, (end_ns - newest_ns) * 1e-9, files, marks, start_ns, code,
-                   result['legs'] if result else [], said, result)
+    return Remains(moment_s, (end_ns - newest_ns) * 1e-9, told_s, told_s - kept_s, files, marks,
+                   start_ns, code, result['legs'] if result else [], said, result)
 
 
 def replayed(journal: Path, *more: str) -> tuple[int, dict | None, str]:

@@ -43,7 +43,8 @@ class Player:
 
     def __init__(self, node, types: dict[str, str], names: dict[str, str] | None = None) -> None:
         names = {'imu': 'imu/data', 'odometer': 'odometer', 'fix': 'fix'} | (names or {})
-        qos = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+        # what a busy subscriber has not taken yet is kept for it, however long it takes
+        qos = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
         self.publishers = {}
         self._stop = threading.Event()
         for slot, msgtype in types.items():
@@ -84,3 +85,18 @@ def part(messages: list[Sent], first_s: float, last_s: float) -> list[Sent]:
     """Return the messages between two times, seconds from the first message."""
     times = (np.array([one.stamp_ns for one in messages]) - messages[0].stamp_ns) * 1e-9
     return [one for one, t in zip(messages, times, strict=True) if first_s <= t < last_s]
+
+
+def by_now(make):
+    """
+    Return a moment that is still to come, ns on the wall clock, and what ``make`` gives for it.
+
+    What is made ready meanwhile would be late on a busy machine: then for a later one.
+    """
+    ahead_ns = 10**9
+    while True:
+        begin_ns = time.time_ns() + ahead_ns
+        made = make(begin_ns)
+        if time.time_ns() < begin_ns:
+            return begin_ns, made
+        ahead_ns *= 2

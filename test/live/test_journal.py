@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 from bench import answer_of, Client, NodeProcess, wait_for
 from kills import drive, killed, remains, replayed, wrong
-from player import messages_of, part, Player, sent_of
+from player import by_now, messages_of, part, Player, sent_of
 import pytest
 
 from odocal_ros.bagio import encode
@@ -130,14 +130,14 @@ def test_dropped_legs_are_not_replayed(session):
 def test_a_killed_leg_is_replayed_from_its_mark(domain, tmp_path, moment_s):
     left = killed(drive(), moment_s, tmp_path)
     assert left.marks == [(left.start_ns, 0)]
-    # a second by design; more only where the machine is so busy that the threads wait
-    assert left.lost_s < 2.0
+    # a second by design, of what the node had heard: how late that was is the machine's load
+    assert left.short_s < 2.0
     assert wrong(left) == []
     assert left.code in (0, 1, 2)     # 2: killed before a sample came after the mark
     if moment_s > 1:
         leg, = left.legs
         assert round(leg['start'] * 1e3) == round(left.start_ns * 1e-6)
-        assert leg['stop'] - leg['start'] > 10 * (moment_s - left.lost_s - 1.0)
+        assert leg['stop'] - leg['start'] > 10 * (left.told_s - 2.0)
         assert 'the leg has no stop mark' in left.text
         assert 'STOP_MARK_MISSING' in {r['code'] for r in leg['reasons']}
 
@@ -162,20 +162,17 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, 
             ('fix', encode.fix('fix', moved(made.fix)))) for one in sent_of(slot, topic)),
             key=lambda one: one.stamp_ns)
 
-    # stamped by now, as of a real vehicle: counts are stamped by their sender's clock; a busy
-    # machine takes a second to encode, and clocks half a second apart start no leg
-    begun = time.monotonic_ns()
-    stamped(0)
-    takes = time.monotonic_ns() - begun
-    sent = stamped(time.time_ns() + takes - int(made.imu.stamp_ns[0]) - 70_000_000_000)
-    player.play(part(sent, 70, 71.5), 1)
-    client.until(state='idle')
-    answer = client.call('start_leg')
-    assert answer.success, answer.message
-    player.play(part(sent, 71.5, 74.5), 1)
-    stopping = client.ask('stop_leg')
-    player.play(part(sent, 74.5, 75), 1)
-    answer_of(stopping)
+    # stamped by now, as of a real vehicle: counts are stamped by their sender's clock, and clocks
+    # half a second apart start no leg. It drives on while services are asked, however long they
+    # take
+    begin_ns, sent = by_now(lambda begin_ns: part(
+        stamped(begin_ns - int(made.imu.stamp_ns[0]) - 70_000_000_000), 70, 170))
+    time.sleep(max(0.0, (begin_ns - time.time_ns()) * 1e-9))
+    with player.playing(sent, 1):
+        client.until(state='idle')
+        client.start()
+        wait_for(lambda: float(client.status['distance_m']) > 50.0, 'fifty metres driven')
+        answer_of(client.ask('stop_leg'))
     journal = Path(client.status['journal'])
     assert client.call('save').success
     wait_for((journal / 'metadata.yaml').exists, 'the joined journal')

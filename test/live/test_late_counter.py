@@ -8,7 +8,7 @@ import time
 
 from bench import Client, NodeProcess, wait_for
 import numpy as np
-from player import Player, Sent, sent_of
+from player import by_now, Player, Sent, sent_of
 import pytest
 
 from odocal_ros.bagio import encode
@@ -17,7 +17,6 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 FIRST_S, START_S, SLIP_S, LAST_S = 12.0, 18.0, 36.0, 54.0     # of the drive, in real time
 SLIP_M, SLIP_LASTS_S = 0.5, 0.5
 HELD_EVERY_S, HELD_S = 7.0, 0.12
-AHEAD_S = 2.0            # s to serialise it all
 TYPES = {'imu': 'sensor_msgs/msg/Imu', 'fix': 'sensor_msgs/msg/NavSatFix'} | dict.fromkeys(
     ('free', 'held', 'slip'), 'std_msgs/msg/Int64')
 LEGS = {'free': (False, False), 'held': (True, False), 'slip': (True, True)}
@@ -88,8 +87,8 @@ def test_lateness_is_no_slip_and_slip_is_found(domain, tmp_path):
         player = Player(clients['free'].node, TYPES, {'imu': '/imu', 'fix': '/fix'} | {
             name: f'/{name}/ticks' for name in LEGS})
         wait_for(player.matched, 'subscriptions of the nodes')
-        begin_ns = time.time_ns() + round((AHEAD_S - FIRST_S) * 1e9)
-        sent = messages(drive, begin_ns)
+        first_ns, sent = by_now(lambda ns: messages(drive, ns - round(FIRST_S * 1e9)))
+        begin_ns = first_ns - round(FIRST_S * 1e9)
         load = Load()
         play(player, sent, begin_ns, FIRST_S, START_S)
         starting = [client.ask('start_leg') for client in clients.values()]

@@ -59,7 +59,8 @@ def not_settled(leg, problem, fit, config) -> MethodResult:
     worst = int(np.argmax(move))
     text = (f'after {fit.iterations} passes {in_words([CONSTANTS[worst]])} still moves by '
             f'{move[worst]:.2g} of its sigma')
-    lacks = [f'turns by {np.rad2deg(problem.turned):.0f} deg in all'] * (problem.turned < NO_TURN)
+    lacks = [f'has turns of {np.rad2deg(problem.turned):.0f} deg in all'] * (
+        problem.turned < NO_TURN)
     lacks += ['does not stop'] * (not problem.still.any())
     if lacks:
         text += f'; the drive {" and ".join(lacks)}'

@@ -50,7 +50,7 @@ def assumed(problem, levels):
     least = problem.least['side']
     if least < MATTERS**2 or all(levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
-    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'the drive turns by '
-                   f'{np.rad2deg(problem.turned):.0f} deg in all, too little to test how much '
-                   f'the wheels slide sideways: {1e3 * np.sqrt(least):.0f} mm in a second are '
+    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'the turns of this drive add up to '
+                   f'{np.rad2deg(problem.turned):.0f} deg, too little to test how much the '
+                   f'wheels slide sideways: {1e3 * np.sqrt(least):.0f} mm in a second are '
                    'assumed, and the sigmas of the mounting angles rest on that')]

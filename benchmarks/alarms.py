@@ -1,0 +1,195 @@
+"""
+Alarms: of each reason that names a sensor's fault, how often it is false and how often it comes.
+
+    python benchmarks/alarms.py [--drives 20] [--only CODE] [--duration 300] [--jobs 1] [--file F]
+
+Vehicles are those of the zoo (docs/zoo.md) without any of its effects, their operators' settings
+right. Clean drives are of all kinds and grades, four times ``--drives``, half of them with two
+wheels and half with RTK. Each fault is put into drives of a kind that shows it, of a size that
+real ones have (FAULTS). Drive k of run e has seed 80_000_000 + 1_000_000 e + k, fixed before the
+first run. Rows go to the file line by line: an interrupted run goes on where it stopped.
+
+Printed by code: the fault; in how many drives with it the code is said, in how many clean ones;
+what else is said of the fault's drives, but for what is never false (zoo_table.HONEST).
+"""
+
+import argparse
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import sys
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+from resumed import read_rows
+from zoo import configured, GRADES, KINDS
+from zoo_table import BY_KIND, HONEST
+
+FIRST_SEED, SEEDS_A_RUN = 80_000_000, 1_000_000
+CHEAP = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'fix_rate': 5.0}
+RTK = {'fix_noise': 'rtk', 'fix_sigma': 0.02}
+DEG = np.pi / 180
+
+
+def shifted(samples, seconds):
+    """Return samples whose stamps are late."""
+    return replace(samples, stamp_ns=samples.stamp_ns + np.int64(round(seconds * 1e9)))
+
+
+def unsigned(leg, rng):
+    """Let the counter count up whatever the wheel does."""
+    step = np.abs(np.diff(leg.odometer.value, prepend=leg.odometer.value[:1]))
+    return replace(leg, odometer=replace(leg.odometer, value=np.cumsum(step)))
+
+
+def held_up(leg, rng):
+    """Hold messages of the counter up for 0.1 to 0.5 s, ten times; then they come at once."""
+    stamp = leg.odometer.stamp_ns.copy()
+    for at in rng.choice(stamp[100:-100], 10, replace=False):
+        end = at + round(1e9 * rng.uniform(0.1, 0.5))
+        inside = (stamp >= at) & (stamp < end)
+        stamp[inside] = end + 200_000 * np.arange(inside.sum())
+    return replace(leg, odometer=replace(leg.odometer, stamp_ns=np.sort(stamp)))
+
+
+def right(leg, wheel):
+    """Return a leg with another right wheel."""
+    return replace(leg, odometer_right=wheel)
+
+
+def of_imu(**signals):
+    """Return a change of the Imu's signals, each by a function."""
+    return lambda leg, rng: replace(leg, imu=replace(leg.imu, **{
+        name: change(getattr(leg.imu, name)) for name, change in signals.items()}))
+
+
+def matrix(scale):
+    """Return an accelerometer's matrix whose x feels a part of y (1 deg and the like)."""
+    return (0.0, scale, 0.0) + (0.0,) * 6
+
+
+# code: (fault, kind of drive, SimOptions, figures of Real, settings, change of the leg)
+FAULTS: dict = {
+    'WHEEL_SLIP': ('spins by 0.5 m, 60 an hour', 'town', {'slip_events': 60.0, 'slip_size': 0.5},
+                   {}, {}, None),
+    'REVERSING_UNSIGNED': ('a fifth backwards, no sign', 'yard', {'duration': 600.0}, {}, {},
+                           unsigned),
+    'IMU_WORSE_THAN_GRADE': ('consumer Imu, told tactical', 'town', {'imu_grade': 'consumer'},
+                             {}, {'imu.grade': 'tactical'}, None),
+    'IMU_AXES_SKEW': ('industrial, accelerometer x 1 deg off', 'town',
+                      {'imu_grade': 'industrial'}, {'accel_matrix': matrix(DEG)}, {}, None),
+    'FIXES_NOISIER_THAN_SAID': ('1.5 m, stated 0.5 m', 'town', {}, {'stated_factor': 1 / 3}, {},
+                                None),
+    'FIXES_SMOOTHED': ('first order, 0.6 s', 'town', {}, {'receiver_lag': 0.6}, {}, None),
+    'DELAY_SEEN': ('fixes 0.3 s late', 'town', {'fix_delay': 0.3}, {}, {}, None),
+    'ODOMETER_LATE': ('ten bursts, 0.1 to 0.5 s', 'town', {}, {}, {}, held_up),
+    'SPEED_COARSE': ('whole km/h', 'town', {'odometer': 'speed', 'scale': 1.01},
+                     {'speed_step': 1 / 3.6}, {}, None),
+    'COUNTER_COARSE': ('0.5 m a pulse', 'town', {'scale': 0.5}, {}, {}, None),
+    'SCALE_VARIES': ('tyres warm by 0.3 %, RTK', 'town', RTK,
+                     {'warming': 0.003, 'warming_time': 200.0}, {}, None),
+    'LEVER_ARM_OFF': ('antenna set 0.8 m off', 'town', {},
+                      {'antenna_arm_error': (0.8, 0.0, 0.0)}, {}, None),
+    'GYROCOMPASS_REFUSED': ('gyro of 1 deg/h, told navigation', 'straight',
+                            {'imu_grade': 'tactical'}, {}, {
+                                'imu.grade': 'navigation',
+                                'alignment.heading_source': 'gyrocompass',
+                                'method': 'two_point'}, None),
+    'CLOCKS_DIFFER': ('fixes in GPS time, 18 s', 'town', {}, {}, {},
+                      lambda leg, rng: replace(leg, fix=shifted(leg.fix, 18.0))),
+    'IMU_UNITS': ('force in g', 'town', {}, {}, {}, of_imu(f_i=lambda f: f / 9.81)),
+    'IMU_AXES': ('Imu turned by 90 deg', 'town', {}, {}, {}, of_imu(
+        w_i=lambda w: w[:, [1, 0, 2]] * [1, -1, 1], f_i=lambda f: f[:, [1, 0, 2]] * [1, -1, 1])),
+    'GYRO_SIGN': ('gyro counts clockwise', 'town', {}, {}, {}, of_imu(w_i=lambda w: -w)),
+    'ODOMETER_REVERSED': ('counts backwards', 'town', {}, {}, {}, lambda leg, rng: replace(
+        leg, odometer=replace(leg.odometer, value=-leg.odometer.value))),
+    'WHEEL_DEAD': ('right wheel stands', 'town', {'two_wheels': True}, {}, {},
+                   lambda leg, rng: right(leg, replace(
+                       leg.odometer_right, value=0 * leg.odometer_right.value))),
+    'WHEEL_REVERSED': ('right wheel backwards', 'town', {'two_wheels': True}, {}, {},
+                       lambda leg, rng: right(leg, replace(
+                           leg.odometer_right, value=-leg.odometer_right.value))),
+    'WHEELS_SWAPPED': ('left is right', 'town', {'two_wheels': True}, {}, {},
+                       lambda leg, rng: replace(leg, odometer=leg.odometer_right,
+                                                odometer_right=leg.odometer)),
+}
+RUNS = ('clean', *FAULTS)
+
+
+def run_drive(seed, duration):
+    """Draw, drive, calibrate; return a row."""
+    from odocal_ros.pipeline.calibrate import calibrate, combine
+    from odocal_ros.settings.config import with_settings
+    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.scenarios import simulate
+    e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
+    code, grade = RUNS[e], GRADES[k % len(GRADES)]
+    if code == 'clean':
+        kind, real, settings, change = KINDS[k % len(KINDS)], {}, {}, None
+        options = {'two_wheels': k % 2 == 1} | (RTK if k // 2 % 2 else {})
+    else:
+        _, kind, options, real, settings, change = FAULTS[code]
+    own = CHEAP | {'duration': duration} | options
+    made, _ = drawn(seed, kind, own.get('imu_grade', grade), (), real=real, **own)
+    drive = simulate(made)
+    config = with_settings(configured(drive), settings)
+    leg = drive.leg() if change is None else change(drive.leg(), np.random.default_rng(seed))
+    calibration = combine([calibrate(leg, config)], config)
+    return {'seed': seed, 'code': code, 'kind': kind, 'grade': grade, 'asked': duration,
+            'verdict': calibration.verdict.value,
+            'codes': sorted({r.code.name for r in calibration.reasons})}
+
+
+def table(rows):
+    """Print detections and false alarms by code."""
+    clean = [r for r in rows if r['code'] == 'clean']
+    print(f'{"":25}{"fault":42}{"said":>9}{"clean":>9}  beside')
+    for code, (what, *_) in FAULTS.items():
+        own = [r for r in rows if r['code'] == code]
+        if not own:
+            continue
+        beside = Counter(c for r in own for c in r['codes']
+                         if c != code and c not in HONEST | BY_KIND.get(r['kind'], set()))
+        said, false = (sum(code in r['codes'] for r in some) for some in (own, clean))
+        print(f'{code:25}{what:42}{f"{said}/{len(own)}":>9}{f"{false}/{len(clean)}":>9}  '
+              + ', '.join(f'{c} {n}' for c, n in beside.most_common(4)))
+    other = Counter(c for r in clean for c in r['codes'] if c not in FAULTS
+                    and c not in HONEST | BY_KIND.get(r['kind'], set()))
+    print('clean drives, beside:', dict(other) or 'nothing', dict(Counter(
+        r['verdict'] for r in clean)))
+
+
+def main():
+    """Run what the file does not hold yet, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=20, help='with each fault')
+    parser.add_argument('--only', choices=RUNS, action='append', default=[], metavar='CODE')
+    parser.add_argument('--duration', type=float, default=300.0, help='s of a drive')
+    parser.add_argument('--jobs', type=int, default=1, help='processes')
+    parser.add_argument('--file', type=Path, default=Path('/tmp/alarms.jsonl'))
+    args = parser.parse_args()
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row['asked'] == args.duration}
+    # by turns, so that what is there after an interruption is of all codes
+    seeds = [FIRST_SEED + SEEDS_A_RUN * RUNS.index(code) + k for j in range(args.drives)
+             for code in args.only or RUNS
+             for k in (range(4 * j, 4 * j + 4) if code == 'clean' else (j,))]
+    missing = [seed for seed in seeds if seed not in have]
+    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
+        done = pool.map(run_drive, missing, [args.duration] * len(missing))
+        for n, row in enumerate(done, 1):
+            out.write(json.dumps(row) + '\n')
+            out.flush()
+            have[row['seed']] = row
+            print(f'\r{n} of {len(missing)}', end='', file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    table([have[seed] for seed in seeds])
+
+
+if __name__ == '__main__':
+    main()
