@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.sections import Sections, sections
+from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
-from odocal_ros.nav.integral import by_row, chunks
 from odocal_ros.nav.rotations import matrix_from_quat
 
 ROWS = 5000          # of each kind kept

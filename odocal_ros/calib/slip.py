@@ -10,9 +10,10 @@ not.
 import numpy as np
 
 from odocal_ros.calib.result import Source
+from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.earth import gravity
-from odocal_ros.nav.integral import by_row, integral_at
+from odocal_ros.nav.integral import integral_at
 from odocal_ros.reasons import Code, Reason
 
 WINDOW = 4.0       # s, longer than a spin, shorter than a hill

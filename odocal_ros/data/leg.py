@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.pieces import by_row
 from odocal_ros.data.samples import (
     FixSamples,
     HeadingSamples,
@@ -29,7 +30,6 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
-from odocal_ros.nav.integral import by_row
 
 EMPTY: dict[str, Callable[[], Samples]] = {
     'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,

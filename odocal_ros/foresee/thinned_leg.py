@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.data.leg import COUNTER, Leg
 from odocal_ros.data.samples import ImuSamples, join, OdometerForm, OdometerSamples, take
-from odocal_ros.live.late_so_far import LateSoFar
+from odocal_ros.foresee.late_so_far import LateSoFar
 
 CELL_NS = 100_000_000
 MOST = 16_000           # cells of a topic: 26 minutes of 0.1 s, pre-roll and all

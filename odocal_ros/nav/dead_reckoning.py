@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import chunks
 from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
-from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.integral import by_step
+from odocal_ros.data.pieces import by_step
 
 FACTOR = 5.0         # of the median interval: what is longer is a gap
 SHORTEST = 0.2       # s

@@ -6,7 +6,7 @@ import numpy as np
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.leg import Leg, part_of
-from odocal_ros.nav.integral import by_step
+from odocal_ros.data.pieces import by_step
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config

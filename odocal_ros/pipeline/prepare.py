@@ -8,9 +8,9 @@ from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
+from odocal_ros.data.pieces import by_row, medians
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.dead_reckoning import dead_reckon
-from odocal_ros.nav.integral import by_row, medians
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align
 from odocal_ros.pipeline.coarse_odometer import coarse_reasons

@@ -6,8 +6,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import by_step, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
-from odocal_ros.nav.integral import by_step, pieces
 from odocal_ros.reasons import Code, Reason
 
 LIMIT = 0.5          # s, between topics

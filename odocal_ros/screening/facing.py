@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.nav.integral import medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 

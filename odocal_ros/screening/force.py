@@ -12,7 +12,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.nav.integral import chunks
+from odocal_ros.data.pieces import chunks
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config

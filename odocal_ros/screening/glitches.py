@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import by_row, by_step
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
-from odocal_ros.nav.integral import by_row, by_step
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig

@@ -3,7 +3,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.integral import by_row, medians
+from odocal_ros.data.pieces import by_row, medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import by_step
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.gaps import gaps_in_rhythm
-from odocal_ros.nav.integral import by_step
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.reasons import Code, Reason

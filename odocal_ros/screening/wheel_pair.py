@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
-from odocal_ros.nav.integral import integral_at, medians
+from odocal_ros.data.pieces import medians
+from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.nav.integral import by_step, chunks
+from odocal_ros.data.pieces import by_step, chunks
 
 LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
 # noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band

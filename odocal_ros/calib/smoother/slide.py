@@ -11,7 +11,7 @@ import numpy as np
 from odocal_ros.calib.smoother.noise import TURNING
 from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.start import rest_bias
-from odocal_ros.nav.integral import chunks
+from odocal_ros.data.pieces import chunks
 from odocal_ros.reasons import Code, Reason
 
 TESTED = 2e-4                   # m/sqrt(s), least that is believed where there are turns

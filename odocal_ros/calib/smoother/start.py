@@ -16,10 +16,10 @@ from odocal_ros.calib.check import pieces, steady
 from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.state import LN_K, M, PITCH, State, YAW
+from odocal_ros.data.pieces import chunks
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
-from odocal_ros.nav.integral import chunks
 from odocal_ros.nav.rotations import skew
 
 LIVELY = 1.0          # m/s^2 that an acceleration over 1 s may be of

@@ -1,0 +1,61 @@
+"""
+Long columns some rows at a time: row by row, step by step, medians; to the last bit as if at once.
+
+The Imu of a long leg is most of the memory that a computation takes, and each column as long as it
+is as much again.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.samples import let_go
+
+Array = NDArray[Any]
+CHUNK = 2**16     # rows
+
+
+def chunks(n: int, *columns: Array) -> Iterator[slice]:
+    """Yield slices of n rows; what is mapped of the columns is let go after each."""
+    for first in range(0, n, CHUNK):
+        yield slice(first, min(first + CHUNK, n))
+        let_go(*columns)
+
+
+def by_row(function: Callable[..., Array], *columns: Array) -> Array:
+    """Return what a function makes of each row of arrays, (n, ...) to (n,)."""
+    parts = [function(*(x[rows] for x in columns)) for rows in chunks(len(columns[0]), *columns)]
+    return np.concatenate(parts) if parts else function(*columns)
+
+
+def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
+    """Return what a function of rows side by side, (m, ...) to (m - steps,), makes of them all."""
+    n = len(columns[0])
+    if n < 1 + steps:
+        return function(*columns)
+    return np.concatenate([function(*(x[rows.start:rows.stop + steps] for x in columns))
+                           for rows in chunks(n - steps, *columns)])
+
+
+def medians(x: Floats) -> Floats:
+    """Return the median of each column: (n, k) to (k,)."""
+    column, found = np.empty(len(x)), []
+    for k in range(x.shape[1]):
+        for rows in chunks(len(x), x):
+            column[rows] = x[rows, k]
+        found.append(np.median(column, overwrite_input=True))
+    return np.array(found)
+
+
+def pieces(times: Array, t: Array, *columns: Array) -> Iterator[tuple[slice, slice]]:
+    """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
+    done = 0
+    for rows in chunks(len(t) - 1, *columns):
+        rows = slice(rows.start, rows.stop + 1)
+        last = rows.stop == len(t)
+        end = len(times) if last else np.searchsorted(times, t[rows.stop - 1])
+        yield slice(done, max(end, done)), rows
+        done = max(end, done)
