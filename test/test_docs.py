@@ -21,6 +21,7 @@ ELSEWHERE = {
     './tools/test': '.ci/run runs it',
     '.ci/run': 'runs these tests',
     '.venv/bin/ruff': '.ci/run runs it',
+    '.venv/bin/mypy': '.ci/run runs it',
     'export': 'for pip inside rosdep',
     'rosdep': 'needs its database from the network',
     'colcon': 'test_package.py builds with colcon and starts what it installed',

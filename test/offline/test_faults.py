@@ -23,7 +23,7 @@ def bag(tmp_path_factory):
 
 
 def test_a_method_that_breaks_leaves_a_trace_file(bag, tmp_path, monkeypatch, capsys):
-    def breaks(run):
+    def breaks(prepared, passed):
         raise ZeroDivisionError('by nothing')
     monkeypatch.setitem(leg_methods.METHODS, 'smoother', breaks)
     monkeypatch.setattr('tempfile.tempdir', str(tmp_path))

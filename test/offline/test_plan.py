@@ -149,10 +149,11 @@ def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys
     stop = predict_smoother(stop_and_start(drive), sigmas)
     assert changes['a stop and a start on the way']['yaw_mounting_angle'] == pytest.approx(
         stop.estimates['yaw_mounting_angle'].sigma, rel=1e-12)
-    # own errors are halved in variance, those shared by legs stay
+    # own errors are halved in variance, those shared by legs stay; of what is imperfect two legs
+    # together tell a little more, in the next digit
     other = changes['a second leg in the other direction']['yaw_mounting_angle']
     yaw = expected.estimates['yaw_mounting_angle'].sigma
-    assert yaw / math.sqrt(2) * 0.9999 <= other < yaw
+    assert yaw / math.sqrt(2) * 0.999 <= other < yaw
 
 
 def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):

@@ -68,9 +68,9 @@ def test_of_no_delay_nothing_is_said(method):
     (-0.04, 0.005, 1.5, True)])
 def test_it_must_be_there_and_matter(late, sigma, fix_sigma, is_said):
     t = np.arange(0.0, 60.0, 0.1)
-    run = SimpleNamespace(config=Config(), rough=0.5, fix_sigma=fix_sigma, inputs=SimpleNamespace(
+    run = SimpleNamespace(config=Config(), fix_sigma=fix_sigma, inputs=SimpleNamespace(
         travel=Travel(t, 20.0 * t, 0.0), t_stop=60.0))       # 10 m/s
-    assert bool(delay_notes(run, {'gnss': (late, sigma)})) == is_said
+    assert bool(delay_notes(run, {'gnss': (late, sigma)}, scale=0.5)) == is_said
 
 
 def test_one_method_says_it_once():
