@@ -11,6 +11,16 @@ HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
 NAME, WIDTHS = 24, (13, 15, 15)      # with 'shared' within 80 columns
 
 
+def largest_source(method, name: str) -> tuple[str, float]:
+    """Return the largest source of an estimate's error, and its share of the variance; '' none."""
+    if method is None or name not in method.parameters:
+        return '', 0.0
+    row = method.parameters.index(name)
+    parts = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
+    largest, whole = max(parts, key=lambda source: parts[source], default=''), sum(parts.values())
+    return (largest, parts[largest] / whole) if whole else ('', 0.0)
+
+
 def budget_lines(table: dict, scale: float, shown: float, hidden=(), width=98,
                  small_too=True) -> list[str]:
     """

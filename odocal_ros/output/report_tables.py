@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration, Estimate, LegResult, MethodResult
-from odocal_ros.output.budget_table import LABELS as SOURCES
+from odocal_ros.output.budget_table import LABELS as SOURCES, largest_source
 from odocal_ros.output.figures import beyond_one, share, two_digits, with_sigma
 from odocal_ros.output.summary import COUNTS, DEG, DEG_PER_HOUR, inverse, known
 from odocal_ros.output.verdicts import shown_verdict
@@ -62,7 +62,7 @@ def value_rows(calibration: Calibration) -> list[dict]:
         first, other, relative = in_units(name, estimate)
         method = calibration.methods.get(estimate.method)
         rows.append({'name': label(name), 'value': first, 'other': other, 'relative': relative,
-                     'method': label(estimate.method), 'mostly': largest_source(method, name)})
+                     'method': label(estimate.method), 'largest': _largest(method, name)})
     return rows
 
 
@@ -78,16 +78,9 @@ def undetermined(calibration: Calibration) -> list[str]:
     return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
-def largest_source(method: MethodResult | None, name: str) -> str:
-    """Return which source of error dominates the sigma of an estimate, empty if none is told."""
-    if method is None or name not in method.parameters:
-        return ''
-    row = method.parameters.index(name)
-    shares = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
-    largest = max(shares, key=lambda source: shares[source], default='')
-    if not largest or not shares[largest]:
-        return ''
-    return label(largest)
+def _largest(method, name):
+    largest, share = largest_source(method, name)
+    return f'{label(largest)} ({share:.0%})' if largest else ''
 
 
 def method_table(methods: dict[str, MethodResult], legs: tuple[LegResult, ...]) -> dict | None:

@@ -3,10 +3,11 @@
 from dataclasses import replace
 from datetime import datetime, UTC
 import math
+import re
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
-from odocal_ros.output.budget_table import budget_lines, LABELS
+from odocal_ros.output.budget_table import budget_lines, LABELS, largest_source
 from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
 from odocal_ros.output.search_table import search_lines
@@ -14,6 +15,7 @@ from odocal_ros.output.track_table import track_lines
 from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
+MOSTLY = 'mostly', 'above all'      # more than half of the variance, or the most of all
 WIDTH = 98
 FAR_SCALE = 0.005    # of a gyro's scale from 1
 SHOWN = 0.01     # share of a variance from which a source is worth a line
@@ -154,8 +156,8 @@ def _values(calibration, width):
         rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
-    return [line if len(line) <= width or width >= WIDTH else line.partition('   mostly ')[0]
-            for line in lines if line]
+    return [line if len(line) <= width or width >= WIDTH
+            else re.split(f'   (?:{"|".join(MOSTLY)}) ', line)[0] for line in lines if line]
 
 
 def _gyro_scale(calibration):
@@ -176,16 +178,13 @@ def _arm(estimates, arm, word):
 
 
 def _mostly(calibration, name):
-    """Return which source of error the sigma of an estimate is mostly made of."""
+    """Return which source makes most of an estimate's sigma, or the most of all."""
     estimate = calibration.estimates.get(name, NONE)
-    method = calibration.methods.get(estimate.method)
-    if estimate.value is None or method is None or name not in method.parameters:
+    if estimate.value is None:
         return ''
-    row = method.parameters.index(name)
-    shares = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
-    largest = max(shares, key=lambda source: shares[source], default='')
+    largest, share = largest_source(calibration.methods.get(estimate.method), name)
     label = LABELS.get(largest, largest).replace('_', ' ')
-    return f'   mostly {label}' if largest and shares[largest] else ''
+    return f'   {MOSTLY[share <= 0.5]} {label}' if largest else ''
 
 
 def _line(label, text):

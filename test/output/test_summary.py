@@ -5,14 +5,24 @@ import math
 import re
 
 from conftest import GAP
+import numpy as np
 import pytest
 
-from odocal_ros.calib.result import Calibration, Estimate, TrackCheck
+from odocal_ros.calib.result import Calibration, Estimate, Source, TrackCheck
 from odocal_ros.output.figures import beyond_one, length, time_span, with_sigma
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import screen, sentence
 from odocal_ros.output.track_table import overall
 from odocal_ros.reasons import Code, Reason
+
+
+@pytest.mark.parametrize(('others', 'word'), [(9e-6, 'mostly'), (11e-6, 'above all')])
+def test_mostly_is_more_than_half_of_the_variance(good, others, word):
+    method = good.methods['two_point']
+    sources = [Source('fixes', np.array([[1.5e-5], [0.0]])),        # 2.25 against 1.62 and 2.42
+               *(Source(name, np.array([[others], [0.0]])) for name in ('slip', 'quantisation'))]
+    text = screen(replace(good, methods={'two_point': replace(method, sources=tuple(sources))}))
+    assert re.search(f'ppm[)]   {word} fixes', text)
 
 
 @pytest.mark.parametrize(('value', 'sigma', 'text'), [
