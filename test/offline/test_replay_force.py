@@ -45,7 +45,7 @@ def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
     assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
 
 
-def interrupted(*_):
+def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
