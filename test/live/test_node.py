@@ -8,7 +8,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, ROOT, wait_for
+from bench import answer_of, Client, NodeProcess, PATIENCE, ROOT, wait_for
 from player import messages_of, part, Player
 import pytest
 from rclpy.serialization import serialize_message
@@ -87,9 +87,10 @@ def _first_leg(seen, client, player, sent):
     seen.set_in_leg = client.set(leg__min_distance=50.0)
     player.play(part(sent, 60, 115), SPEED)
     seen.recording = client.until(state='recording')
-    # a look that is due comes after the last message too: it sees 50 s of the leg or more
+    # a look that is due comes after the last message too: it sees 50 s of the leg or more; one
+    # that cost three seconds of a busy machine is followed by a minute's pause
     seen.foreseen = wait_for(lambda: client.status['estimate_scale_factor'] != 'nan'
-                             and client.status, 'a running estimate')
+                             and client.status, 'a running estimate', 4 * PATIENCE)
     # no more is sent until the answer: what the leg holds must not depend on how busy all is
     player.play(part(sent, 115, 117), SPEED)
     stopping = client.ask('stop_leg')
