@@ -106,7 +106,9 @@ class Input:
         """Name those who publish the topic where they are several, else return nothing."""
         if len(self.publishers) < 2 or self.reader is None:
             return ''
-        who = ', '.join(sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+        # a node's name comes after its topics
+        who = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
+                               else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
                                for p in self.publishers))
         return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages mix; '
                 'stop all but one')
