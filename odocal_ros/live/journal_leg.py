@@ -11,7 +11,7 @@ from odocal_ros.bagio.chunks import Chunk
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.live.journal_space import claim, clear_empty, make_room
-from odocal_ros.outside.whole import write_text
+from odocal_ros.outside.whole import new_folder, write_text
 
 MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
 MARGIN = 2**20                # for metadata and file heads
@@ -121,7 +121,7 @@ class LegJournal:
         root.mkdir(parents=True, exist_ok=True)
         clear_empty(root)
         self._others = make_room(root, self.plan.limit)
-        folder = _free(root, self.plan.name)
+        folder = new_folder(root, self.plan.name)
         try:
             write_text(folder / JOURNAL, self.plan.settings)
             self._claim = claim(folder)
@@ -150,18 +150,6 @@ class LegJournal:
         else:
             if not self._over:
                 self.trouble = ''
-
-
-def _free(root: Path, name: str) -> Path:
-    """Create a folder that is not there yet."""
-    for count in range(1, 1000):
-        folder = root / (name if count == 1 else f'{name}-{count}')
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            continue
-        return folder
-    raise OSError(f'{root} holds 1000 journals of {name}')
 
 
 def in_order(held: Mapping[str, list[Chunk]]) -> list[Chunk]:

@@ -14,6 +14,7 @@ from std_msgs.msg import Header
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.result_folders import ResultFolders
+from odocal_ros.outside.whole import new_folder
 from odocal_ros.settings.config import Config
 
 MOST_POSES = 2000
@@ -73,7 +74,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     root = output_root(config, inputs[0]['node'])
     name = f'{datetime.fromtimestamp(now_ns // 10**9, UTC):%Y-%m-%dT%H-%M-%SZ}'
     try:
-        folder = _free(root, name)
+        folder = new_folder(root, name)
         try:
             results = Results(calibration, config, folder, inputs, iso(now_ns))
             results.write()
@@ -93,16 +94,3 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
 def marks(legs) -> frozenset[int]:
     """Return the start marks of legs, ns: by them a session knows its legs."""
     return frozenset(leg.start_ns for leg in legs)
-
-
-def _free(root: Path, name: str) -> Path:
-    """Create a folder that no other save has, and return it."""
-    root.mkdir(parents=True, exist_ok=True)
-    for count in range(1, 1000):
-        folder = root / (name if count == 1 else f'{name}-{count}')
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            continue
-        return folder
-    raise OdocalError(f'{root} holds 1000 results of {name}: clear it out')

@@ -7,7 +7,6 @@ import sys
 from odocal_ros.calib.causes import ANOTHER, change_in_words, OTHER, TYRES
 from odocal_ros.offline.say import say
 
-HELP = 'change between calibrations against their sigmas'
 CAUSES = {
     'scale': f'{TYRES}; calibrate again to be sure, then use the newer value',
     'track': 'another rim or tyre; calibrate again to be sure',

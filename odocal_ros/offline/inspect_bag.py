@@ -4,7 +4,6 @@ from pathlib import Path
 
 from odocal_ros.offline.say import say
 
-HELP = 'tell what a bag holds and what it lacks'
 SLOTS = ('imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')
 
 

@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
-
-HELP = 'reproduce tables 1-4 of the two-point paper'
-PICTURES = ('.png', '.svg', '.pdf')
+from odocal_ros.output.pictures import check_picture
 
 
 def add_arguments(parser) -> None:
@@ -35,17 +32,3 @@ def run(args) -> int:
         if picture is not None:
             say(f'\n{picture}: the track and the growth of each error')
     return 0
-
-
-def check_picture(path: Path) -> None:
-    """Refuse before computing what could not be drawn after it."""
-    if path.suffix.lower() not in PICTURES:
-        raise BadUsage(f'--plot {path}: want a name that ends in {", ".join(PICTURES)}')
-    if not path.parent.is_dir():
-        raise BadUsage(f'--plot {path}: there is no folder {path.parent}; make it first')
-    if path.is_dir():
-        raise BadUsage(f'--plot {path}: is a folder, want a file')
-    from importlib.util import find_spec
-    if find_spec('matplotlib') is None:
-        raise BadUsage('--plot needs matplotlib: pip install matplotlib (or apt install '
-                       'python3-matplotlib)')

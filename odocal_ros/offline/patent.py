@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from odocal_ros.offline.paper import check_picture
 from odocal_ros.offline.say import say
+from odocal_ros.output.pictures import check_picture
 
 FIXES = ('white', 'correlated', 'rtk')
 

@@ -8,7 +8,6 @@ import sys
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
 
-HELP = 'predicted sigmas of a drive not yet driven'
 NOISE = {'white': 0.0, 'correlated': 60.0}
 
 

@@ -12,7 +12,6 @@ from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.say import say, warn
 from odocal_ros.outside.names import one_line
 
-HELP = 'calibrate from recorded bags'
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
 
 

@@ -10,7 +10,6 @@ from odocal_ros.offline.say import say
 from odocal_ros.outside.names import for_comment, for_shell, one_line
 from odocal_ros.outside.whole import uninterrupted, write_text
 
-HELP = 'write a bag with known truth'
 TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
 MADE_HERE = 'Made by odocal simulate.'
 # option: (what follows it, help); its name is SimOptions' field

@@ -6,6 +6,7 @@ Every step that a disk can refuse goes through ``disk``, so that tests can refus
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+import errno
 import fcntl
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ import signal
 import threading
 from typing import Any, BinaryIO
 
+MOST_ALIKE = 1000             # folders of one name
 PART = '.part'                # of files being written: no ending that a result's or a bag's have
 
 
@@ -53,6 +55,19 @@ def whole_file(path: Path) -> Iterator[WholeFile]:
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise
+
+
+def new_folder(root: Path, name: str) -> Path:
+    """Create a folder that nobody else has: of that name, or with a number after it."""
+    root.mkdir(parents=True, exist_ok=True)
+    for count in range(1, MOST_ALIKE + 1):
+        folder = root / (name if count == 1 else f'{name}-{count}')
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise OSError(errno.EEXIST, f'it holds {MOST_ALIKE} folders named {name}, clear it out')
 
 
 def write_text(path: Path, text: str) -> None:
