@@ -110,8 +110,8 @@ def _noisy(problem, levels):
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
     if factor <= NOISY:
         return []
-    return [Reason(Code.FIXES_NOISIER_THAN_SAID, f'the fixes stray from the track {factor:.1f} '
-                   'times as far as their covariance says')]
+    return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'white and slow errors together, the fixes '
+                   f'err {factor:.1f} times as much as their covariance says')]
 
 
 def _varies(fit, sigma):
