@@ -4,10 +4,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 import traceback
 
+import numpy as np
+
 from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason
 
 TRACE = 'trace'      # of the details: what a developer needs
+
+
+def told_if_wild() -> np.errstate:
+    """Return a context in which what runs away raises FloatingPointError, in place of warnings."""
+    return np.errstate(over='raise', divide='raise', invalid='raise')
 
 
 def failed(unknown: Callable[[Reason], MethodResult], name: str,

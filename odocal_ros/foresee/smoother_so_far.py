@@ -14,6 +14,7 @@ import time
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.failed import told_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother import smoother_leg
 from odocal_ros.calib.smoother.chain import NotPositive
@@ -102,19 +103,21 @@ class SmootherSoFar:
         self.once_s = 0.0
         try:
             view = self._view(leg, config)
-            best, problem = self._fit(view, config, trace)
-        except (NotPositive, np.linalg.LinAlgError) as error:
+            with told_if_wild():
+                best, problem = self._fit(view, config, trace)
+                running = _running(view, problem, best, config) if best.settled else None
+        except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             self._last = None
             raise BadData(f'the smoother cannot solve the way so far: {error}') from None
         except BaseException:
             self._last = None
             raise
-        if not best.settled:
+        if running is None:
             self._last = None
             raise BadData('the smoother has not settled on the way so far')
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
         self._thin = problem.thin
-        return _running(view, problem, best, config)
+        return running
 
     def _view(self, leg, config) -> SmootherLeg:
         inputs, _ = screen(leg, config)

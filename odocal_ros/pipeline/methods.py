@@ -3,9 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
-from odocal_ros.calib.failed import failed
+from odocal_ros.calib.failed import failed, told_if_wild
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
@@ -83,7 +81,7 @@ def _guarded(name, prepared, work) -> MethodRun:
     inputs = prepared.inputs
     try:
         # what runs away is told by the number that is none, not by warnings and what follows
-        with np.errstate(over='raise', divide='raise', invalid='raise'):
+        with told_if_wild():
             return work()
     except (OdocalError, MemoryError):
         raise

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 from types import SimpleNamespace
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.data.samples import take
-from odocal_ros.errors import OdocalError
+from odocal_ros.errors import BadData, OdocalError
+from odocal_ros.foresee import smoother_so_far
 from odocal_ros.foresee.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.foresee.foresight import forecast_of
 from odocal_ros.foresee.smoother_forecast import look, with_running
@@ -105,6 +107,19 @@ def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(config, 
 def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(looks):
     # from the standstill 20 s before the mark on: 50 s, 80 s, 128 s, 192 s
     assert [x.once_s > 0 for x in looks] == [False, False, True, False, True, False, True, False]
+
+
+def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, looks, monkeypatch):
+    so_far = SmootherSoFar()
+
+    def wild(*_):
+        return np.exp(np.full(3, 1e3))
+    with monkeypatch.context() as broken, warnings.catch_warnings():
+        warnings.simplefilter('error')       # a node has no place for warnings
+        broken.setattr(smoother_so_far, 'best_fit', wild)
+        with pytest.raises(BadData, match='cannot solve the way so far: overflow'):
+            so_far.look(looks[-1].leg, config)
+    assert so_far.look(looks[-1].leg, config).method.estimates['scale_factor'].value is not None
 
 
 def test_keyframes_stay_where_they_are(config, looks):
