@@ -11,6 +11,9 @@ HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"^__version__ = '(.+)'$", (HERE / NAME / '__init__.py').read_text(),
                     re.MULTILINE).group(1)
 SHARE = f'share/{NAME}'
+SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
+# pyarrow: 24 and later refuse numpy 1.26, which is Ubuntu 24.04's
+FLEET = ['dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2', 'pandas>=2.2', 'pyarrow>=15,<24']
 
 setup(
     name=NAME,
@@ -22,7 +25,7 @@ setup(
     author_email='maintainers@users.noreply.h-seed-08f791d2.example',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={f'{NAME}.output': ['templates/*']},
+    package_data={f'{NAME}.{room}': ['templates/*'] for room in ('fleet', 'output')},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
@@ -47,16 +50,30 @@ setup(
             'ros-jazzy-rclpy',
             'ros-jazzy-rmw-fastrtps-cpp',
         ],
+        # Calibration.to_frame, --export of Parquet
+        'tables': [
+            'pandas>=2',
+            'pyarrow>=14',
+        ],
+        # the site: sphinx-build -W docs site
+        'docs': SITE,
         # odocal watch
         'watch': [
             'rich>=13',
         ],
+        # odocal fleet
+        'fleet': FLEET,
         'dev': [
             'colcon-common-extensions',
+            *SITE,
+            *FLEET,
             'hypothesis>=6',
             'mpmath>=1.3',
             'mypy>=1.8',
+            'pandas>=2',
+            'pyarrow>=14',
             'pytest>=7.4',
+            'pytest-cov>=4',
             'pytest-xdist>=3.5',
             'rich>=13',
             'ruff>=0.6',

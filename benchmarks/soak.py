@@ -160,7 +160,9 @@ def grown(looks: list[Look]) -> list[str]:
     quarter = len(looks) // 4
     found = []
     for name, most in GROWTH.items():
-        before, after = (statistics.median(getattr(one, name) for one in part)
+        # some descriptors are open for a moment: what leaks raises the least of them
+        usual = min if most == 0.0 else statistics.median
+        before, after = (usual(getattr(one, name) for one in part)
                          for part in (looks[quarter:2 * quarter], looks[-quarter:]))
         grew = after > max(before * (1 + most), LEAST.get(name, 0.0))
         print(f'{name}: {before:.4g} in legs {quarter + 1} to {2 * quarter}, {after:.4g} in the '

@@ -22,13 +22,45 @@ Rooms    data       samples and legs         settings   what may be set, grades
          calib      methods, budgets, verdict, legs combined
          patent     the search of CN104359492A; paper: the tables of Shi et al. 2015
          pipeline   one pure function from leg to result
-         plan       what a drive will tell; foresee: the same while it is driven
+         planning   what a drive will tell; foresee: the same while it is driven
          apply      a calibration at work, sample by sample
          sim        drives with known truth  output     files, report, words
          live       the nodes, the only place of rclpy
-         offline    the odocal command
+         library    recordings, options and figures to answers, for any program
+         offline    the odocal command        fleet   many vehicles; the only place of Dask
 Flow     messages -> data.samples -> data.leg -> screening -> pipeline.calibrate -> calib.result
          -> status, YAML, JSON
 """
 
-__version__ = '0.1.0'
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from odocal_ros.errors import OdocalError
+    from odocal_ros.library.calibrate_bag import calibrate_bag
+    from odocal_ros.library.calibration import Calibration
+    from odocal_ros.library.compare import compare, Comparison
+    from odocal_ros.library.plan import plan, Planned
+    from odocal_ros.library.read_bag import read_bag, Recording
+    from odocal_ros.library.simulate import simulate
+    from odocal_ros.settings.config import Config
+
+__version__ = '1.0.0'
+__all__ = ['Calibration', 'Comparison', 'Config', 'OdocalError', 'Planned', 'Recording',
+           'calibrate_bag', 'compare', 'plan', 'read_bag', 'simulate']
+# name: its module; imported when it is first asked for, so that this page stays quick
+_HOMES = {'Calibration': 'library.calibration', 'Comparison': 'library.compare',
+          'Config': 'settings.config', 'OdocalError': 'errors', 'Planned': 'library.plan',
+          'Recording': 'library.read_bag', 'calibrate_bag': 'library.calibrate_bag',
+          'compare': 'library.compare', 'plan': 'library.plan', 'read_bag': 'library.read_bag',
+          'simulate': 'library.simulate'}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -57,7 +57,7 @@ class Code(Enum):
     COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
                             'farther: a count weighs less the longer the way.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
-                                  'backwards (odometer.signed).')
+                                   'backwards (odometer.signed).')
     ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '
                                  'faces backwards, set imu.mounting_rpy or imu.nominal_yaw.')
     ODOMETER_STILL = REJECT, 'Check wheel sensor and topic: the fixes move, the counter does not.'
@@ -73,7 +73,8 @@ class Code(Enum):
     IMU_AXES_SKEW = NOTE, ('Nothing: the angles are those of the axes that the Imu measures in; '
                            'set imu.misalignment_sigma to what the Imu has.')
     LEVER_ARM_OFF = CAUTION, ('Measure that lever arm again and set it: from base_link, x '
-                              'forward, y left, z up.')
+                              'forward, y left, z up. A vehicle that slides in turns (skid '
+                              'steering, tracks) looks so too: then leave it.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg; what was driven '
@@ -92,7 +93,7 @@ class Code(Enum):
     SPEED_TOO_LOW = CAUTION, 'Drive faster than leg.min_speed for at least part of the leg.'
     LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
     TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
-                               'fixes; drive again on a firm straight road with open sky.')
+                              'fixes; drive again on a firm straight road with open sky.')
     CHECK_WORSE = CAUTION, ('Keep what you had; look in the report where the track leaves the '
                             'fixes (slip, gaps, bad fixes), and drive again.')
     WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 import odocal_ros
+from odocal_ros.offline.cli import COMMANDS
 
 PACKAGE = Path(odocal_ros.__file__).parent
 HEAVY = ('rclpy', 'rosbags', 'yaml', 'matplotlib', 'scipy', 'pyproj', 'tqdm')
@@ -18,21 +19,24 @@ ROOMS = {
     'outside': '', 'data': '',
     'settings': 'outside',
     'messages': 'data settings',
-    'bagio': 'messages outside',
+    'bagio': 'data messages outside',
     'nav': 'data',
     'screening': 'data nav settings',
     'calib': 'data nav screening settings',
     'patent': 'nav',
     'pipeline': 'calib data nav patent screening settings',
-    'plan': 'calib data nav screening settings',
-    'foresee': 'calib data nav pipeline plan screening settings',
+    'planning': 'calib data nav screening settings',
+    'foresee': 'calib data nav pipeline planning screening settings',
     'apply': 'calib data nav settings',
     'sim': 'data nav settings',
     'paper': 'calib nav pipeline settings sim',
     'output': 'calib nav outside paper patent pipeline settings',
     'live': 'apply bagio calib data foresee messages output outside pipeline settings',
-    'offline': 'bagio calib data messages nav output outside paper patent pipeline plan '
-               'screening settings sim'}
+    'library': 'bagio calib data messages nav output outside pipeline planning screening settings '
+               'sim',
+    'offline': 'bagio calib data library messages nav output outside paper patent pipeline '
+               'planning screening settings sim',
+    'fleet': 'bagio calib library nav offline outside output pipeline settings'}
 COMMON = {'errors', 'reasons'}
 
 
@@ -67,20 +71,22 @@ def _own_parts(path):
     'odocal_ros.pipeline.calibrate', 'odocal_ros.calib.two_point', 'odocal_ros.nav.strapdown',
     'odocal_ros.data.leg', 'odocal_ros.messages.decode', 'odocal_ros.settings.config_file',
     'odocal_ros.output.files', 'odocal_ros.output.summary', 'odocal_ros.bagio.read',
-    'odocal_ros.offline.replay', 'odocal_ros.apply.odometry'])
+    'odocal_ros.offline.replay', 'odocal_ros.apply.odometry',
+    'odocal_ros.library.calibrate_bag'])
 def test_imports_at_the_top_stay_light(module):
     probe = f'import {module}, sys; print([m for m in {HEAVY} if m in sys.modules])'
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 
 def test_help_and_usage_errors_import_not_even_numpy():
-    for argv in (['--help'], ['replay'], ['--version']):
-        probe = (f'import sys; from odocal_ros.offline.cli import main\n'
-                 f'try: main({argv})\nexcept SystemExit: pass\n'
-                 f'print([m for m in {("numpy", *HEAVY)} if m in sys.modules])')
-        out = subprocess.check_output([sys.executable, '-c', probe], text=True,
-                                      stderr=subprocess.DEVNULL)
-        assert out.strip().splitlines()[-1] == '[]', argv
+    told = [[], ['--help'], ['--version'], ['nothing'], ['replay'], ['inspect'], ['compare'],
+            *([command, option] for command in COMMANDS for option in ('--help', '--nothing'))]
+    probe = (f'import sys; from odocal_ros.offline.cli import main\n'
+             f'for argv in {told}:\n'
+             f'    try: main(argv)\n    except SystemExit: pass\n'
+             f'    found = [m for m in {("numpy", *HEAVY)} if m in sys.modules]\n'
+             f'    assert not found, (argv, found)\n')
+    subprocess.run([sys.executable, '-c', probe], stdout=subprocess.DEVNULL, check=True)
 
 
 def test_ros_is_imported_in_live_only():
@@ -92,6 +98,16 @@ def test_rosbags_is_imported_in_bagio_only():
     users = {_part(p) for p in _modules() for name in _imports(p)
              if name.split('.')[0] == 'rosbags'}
     assert users == {'bagio'}
+
+
+def test_dask_is_imported_in_fleet_only_and_never_at_the_top():
+    users = {_part(p) for p in _modules() for name in _imports(p)
+             if name.split('.')[0] in ('dask', 'distributed', 'fsspec')}
+    assert users == {'fleet'}
+    probe = ('import odocal_ros.fleet.command, odocal_ros.fleet.outcome, odocal_ros.fleet.jobs, '
+             "sys; print([m for m in ('dask', 'distributed', 'fsspec', 'pandas', 'pyarrow') "
+             'if m in sys.modules])')
+    assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 
 @pytest.mark.parametrize('room', ROOMS)
@@ -111,7 +127,7 @@ def test_the_rooms_stand_in_order_and_nothing_else_lies_beside_them():
 
 def test_the_pure_parts_ask_no_clock_and_open_nothing():
     pure = [p for p in _modules() if _part(p) in (
-        'nav', 'screening', 'calib', 'patent', 'pipeline', 'plan', 'apply')]
+        'nav', 'screening', 'calib', 'patent', 'pipeline', 'planning', 'apply')]
     assert len(pure) > 10
     for path in pure:
         tree = ast.parse(path.read_text(encoding='utf-8'))

@@ -145,6 +145,16 @@ def test_settings_files_on_the_pages_are_taken(tmp_path):
         assert len(read_config_file(tmp_path / 'mine.yaml')) > 3
 
 
+def test_files_for_common_vehicles_are_taken():
+    files = sorted((ROOT / 'config').glob('vehicle_*.yaml'))
+    assert len(files) == 3
+    for path in files:
+        found = read_config_file(path)
+        assert found['imu.grade'] in path.read_text().partition('/**')[0], 'the head says it too'
+        assert {'vehicle', 'odometer.nominal_scale', 'gnss.lever_arm', 'imu.mounting_rpy'} <= set(
+            found), path.name
+
+
 def test_a_plan_says_what_the_page_quotes(capsys):
     words = [shlex.split(line)[1:] for page, line in all_commands('odocal')
              if page == 'docs/first_calibration.md' and ' plan ' in line]
@@ -155,3 +165,14 @@ def test_a_plan_says_what_the_page_quotes(capsys):
     found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma']
              for plan in sigmas]
     assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)
+
+
+def test_equations_have_a_number_each_and_the_code_cites_them():
+    numbered = re.findall(r'\\tag\{(S\d+)\}', page_of('docs/method.md'))
+    assert numbered == [f'S{k}' for k in range(1, len(numbered) + 1)]
+    cited: set[str] = set()
+    for path in (ROOT / 'odocal_ros' / 'calib' / 'smoother').glob('*.py'):
+        text = path.read_text(encoding='utf-8')
+        for first, last in re.findall(r'\(S(\d+)\)(?: to \(S(\d+)\))?', text):
+            cited |= {f'S{k}' for k in range(int(first), int(last or first) + 1)}
+    assert cited == set(numbered)

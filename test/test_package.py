@@ -12,6 +12,7 @@ import uuid
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 import odocal_ros
 
@@ -26,6 +27,10 @@ KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
         'rich': ('python3-rich', 'rich'), 'rosbags': ('python3-rosbags-pip', 'rosbags'),
         'scipy': ('python3-scipy', 'scipy'), 'tqdm': ('python3-tqdm', 'tqdm')}
 EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that brings it
+TABLES = {'pandas', 'pyarrow'}      # of the extra tables: who wants them is told what to install
+# of the extra for fleets, which pip alone brings: a vehicle's computer has no use for it
+FLEET = {'dask', 'distributed', 'fsspec'} | TABLES
+WITH_DISTRIBUTED = {'psutil'}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 
@@ -38,7 +43,7 @@ def imported():
                 names |= {alias.name.split('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 names.add(node.module.split('.')[0])
-    return names - set(sys.stdlib_module_names) - {'odocal_ros'} - WITH_ROSBAGS
+    return names - set(sys.stdlib_module_names) - {'odocal_ros'} - WITH_ROSBAGS - TABLES
 
 
 def test_one_version_everywhere():
@@ -46,11 +51,24 @@ def test_one_version_everywhere():
     assert XML.findtext('version') == version
     changes = (ROOT / 'CHANGELOG.rst').read_text()
     assert re.search(r'^(\d+\.\d+\.\d+) \(', changes, re.MULTILINE).group(1) == version
+    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    assert cited['version'] == version
+
+
+def test_the_changelog_is_as_bloom_reads_it():
+    """catkin_pkg reads it: a title, versions with dates, lists."""
+    changelog = pytest.importorskip('catkin_pkg.changelog', reason='no catkin_pkg here')
+    found = changelog.get_changelog_from_path(str(ROOT), 'odocal_ros')
+    newest, date, content = next(found.foreach_version())
+    assert newest == odocal_ros.__version__
+    assert date is not None
+    assert len(content[0].bullets) > 10
 
 
 def test_package_xml_names_all_that_is_imported():
     declared = {e.text for e in XML.findall('exec_depend')}
-    wanted = {KEYS[name][0] if name in KEYS else name for name in imported()}
+    wanted = {KEYS[name][0] if name in KEYS else name
+              for name in imported() - FLEET - WITH_DISTRIBUTED}
     assert len(wanted) > 10
     assert wanted <= declared
     assert XML.attrib['format'] == '3'
@@ -63,6 +81,10 @@ def test_setup_requires_all_that_is_imported_but_ros():
     required = set(re.findall(r"'([A-Za-z0-9]+)", block))
     foreign = imported() & set(KEYS) - set(EXTRA)
     assert required == {KEYS[name][1] for name in foreign}
+    assert {name for name in TABLES if f"'{name}" in setup.partition("'tables': [")[2].partition(
+        ']')[0]} == TABLES
+    listed = setup.partition('FLEET = [')[2].partition(']')[0]
+    assert set(re.findall(r"'([a-z]+)", listed)) == FLEET <= imported() | TABLES
     for name, extra in EXTRA.items():
         assert f"'{KEYS[name][1]}" in setup.partition(f"'{extra}': [")[2].partition(']')[0]
 

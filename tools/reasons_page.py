@@ -89,12 +89,15 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'forward-right-down. It was turned over for this result.',
         Code.IMU_AXES: 'Gravity shows on another axis than z, or speeding up pushes the Imu to a '
         'side: the body frame is not forward-left-up.',
-        Code.IMU_WORSE_THAN_GRADE: 'At rest the gyro is ten times noisier than its grade, or '
-        'more. Sigmas that come from the grade are then too small.',
+        Code.IMU_WORSE_THAN_GRADE: 'The Imu errs more than its grade. The smoother takes what the '
+        'drive shows instead; what rests on the grade alone, as the sigmas of the other methods, '
+        'is too small.',
         Code.IMU_AXES_SKEW: 'Axes of the Imu are farther from right angles than its grade has '
         'it. The fit holds that; a drawing of the housing is worth the less.',
         Code.LEVER_ARM_OFF: 'Where the vehicle turns and leans, a sensor moves as if it sat '
-        'decimetres from where the settings have it.',
+        'decimetres from where the settings have it. Sliding in turns is not modelled: of a '
+        'vehicle that steers by it the point found is where it slides least, not where the wheel '
+        'is.',
         Code.GYRO_SIGN: 'Where the fixes turn left the gyro turns right.',
         Code.BAG_TRUNCATED: 'A recording was not ended properly. What the file holds was read.',
         Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '

@@ -1,21 +1,19 @@
 """
-Pages made from the settings and reasons: config/*.yaml, docs/reasons.md, the README's tables.
+Pages made from the settings and reasons: config/calibrator.yaml and its like, docs/*.md.
 
 ``python -m tools.settings_page`` tells whether they agree with the code, ``--write`` makes
 them agree. A test says so too.
 """
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 import sys
 import textwrap
 
-from odocal_ros.reasons import Code
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.config import Config, SETTINGS, settings_of
 from odocal_ros.settings.setting import Setting
-from tools.reasons_page import reasons_md, WEIGHTS
+from tools.reasons_page import reasons_md
 
 ROOT = Path(__file__).resolve().parent.parent
 YAML_HEAD = """\
@@ -24,6 +22,14 @@ YAML_HEAD = """\
 /**/{}:
   ros__parameters:
 """
+SETTINGS_HEAD = """\
+# Settings
+
+Made from `odocal_ros/settings/config.py` by `python -m tools.settings_page --write`.
+
+The node's parameters, the keys of `--config` files, of `--set` and of `config=` in Python; `(ro)`:
+fixed at start-up, the others change between legs. `config/calibrator.yaml` holds them all with
+their defaults."""
 NODES = {
     'calibrator': (Config, YAML_HEAD.format('odocal_ros', 'The node takes it by --params-file, '
                                             'odocal replay by --config. Keep the lines you '
@@ -74,45 +80,29 @@ def config_yaml(node: str) -> str:
     return head + '\n'.join(lines) + '\n'
 
 
-def settings_table() -> str:
-    """Return the README's parameter table."""
-    rows = ['| parameter | type | default | unit, values | meaning |', '|---|---|---|---|---|']
+def settings_md() -> str:
+    """Return the text of docs/settings.md."""
+    rows = [SETTINGS_HEAD]
+    group = None
     for name, setting in SETTINGS.items():
+        here = name.rpartition('.')[0]
+        if here != group:
+            rows += ['', f'## {here or "general"}', '',
+                     '| parameter | type | default | unit, values | meaning |',
+                     '|---|---|---|---|---|']
+            group = here
         fixed = ' (ro)' if setting.read_only else ''
         default = scalar_text(setting.default).replace("''", "`''`")
         rows.append(f'| `{name}` | {TYPES[setting.kind]}{fixed} | {default} | {limits(setting)} | '
                     f'{setting.about} |')
-    return '\n'.join(rows)
-
-
-def reasons_table() -> str:
-    """Return the README's table of reasons."""
-    rows = ['| reason | weight | what to do |', '|---|---|---|']
-    rows += [f'| `{code.name}` | {WEIGHTS[code.gravity]} | {code.remedy} |' for code in Code]
-    return '\n'.join(rows)
-
-
-TABLES: dict[str, Callable[[], str]] = {'settings': settings_table, 'reasons': reasons_table}
-
-
-def filled(page: str) -> str:
-    """Return a page with the text between each table's begin and end comments made anew."""
-    for name, table in TABLES.items():
-        begin, end = f'<!-- {name}: begin -->', f'<!-- {name}: end -->'
-        head, _, rest = page.partition(begin)
-        _, found, tail = rest.partition(end)
-        if not found:
-            raise ValueError(f'the page has no {begin} ... {end}')
-        page = f'{head}{begin}\n{table()}\n{end}{tail}'
-    return page
+    return '\n'.join(rows) + '\n'
 
 
 def pages(root: Path = ROOT) -> dict[Path, str]:
     """Return each page's path and the text it should have."""
-    readme = root / 'README.md'
     return {**{root / 'config' / f'{node}.yaml': config_yaml(node) for node in NODES},
-            root / 'docs' / 'reasons.md': reasons_md(),
-            readme: filled(readme.read_text(encoding='utf-8'))}
+            root / 'docs' / 'settings.md': settings_md(),
+            root / 'docs' / 'reasons.md': reasons_md()}
 
 
 def main() -> int:

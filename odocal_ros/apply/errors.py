@@ -11,16 +11,17 @@ import numpy as np
 from odocal_ros.nav.rotations import skew
 
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-K, M, G, N = 12, slice(13, 15), 15, 16     # m: about the y and z axis of b
+K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # what it tells, of a body that is nearly level: no heading
 BY_REST = np.r_[3:9]
-ROAD = np.array([0.005, 0.01, 0.01])   # m/sqrt(m) along, left, up: slip and slide of any road
-HIDDEN = 0.1          # rad/s that may hide in a gap of the Imu
-SHAKE = 0.4          # m/s^2 of driving that a second of odometer does not tell, and more seconds
+# m/sqrt(m) along, left, up: slip and slide of any road
+ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
+HIDDEN_IN_GAP = 0.1    # rad/s that may hide in a gap of the Imu
+SHAKING = 0.4    # m/s^2 of driving that a second of odometer does not tell, and more seconds
 # rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the vehicle: 11
 # deg/h that stay alike for half a minute or so
 EARTH_LEFT = 6e-4
-GRAVITY = 9.81        # m/s^2; its last digits tilt nothing
+GRAVITY = 9.81    # m/s^2; its last digits tilt nothing
 
 
 class Errors:
@@ -59,7 +60,7 @@ class Errors:
         road = self.road(np.linalg.norm(way_n)) + [doubt, 0.0, 0.0]
         cov[P, P] += axes_n * road @ axes_n.T
         diagonal = np.zeros(N)
-        diagonal[PHI] = self.grade.gyro_noise**2 * T + (HIDDEN * hidden)**2
+        diagonal[PHI] = self.grade.gyro_noise**2 * T + (HIDDEN_IN_GAP * hidden)**2
         diagonal[3:5] += self._earth_left**2 * T
         diagonal[BG] = self.grade.gyro_bias_walk**2 * T
         diagonal[BA] = self.grade.accel_bias_walk**2 * T
@@ -69,7 +70,7 @@ class Errors:
     @staticmethod
     def road(way):
         """Return what slip and slide vary a way by, along, left and up, m^2."""
-        return ROAD**2 * abs(way)
+        return ROAD_PER_METRE**2 * abs(way)
 
     def lost(self, way) -> None:
         """Take in a way, m, of which nobody knows where it led."""

@@ -10,7 +10,7 @@ gyro bias; the position never jumps.
 
 import numpy as np
 
-from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKE
+from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
 from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
 from odocal_ros.apply.start import begin, Start
 from odocal_ros.apply.stream import ImuStream
@@ -22,15 +22,15 @@ from odocal_ros.nav.rotations import (
     quat_from_rotvec,
     quat_multiply,
 )
-from odocal_ros.nav.standstill import TURN
+from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
 from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.levels import FASTEST
 
 LOOK = 1.0           # s between corrections
 SPEED_OVER = 0.2     # s that a speed is taken over
 SILENT = 10.0        # s without odometer, after which attitude goes on alone
 HOLE = 0.1           # s without Imu that hide motion
-TOO_FAST = 100.0     # m/s: no land vehicle, but a scale of another unit
 
 
 class Odometry:
@@ -169,14 +169,15 @@ class Odometry:
         velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
         w = np.concatenate(self._w_look)
         resting = heard and self.wheels.still(self._t_look, self._t) and bool(
-            (w.std(axis=0) < TURN).all() and (np.abs(w.mean(axis=0) - self.bias) < TURN).all())
+            (w.std(axis=0) < REST_TURN).all()
+            and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
         # a rest that begins with this look may begin with the last of the braking
         standing = resting and self._rested
         if self.config.levelling and heard and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
             noise = 2 * self.wheels.quantum / SPEED_OVER / T
             self._correct(self.errors.by_gravity(
-                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKE, noise)))
+                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise)))
         if self.config.levelling and standing:
             variance = np.maximum(self.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
             earth_b = matrix_from_quat(self.q).T @ self._start.earth_n
@@ -199,7 +200,7 @@ class Odometry:
         rate = C_vb @ (self._turn_b / T - earth_b)
         speed = (self._s - self._s_pose) / T
         velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
-        if abs(speed) > TOO_FAST:
+        if abs(speed) > FASTEST:
             self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
         quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.apply.errors import BG
-
-SWAY = 0.05          # m/s to the side and up, of a body that no wheel feels
+from odocal_ros.settings.levels import SWAY
 
 
 @dataclass(frozen=True, eq=False)

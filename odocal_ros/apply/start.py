@@ -9,12 +9,12 @@ from odocal_ros.apply.errors import Errors
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
-from odocal_ros.nav.standstill import MOST_BIAS, TURN
+from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 
-LOOKED_AT = 2.0        # s of samples that a start is taken from
-TILT_GIVEN = 0.01      # rad of an attitude from outside
-TILT = 0.1             # rad of a road, and of a vehicle that moves while it is levelled
-UNDER_WAY = 2.0        # m/s^2 that a mean of so long may hold of braking
+LOOKED_AT = 2.0      # s of samples that a start is taken from
+TILT_GIVEN = 0.01    # rad of an attitude from outside
+ROAD_TILT = 0.1      # rad of a road, and of a vehicle that moves while it is levelled
+UNDER_WAY = 2.0      # m/s^2 that a mean of so long may hold of braking
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ def begin(imu, wheels, vehicle, config, grade) -> Start | None:
         return None
     t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
     resting = wheels.still(t[0], t[-1]) and bool(
-        (w.std(axis=0) < TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
+        (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
     return _levelled(end, t[-1] - t[0], w, f, resting, vehicle, grade)
 
 
@@ -70,7 +70,7 @@ def _levelled(row, length, w, f, resting, vehicle, grade):
     else:
         known = vehicle.gyro_bias is not None
         bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
-    errors = Errors(grade, vehicle, TILT, sigma)
+    errors = Errors(grade, vehicle, ROAD_TILT, sigma)
     if felt:        # so that the tilt hangs on the accelerometer's bias
         errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else UNDER_WAY)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import matrix_from_rpy
 
-WILD = 100.0         # rad/s: no turn rate
+WILD_RATE = 100.0    # rad/s: no turn rate
 BACK_NS = 10**9      # stamps that step back by more,
-FEW = 3              # so many in turn, are a time that began anew
+BACK_ROWS = 3        # so many in turn, are a time that began anew
 
 
 class ImuStream:
@@ -34,7 +34,7 @@ class ImuStream:
     def feed(self, block) -> bool:
         """Take rows; return False, nothing taken, where their time has begun anew."""
         stamp = block.stamp_ns + self._offset_ns
-        good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD).all(axis=1)
+        good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD_RATE).all(axis=1)
         newest = self.stamp_ns[-1] if len(self.stamp_ns) else 0
         for k in np.flatnonzero(good):
             if stamp[k] <= newest:
@@ -42,7 +42,7 @@ class ImuStream:
                 self._stale = self._stale + 1 if stamp[k] < newest - BACK_NS else self._stale
             else:
                 newest, self._stale = stamp[k], 0
-        if self._stale >= FEW:
+        if self._stale >= BACK_ROWS:
             return False
         if not good.any():
             return True

@@ -12,11 +12,12 @@ import numpy as np
 
 from odocal_ros.data.samples import OdometerForm
 
-SPEED_TIME = 0.5               # s over which the speed beside a row is taken
-QUICK, SHORT = 5.0, 0.25       # m/s that a speed may change by, s that a burst of stamps may hide
-SURE = 5                       # rows before any is doubted
-MOST_REFUSED = 2               # rows in turn; a third is believed
-GAP, GAP_FACTOR = 0.5, 2.5     # s, usual intervals: messages are missing
+SPEED_TIME = 0.5                       # s over which the speed beside a row is taken
+# m/s that a speed may change by, s that a burst of stamps may hide
+SPEED_CHANGE, STAMP_BURST = 5.0, 0.25
+SURE_ROWS = 5                          # rows before any is doubted
+MOST_REFUSED = 2                       # rows in turn; a third is believed
+MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals: messages are missing
 
 
 class Wheel:
@@ -81,11 +82,11 @@ class Wheel:
         dt, before = t - self.t[-1], self._value
         self._rows += 1
         step = self._step(value, before, dt) * self.scale
-        allowed = (1.5 * abs(self.speed) + QUICK) * max(dt, SHORT) + 3 * self.quantum
-        gap = dt > max(GAP, GAP_FACTOR * self.usual) and self._rows > SURE
+        allowed = (1.5 * abs(self.speed) + SPEED_CHANGE) * max(dt, STAMP_BURST) + 3 * self.quantum
+        gap = dt > max(MISSING_TIME, GAP_FACTOR * self.usual) and self._rows > SURE_ROWS
         if gap and self.form.quantity != 'cumulative':
             step += self._bridged(t, dt, step)
-        if abs(step) > allowed and self._rows > SURE and self._refused < MOST_REFUSED:
+        if abs(step) > allowed and self._rows > SURE_ROWS and self._refused < MOST_REFUSED:
             self._refused += 1
             self.told.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or a '
                              f'false row, no motion; bridged at {self.speed:.1f} m/s')

@@ -3,9 +3,9 @@
 import numpy as np
 
 from odocal_ros.apply.wheel import Wheel
-from odocal_ros.nav.standstill import MOVE
+from odocal_ros.nav.standstill import REST_TRAVEL
 
-STILL = 1.5      # counts that a wheel at rest may still show
+STILL_COUNTS = 1.5    # counts that a wheel at rest may still show
 SIDES = ('odometer', 'odometer_right')
 
 
@@ -82,7 +82,7 @@ class Wheels:
 
     def still(self, t_from, t_to) -> bool:
         """Return whether no wheel turned between two times."""
-        return all(abs(w.at(t_to) - w.at(t_from)) <= MOVE / 2 + STILL * w.quantum
+        return all(abs(w.at(t_to) - w.at(t_from)) <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum
                    for w in self._wheels.values())
 
     def forget(self, t) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from odocal_ros.data.arrays import Ints
+from odocal_ros.messages.raws import Raws
 from odocal_ros.outside.limits import LATEST_NS
 
 FORMATS = {'ros2msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl'}
@@ -30,6 +32,10 @@ class Message(NamedTuple):
     raw: bytes
 
 
+# topic -> bag times and messages, in order of time
+Batch = dict[str, tuple[Ints, Raws]]
+
+
 class Recording:
     """
     A file of a bag: its channels by number, their counts, first and last time.
@@ -46,6 +52,10 @@ class Recording:
     def messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
         """Yield the messages of some topics (name -> type): channel, time and bytes."""
         raise NotImplementedError
+
+    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
+        """Return the same many at a time, each a column; None where only one by one is known."""
+        return None
 
     def close(self) -> None:
         """Let go of the file."""

@@ -7,15 +7,18 @@ from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio.channels import Channel, FORMATS, Message, Recording
+from odocal_ros.bagio.channels import Batch, Channel, FORMATS, Message, Recording
 from odocal_ros.bagio.file_bytes import FileBytes
+from odocal_ros.bagio.mcap_chunk import Chunk, CHUNK_DAMAGED, unpacked
+from odocal_ros.bagio.mcap_gather import batches
 from odocal_ros.bagio.mcap_records import (
+    apart,
     CHANNEL,
     CHUNK,
-    CHUNK_HEAD,
     CHUNK_INDEX,
     END,
     FOOTER,
+    INDEX_DAMAGED,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
@@ -27,10 +30,10 @@ from odocal_ros.bagio.mcap_records import (
     STATISTICS,
     statistics_of,
     text_at,
+    TIMES,
 )
-from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS, LimitReached
+from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS
 
-CHUNK_DAMAGED, INDEX_DAMAGED = 'a damaged chunk', 'a damaged index'
 Entry = tuple[int, int, bytes]     # time, channel, message
 
 
@@ -48,6 +51,7 @@ class McapFile(Recording):
         self._allowance = allowance
         self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._places: list[Place] = []
+        self._counted = ''         # the damage known when messages were counted
         self._file = FileBytes(path)
         try:
             self._open()
@@ -64,6 +68,7 @@ class McapFile(Recording):
             self.damage = str(error) if isinstance(error, Damaged) else INDEX_DAMAGED
         self._places = []
         self._count()
+        self._counted = self.damage
 
     # ---- the index -------------------------------------------------------------------------
 
@@ -92,31 +97,52 @@ class McapFile(Recording):
         count, start_ns, end_ns, counts = found
         if not 0 <= start_ns <= end_ns < LATEST_NS and count:
             raise Damaged(INDEX_DAMAGED)
-        self._sound(start)
+        self._places = apart(self._places, start)
         self._tell(counts, start_ns, end_ns)
         return True
-
-    def _sound(self, end: int) -> None:
-        """See that no two chunks of the index are one: a file would hold more than its bytes."""
-        at = len(MAGIC)
-        for place in sorted(self._places, key=lambda place: place.at):
-            if place.at < at or place.size < 9 or place.at + place.size > end:
-                raise Damaged(INDEX_DAMAGED)
-            at = place.at + place.size
-        self._places.sort()
 
     # ---- messages --------------------------------------------------------------------------
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[Message]:
         """Yield the messages of some topics (name -> type) by time; by chunk without an index."""
-        wanted, known = self._wanted(topics), self.damage
+        wanted = self._wanted(topics)
         self._allowance.again()
         entries = self._by_time(wanted) if self._places else (
             entry for entry in self._walk() if entry[1] in wanted)
         for time_ns, key, raw in entries:
             yield Message(wanted[key], time_ns, raw)
-        if self.damage != known:
-            self._count()          # the index counts what is lost too
+        self._recount()
+
+    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
+        """Yield the same many at a time; None where the index is gone, or not of these chunks."""
+        wanted = self._wanted(topics)
+        places = [place for place in self._places
+                  if not place.channels or place.channels & wanted.keys()]
+        if not self._places or any(self._file[place.at + 9:place.at + 25] != TIMES.pack(
+                place.start_ns, place.end_ns) for place in places):
+            return None
+        return self._gathered(places, wanted)
+
+    def _gathered(self, places: list[Place], wanted: Mapping[int, Channel]) -> Iterator[Batch]:
+        self._allowance.again()
+        yield from batches(places, wanted, self._channels, self._at, self._walked, self._note)
+        self._recount()
+
+    def _at(self, place: Place) -> Chunk:
+        """Return a chunk of the index and the message index behind it, or Damaged."""
+        record = memoryview(self._file[place.at:place.at + place.size + place.index_size])
+        if record[:9] != RECORD.pack(CHUNK, place.size - 9):
+            raise Damaged(CHUNK_DAMAGED)
+        return unpacked(record[9:place.size], self._allowance)._replace(begins=record[place.size:])
+
+    def _note(self, damage: Damaged) -> None:
+        self.damage = self.damage or str(damage)
+
+    def _recount(self) -> None:
+        """Count again what an index counted, once something of that is known to be lost."""
+        if self.damage != self._counted:
+            self._count()
+            self._counted = self.damage
 
     def _by_time(self, wanted: Mapping[int, Channel]) -> Iterator[Entry]:
         """Yield the messages of the chunks in the index, those of chunks that overlap merged."""
@@ -144,14 +170,10 @@ class McapFile(Recording):
 
     def _of(self, place: Place, wanted: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; none of one that is damaged."""
-        record = self._file[place.at:place.at + place.size]
         try:
-            op, size = RECORD.unpack_from(record)
-            if op != CHUNK or size != place.size - 9:
-                raise Damaged(CHUNK_DAMAGED)
-            found = self._chunk(record[9:])
-        except (Damaged, struct.error) as error:
-            self.damage = self.damage or _said(error)
+            found = self._walked(self._at(place))
+        except Damaged as error:
+            self._note(error)
             return []
         return [entry for entry in found if entry[1] in wanted]
 
@@ -182,21 +204,14 @@ class McapFile(Recording):
 
     def _chunk(self, body: bytes, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time; or Damaged. ``cut``: the file ends in it."""
-        try:
-            start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
-            packing, at = text_at(body, CHUNK_HEAD.size)
-            (packed,) = struct.unpack_from('<Q', body, at)
-            data = body[at + 8:at + 8 + packed]
-            records = self._allowance.unpack(packing, data, size)
-        except (LimitReached, MemoryError):
-            raise
-        except Exception:    # each compression has its own error; what is lost is lost
-            raise Damaged(CHUNK_DAMAGED) from None
-        if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
-            raise Damaged(CHUNK_DAMAGED)
-        found = self._entries(records, cut)
+        return self._walked(unpacked(body, self._allowance, cut), cut)
+
+    def _walked(self, chunk: Chunk, cut: bool = False) -> list[Entry]:
+        """Return the messages of a chunk by time, as a walk over its records finds them."""
+        found = self._entries(bytes(chunk.records), cut)
         found.sort(key=itemgetter(0))
-        if found and not start_ns <= found[0][0] <= found[-1][0] <= max(end_ns, start_ns):
+        if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
+                chunk.end_ns, chunk.start_ns):
             raise Damaged(CHUNK_DAMAGED)
         return found
 

@@ -1,26 +1,37 @@
 """Records of mcap files (mcap.dev/spec): their kinds, and what stands in them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from operator import attrgetter
 import struct
 from typing import NamedTuple
 
+from odocal_ros.messages.raws import Bytes
+from odocal_ros.outside.limits import Damaged
+
 MAGIC = b'\x89MCAP0\r\n'
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 8, 11
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = (
+    2, 3, 4, 5, 6, 7, 8, 11)
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
+INDEX_DAMAGED = 'a damaged index'
 MOST_CUT = 2**26        # bytes taken of a chunk that the file ends in
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
-INDEX_HEAD = struct.Struct('<QQQQ')
+INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
 END = 9 + 20 + len(MAGIC)      # of the footer
 
 
 class Place(NamedTuple):
-    """A chunk by the index: its times, where its record stands, whose messages it holds."""
+    """
+    A chunk by the index: its times, where its record stands, whose messages it holds.
+
+    ``index_size`` is that of the message index behind it, as far as it is to be trusted.
+    """
 
     start_ns: int
     end_ns: int
     at: int
     size: int
     channels: frozenset[int]
+    index_size: int = 0
 
 
 def records_of(data, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
@@ -40,9 +51,26 @@ def place_of(body: bytes) -> Place:
     """Return the chunk that a record of the index names."""
     start_ns, end_ns, at, size = INDEX_HEAD.unpack_from(body)
     (length,) = struct.unpack_from('<I', body, INDEX_HEAD.size)
-    pairs = body[INDEX_HEAD.size + 4:INDEX_HEAD.size + 4 + length]
+    stop = INDEX_HEAD.size + 4 + length
+    pairs = body[INDEX_HEAD.size + 4:stop]
     return Place(start_ns, end_ns, at, size,
-                 frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)))
+                 frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
+                 int.from_bytes(body[stop:stop + 8], 'little'))
+
+
+def apart(places: Sequence[Place], end: int) -> list[Place]:
+    """
+    Return the chunks of an index by time, none of which lies in another, nor behind ``end``.
+
+    Raises Damaged where one does: a file would hold more than its bytes.
+    """
+    places, found, at = sorted(places, key=attrgetter('at')), [], len(MAGIC)
+    for place, after in zip(places, [*(p.at for p in places[1:]), end], strict=True):
+        if place.at < at or place.size < 9 or place.at + place.size > end:
+            raise Damaged(INDEX_DAMAGED)
+        at = place.at + place.size
+        found.append(place._replace(index_size=min(place.index_size, max(after - at, 0))))
+    return sorted(found)
 
 
 def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
@@ -51,7 +79,7 @@ def statistics_of(body: bytes) -> tuple[int, int, int, dict[int, int]]:
     return count, start_ns, end_ns, dict(struct.iter_unpack('<HQ', body[46:46 + length]))
 
 
-def text_at(body: bytes, at: int) -> tuple[str, int]:
+def text_at(body: Bytes, at: int) -> tuple[str, int]:
     """Return a text of a record and where it ends."""
     (size,) = struct.unpack_from('<I', body, at)
-    return body[at + 4:at + 4 + size].decode(), at + 4 + size
+    return bytes(body[at + 4:at + 4 + size]).decode(), at + 4 + size

@@ -8,19 +8,19 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from odocal_ros.bagio.channels import Channel, Recording
+import numpy as np
+
+from odocal_ros.bagio.channels import Batch, Channel, Recording
 from odocal_ros.bagio.mcap_file import McapFile
 from odocal_ros.bagio.rosbag1_file import Rosbag1File
 from odocal_ros.bagio.sqlite_file import SqliteFile
 from odocal_ros.errors import BadBag
+from odocal_ros.messages.raws import Raws
 from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
 BLOCK = 20_000         # messages taken at a time, and
 BLOCK_BYTES = 2**24    # bytes of them
 ZSTD = b'\x28\xb5\x2f\xfd'
-# topic -> bag times and messages, in order of arrival; lists of bytes and numbers only, which
-# the garbage collector does not look at (a list of tuples takes as long as the reading itself)
-Batch = dict[str, tuple[list[int], list[bytes]]]
 
 
 class Part:
@@ -45,6 +45,12 @@ class Part:
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch]:
         """Yield the messages of some topics (name -> type), many at a time, as CDR."""
+        batches = self._file.batches(topics)
+        first = next(batches, {}) if batches else {}
+        if batches and not any(_packed(raws[0]) for _, raws in first.values()):
+            yield from chain([first] * bool(first), batches)
+            return
+        del batches
         stream = self._messages(topics)
         while batch := group(stream):
             yield batch
@@ -53,8 +59,8 @@ class Part:
         """Yield the same one by one in order of time, for merging; slower."""
         channels = {c.topic: c for c in self.channels}
         for batch in self.batches(topics):
-            lists = ([(time_ns, i, channels[topic], raw) for i, (time_ns, raw) in
-                      enumerate(zip(*both, strict=True))] for topic, both in batch.items())
+            lists = ([(time_ns, i, channels[topic], raw) for i, (time_ns, raw) in enumerate(
+                zip(times.tolist(), raws, strict=True))] for topic, (times, raws) in batch.items())
             for time_ns, _, channel, raw in heapq.merge(*lists, key=itemgetter(0)):
                 yield channel, time_ns, raw
 
@@ -64,9 +70,7 @@ class Part:
         if first is None:
             return iter(())
         stream = chain([first], stream)
-        if first[2][:4] == ZSTD:     # each message compressed; CDR begins with a zero byte
-            return self._unpacked(stream)
-        return stream
+        return self._unpacked(stream) if _packed(first[2]) else stream
 
     def _unpacked(self, stream: Iterator[tuple]) -> Iterator[tuple]:
         """Yield messages unpacked; b'' where that fails, for readers to count."""
@@ -85,19 +89,27 @@ class Part:
             self._file.close()
 
 
+def _packed(raw: bytes) -> bool:
+    """Tell whether messages are compressed each for itself: CDR begins with a zero byte."""
+    return raw[:4] == ZSTD
+
+
 def group(stream: Iterator[tuple]) -> Batch:
     """Take messages (rosbags' connection or our Channel, time, raw), by topic; {}: none left."""
-    batch: Batch = {}
+    # lists of bytes and numbers only, which the garbage collector does not look at (a list of
+    # tuples takes as long as the reading itself)
+    found: dict[str, tuple[list[int], list[bytes]]] = {}
     messages, size = BLOCK, BLOCK_BYTES
     for channel, time_ns, raw in stream:
         try:
-            times, raws = batch[channel.topic]
+            times, raws = found[channel.topic]
         except KeyError:
-            times, raws = batch[channel.topic] = [], []
+            times, raws = found[channel.topic] = [], []
         times.append(time_ns)
         raws.append(raw)
         messages -= 1
         size -= len(raw)
         if messages <= 0 or size <= 0:
             break
-    return batch
+    return {topic: (np.array(times, np.int64), Raws.of(raws))
+            for topic, (times, raws) in found.items()}

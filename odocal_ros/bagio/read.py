@@ -8,11 +8,14 @@ import heapq
 from operator import itemgetter
 from pathlib import Path
 import tempfile
+from typing import Any
 
-from odocal_ros.bagio.parts import Batch, group, Part
+from odocal_ros.bagio.channels import Batch
+from odocal_ros.bagio.parts import group, Part
 from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
+from odocal_ros.messages import cdr
 from odocal_ros.messages.decode import Feed, Reader
 from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
@@ -124,7 +127,7 @@ class Bag:
                     used[topic] += len(block.stamp_ns)
                     feed(slot, block)
             if progress:
-                newest = max(times[-1] for times, _ in batch.values())
+                newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
         for topic, reader in readers.items():
             self._tell(topic, reader, used[topic])
@@ -142,13 +145,26 @@ class Bag:
 
     def messages(self, topic: str) -> Iterator[tuple[int, object]]:
         """Yield (bag time ns, deserialised message) of a topic; empty if it is not there."""
-        if topic not in self.topics:
-            return
-        deserialize = self._types.deserializer(self.topics[topic].msgtype)
+        if topic in self.topics:
+            yield from self._each(topic, self._types.deserializer(self.topics[topic].msgtype))
+
+    def frame(self, topic: str) -> str:
+        """Return the frame_id that the first message of a topic has; '' if there is none."""
+        msgtype = self.topics[topic].msgtype
+        deserialize = self._types.deserializer(msgtype)
+
+        def frame_of(raw: bytes) -> str:
+            told = cdr.frame_of(msgtype, raw)
+            return deserialize(raw).header.frame_id if told is None else told
+        return next((frame for _, frame in self._each(topic, frame_of)), '')
+
+    def _each(self, topic: str, read: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:
+        """Yield bag time and what a function makes of each message that it can read."""
         for batch in self._batches({topic}):
-            for time_ns, raw in zip(*batch[topic], strict=True):
+            times, raws = batch[topic]
+            for time_ns, raw in zip(times.tolist(), raws, strict=True):
                 try:
-                    message = deserialize(raw)
+                    message = read(raw)
                 except (OdocalError, MemoryError):
                     raise
                 except Exception:   # one damaged message is no reason to lose the others

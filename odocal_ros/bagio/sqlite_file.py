@@ -6,15 +6,21 @@ import sqlite3
 import struct
 from urllib.parse import quote
 
-from odocal_ros.bagio.channels import Channel, FORMATS, Message, possible, Recording
+import numpy as np
+
+from odocal_ros.bagio import sqlite_gather
+from odocal_ros.bagio.channels import Batch, Channel, FORMATS, Message, possible, Recording
+from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.bagio.sqlite_leaves import Leaves
-from odocal_ros.outside.limits import Damaged, factor
+from odocal_ros.errors import BadBag
+from odocal_ros.outside.limits import Damaged, factor, LATEST_NS
 
 STEPS = 10_000            # of sqlite's machine between two looks at how many it took
 MOST_STEPS = 20_000_000   # for any file, and
 STEPS_A_BYTE = 20         # more for each byte: a row of ten takes about 30 to read
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
+BY_TIME = 'SELECT rowid FROM messages ORDER BY timestamp'
 TEXTS = ('name', 'type', 'serialization_format')
 
 
@@ -31,6 +37,8 @@ class SqliteFile(Recording):
         self._size = path.stat().st_size
         self._leaves: Leaves | None = None
         self._sorted = True
+        self._rows: sqlite_gather.Rows | None = None
+        self._file = FileBytes(path)
         self._db = sqlite3.connect(f'file:{quote(str(path.resolve()))}?mode=ro&immutable=1',
                                    uri=True, check_same_thread=False)
         try:
@@ -82,10 +90,29 @@ class SqliteFile(Recording):
                 f'SELECT id, {", ".join(TEXTS)} FROM topics')
             if isinstance(key, int) and all(isinstance(x, str) for x in (topic, msgtype, form))}
         try:
-            self._count()
+            if not self._indexed():
+                self._count()
         except Damaged as error:
             self._to_leaves(error)
             self._count()
+
+    def _indexed(self) -> bool:
+        """Learn from the pages where all messages lie; False: that is for SQL."""
+        rows = None
+        for sql, root in self._query(
+                "SELECT sql, rootpage FROM sqlite_master WHERE name = 'messages'"):
+            rows = sqlite_gather.rows_of(self._file, root) if sqlite_gather.plain(sql) else None
+        if rows is None:
+            return False
+        known = np.isin(rows.key, list(self._channels))
+        self._rows = rows = rows.take(
+            known & (rows.time_ns >= 0) & (rows.time_ns < LATEST_NS))
+        self._sorted = bool((np.diff(rows.time_ns) >= 0).all())
+        counts = zip(*(column.tolist() for column in np.unique(rows.key, return_counts=True)),
+                     strict=True)
+        self._tell(dict(counts), int(rows.time_ns.min(initial=2**63 - 1)),
+                   int(rows.time_ns.max(initial=0)))
+        return True
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
         try:
@@ -114,12 +141,39 @@ class SqliteFile(Recording):
                 before = time_ns
                 yield key, time_ns
 
+    def batches(self, topics: Mapping[str, str]) -> Iterator[Batch] | None:
+        """Yield the same many at a time; None where SQL has to find some of them."""
+        wanted, rows = self._wanted(topics), self._rows
+        if rows is None:
+            return None
+        rows = rows.take(np.isin(rows.key, list(wanted)))
+        if (rows.offset < 0).any():
+            return None
+        if not self._sorted:
+            try:
+                ids = np.fromiter((each for each, in self._query(BY_TIME)), np.int64)
+            except Damaged:
+                return None
+            where = np.searchsorted(rows.id, ids)
+            there = where < len(rows.id)
+            where = where[there]
+            rows = rows.take(where[rows.id[where] == ids[there]])
+        return self._gathered(rows, wanted)
+
+    def _gathered(self, rows: sqlite_gather.Rows, wanted: Mapping[int, Channel]
+                  ) -> Iterator[Batch]:
+        try:
+            yield from sqlite_gather.batches(self._file, rows, wanted)
+        except sqlite_gather.Odd:
+            raise BadBag(f'{self.path}: it changes while it is read; stop what writes it'
+                         ) from None
+
     def messages(self, topics: Mapping[str, str]) -> Iterator[Message]:
         """Yield the messages of some topics (name -> type) by time; as written where damaged."""
         wanted, last = self._wanted(topics), -1
         if not self._leaves:
             try:
-                for row, key, time_ns, raw in self._rows():
+                for row, key, time_ns, raw in self._by_time():
                     if isinstance(key, int) and key in wanted and possible(time_ns):
                         # text and numbers are no messages: readers count what is none
                         yield Message(wanted[key], time_ns, raw if isinstance(raw, bytes) else b'')
@@ -133,19 +187,20 @@ class SqliteFile(Recording):
             if possible(time_ns):
                 yield Message(wanted[key], time_ns, raw)
 
-    def _rows(self) -> Iterator[tuple]:
+    def _by_time(self) -> Iterator[tuple]:
         row = 'SELECT rowid, topic_id, timestamp, data FROM messages'
         if self._sorted:
             yield from self._query(f'{row} ORDER BY rowid')
             return
         # one by one: sqlite would sort them with all their data
-        order = [each for each, in self._query('SELECT rowid FROM messages ORDER BY timestamp')]
+        order = [each for each, in self._query(BY_TIME)]
         for each in order:
             yield from self._query(f'{row} WHERE rowid = ?', each)
 
     def close(self) -> None:
         """Let go of the file."""
         self._db.close()
+        self._file.close()
         if self._leaves:
             self._leaves.close()
 

@@ -22,7 +22,7 @@ class Types:
         if definition[0]:
             self._definitions.setdefault(msgtype, definition)
 
-    def deserializer(self, msgtype: str) -> Callable[[bytes], object]:
+    def deserializer(self, msgtype: str) -> Callable[[bytes], Any]:
         """Return the function that turns CDR bytes of a type into an object."""
         def deserialize(raw: bytes) -> object:
             store = self._with(msgtype)

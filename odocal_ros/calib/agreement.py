@@ -8,8 +8,9 @@ from odocal_ros.calib.judge import share
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-LOOSE = 3.0     # sigmas of the difference, as if independent: methods that share data differ less
+# sigmas of the difference, as if independent: methods that share data differ less
 NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 CAUSES = {
     'scale_factor': {
@@ -51,7 +52,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
                 continue
             sigma = math.hypot(a.sigma, b.sigma)
             apart = b.value - a.value if name == 'scale_factor' else float(wrap(b.value - a.value))
-            if abs(apart) > LOOSE * sigma:
+            if abs(apart) > REMARK_SIGMAS * sigma:
                 off = (share(apart / a.value, '+') if name == 'scale_factor' else
                        f'{math.degrees(apart):+.3f} deg')
                 found.append(Reason(

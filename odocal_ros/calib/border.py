@@ -8,9 +8,9 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 
-LEAST = 1e-12      # of the largest eigenvalue: what is below is rounding
+ROUNDING_SHARE = 1e-12    # of the largest eigenvalue: what is below is rounding
 # unit of a constant without a prior, ln K and angles: where a leg's equations stop being linear
-UNIT = 0.05
+STEP_UNIT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Border:
     names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
     centre, sigma : (m,) what was believed beforehand, inf where nothing is.   used : (m,) the
-    sigmas with those beliefs widened that the leg gainsaid.   usual : (m,) of what may be there or
+    sigmas with those priors widened that the leg gainsaid.   usual : (m,) of what may be there or
     not, and which of both the leg's own evidence says, the sigma of what is there; 0 of others.
     """
 
@@ -98,5 +98,5 @@ class Border:
 
     def _directions(self, unit: Floats, least: float) -> tuple[Floats, Floats]:
         size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
-        keep = size > max(LEAST * size[-1], least, 1e-300)
+        keep = size > max(ROUNDING_SHARE * size[-1], least, 1e-300)
         return size[keep], V[:, keep]

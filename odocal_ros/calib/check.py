@@ -10,11 +10,11 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
 
-DIRECTION_CHORD = 10.0    # m, least length of a piece whose direction is compared
-CLEAR = 20.0              # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
-AS_FAR = (0.6, 1.6)     # of a piece driven backwards, track beside fixes
-LOOSE = 4.0               # sigmas of disagreement that name a mismatch
-SLOP = 0.002              # of the distance: slip, suspension, road
+DIRECTION_CHORD = 10.0           # m, least length of a piece whose direction is compared
+CLEAR_SIGMAS = 20.0    # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
+AS_FAR_BACKWARDS = (0.6, 1.6)    # of a piece driven backwards, track beside fixes
+MISMATCH_SIGMAS = 4.0            # sigmas of disagreement that name a mismatch
+SLOP_OF_WAY = 0.002              # of the distance: slip, suspension, road
 
 
 def stray(path: Callable[[Floats], Floats], pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
@@ -76,7 +76,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
 def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
              distance: float) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
-    allowed = LOOSE * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP * distance
+    allowed = MISMATCH_SIGMAS * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP_OF_WAY * distance
     if check.rms <= allowed:
         return ()
     return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
@@ -94,7 +94,7 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,
     stretch : (k,) how long the track is beside the fixes.
 
     """
-    need = max(DIRECTION_CHORD, CLEAR * sigma)
+    need = max(DIRECTION_CHORD, CLEAR_SIGMAS * sigma)
     a, cuts = 0, []
     for b in range(1, len(fixes_2d)):
         if np.hypot(*(fixes_2d[b] - fixes_2d[a])) >= need:
@@ -140,7 +140,7 @@ def against_travel(track_direction: Floats, course: Floats, stretch: Floats,
     off = wrap(track_direction - course)
     middle = np.angle(np.median(np.cos(off)) + 1j * np.median(np.sin(off)))
     back = np.abs(wrap(off - middle)) > np.deg2rad(135)
-    back &= (stretch > AS_FAR[0]) & (stretch < AS_FAR[1])
+    back &= (stretch > AS_FAR_BACKWARDS[0]) & (stretch < AS_FAR_BACKWARDS[1])
     if not back.any() or back.mean() > 0.5:
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'

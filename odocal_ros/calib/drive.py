@@ -3,16 +3,20 @@
 import numpy as np
 
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import LegConfig
+from odocal_ros.settings.levels import FASTEST
 
-MOVED = 20.0     # m over which fixes must spread to say that the vehicle moved
-EDGE = 0.5       # s of odometer missing at a mark worth saying
-FASTEST, ASTRAY = 100.0, 50.0     # m/s that no land vehicle drives; m by which any fix may be off
-TURNS = 0.1      # of the distance: more of it in turns is worth saying
+MOVED_SPREAD = 20.0    # m over which fixes must spread to say that the vehicle moved
+EDGE_TIME = 0.5        # s of odometer missing at a mark worth saying
+ASTRAY_FIX = 50.0      # m by which any fix may be off
+TURNS_SHARE = 0.1      # of the distance: more of it in turns is worth saying
 
 
-def judge_drive(track, t_stop, metres_per_unit, leg):
+def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
+                leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
     Judge a drive between the marks.
 
@@ -50,7 +54,7 @@ def judge_drive(track, t_stop, metres_per_unit, leg):
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
     turning = np.abs(_rate_1s(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-    if share > TURNS:
+    if share > TURNS_SHARE:
         found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
                          f'in turns above {leg.max_yaw_rate:g} rad/s'),)
     return distance, found
@@ -65,7 +69,7 @@ def _rate_1s(t, x):
 def uncovered(travel, t_stop) -> tuple[Reason, ...]:
     """Say where the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
-    edge = max(EDGE, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
+    edge = max(EDGE_TIME, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
     what = [f'begins {late:.1f} s after the start mark'] * (late > edge)
     what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
     if not what:
@@ -83,7 +87,7 @@ def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
                        'marks'),)
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
-    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(MOVED, 10 * fix_sigma)
+    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(MOVED_SPREAD, 10 * fix_sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
@@ -114,7 +118,8 @@ def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
 def within_reach(t_fix, fixes_n):
     """Tell which fixes a vehicle gets to from the one amid them, fix by fix: (k,) bool."""
     p = fixes_n[:, :2]
-    if len(p) < 2 or (np.hypot(*np.diff(p, axis=0).T) <= FASTEST * np.diff(t_fix) + ASTRAY).all():
+    steps = np.hypot(*np.diff(p, axis=0).T)
+    if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + ASTRAY_FIX).all():
         return np.ones(len(p), bool)
     amid = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
     keep, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
@@ -122,7 +127,7 @@ def within_reach(t_fix, fixes_n):
         t, x, y = rows[amid]
         for k in order:
             far = np.hypot(rows[k][1] - x, rows[k][2] - y)
-            if far <= FASTEST * abs(rows[k][0] - t) + ASTRAY:
+            if far <= FASTEST * abs(rows[k][0] - t) + ASTRAY_FIX:
                 keep[k] = True
                 t, x, y = rows[k]
     return keep

@@ -11,9 +11,9 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import matrix_from_quat
 
-ROWS = 5000          # of each kind kept
-WINDOW = 0.5         # s to either side, over which speed, turn rate and direction are taken
-CREEP = 0.2          # m in the window, below which the direction of travel is that of before
+KEPT_ROWS = 5000       # of each kind kept
+MOTION_WINDOW = 0.5    # s to either side, over which speed, turn rate and direction are taken
+CREEP_WAY = 0.2        # m in the window, below which the direction of travel is that of before
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ def _over_window(t, x):
     """Return the rate of x by time, over a second about each row: (m,)."""
     if len(t) < 2:
         return np.zeros(len(t))
-    a, b = np.clip([t - WINDOW, t + WINDOW], t[0], t[-1])
+    a, b = np.clip([t - MOTION_WINDOW, t + MOTION_WINDOW], t[0], t[-1])
     return (np.interp(b, t, x) - np.interp(a, t, x)) / np.maximum(b - a, 1e-9)
 
 
@@ -163,7 +163,7 @@ def _forward_at(t_new, t, track_n, sign):
     if not len(t):
         return np.ones(len(t_new), complex)
     z = (_over_window(t, track_n[:, 0]) + 1j * _over_window(t, track_n[:, 1])) * sign
-    moving = np.flatnonzero(np.abs(z) * 2 * WINDOW > CREEP)
+    moving = np.flatnonzero(np.abs(z) * 2 * MOTION_WINDOW > CREEP_WAY)
     if not len(moving):
         return np.ones(len(t_new), complex)
     before = np.searchsorted(moving, np.arange(len(t)), side='right') - 1
@@ -178,6 +178,6 @@ def _split(off_n, forward):
 
 
 def _few(n):
-    """Return at most ROWS row numbers, first and last included."""
-    return np.unique(np.linspace(0, n - 1, min(n, ROWS)).round().astype(int)) if n else \
+    """Return at most KEPT_ROWS row numbers, first and last included."""
+    return np.unique(np.linspace(0, n - 1, min(n, KEPT_ROWS)).round().astype(int)) if n else \
         np.empty(0, int)

@@ -15,13 +15,13 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
 
 Floats = NDArray[np.float64]
-Z95 = 1.6449         # one-sided 95 % point of the normal law
-SURE = 2.7           # deviates, one in 300: some 15 constants are looked at
-MOST_SPREADS = 3     # constants that may differ between legs before all sigmas are widened
-WIDE = 1e3           # times what values of legs differ by: more than their sigma can be
-LESS = 0.5           # of the freedom that a constant of each leg's own takes up
-STEPS = 40           # of a bisection
-BENDS = 3            # passes in which legs are taken to where they were not linearised
+Z95 = 1.6449            # one-sided 95 % point of the normal law
+DEVIATES = 2.7          # deviates, one in 300: some 15 constants are looked at
+MOST_SPREADS = 3        # constants that may differ between legs before all sigmas are widened
+ANY_SPREAD = 1e3        # times what values of legs differ by: more than their sigma can be
+SPREAD_FREEDOM = 0.5    # of the freedom that a constant of each leg's own takes up
+BISECTIONS = 40         # of a bisection
+BENDING_PASSES = 3      # passes in which legs are taken to where they were not linearised
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +103,9 @@ def _disputed(legs) -> dict[str, float]:
         found = []
         for name in (n for n in legs.names if n not in spread):
             left, rest = legs.disagreement(spread | {name: np.inf})
-            if freedom - rest > LESS:
+            if freedom - rest > SPREAD_FREEDOM:
                 found.append((deviate(now - left, freedom - rest), name, left + freedom - rest))
-        if not found or max(found)[0] < SURE:
+        if not found or max(found)[0] < DEVIATES:
             break
         _, name, target = max(found)
         spread = spread | {name: _spread(legs, spread, name, target)}
@@ -121,10 +121,10 @@ def _spread(legs, spread, name, target) -> float:
     does not differ by 4 %, and legs told of it without that say what their noise wants.
     """
     i = legs.names.index(name)
-    high = WIDE * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
+    high = ANY_SPREAD * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
     high = min(high, float(legs.used[i]))
     low = high * 1e-12
-    for _ in range(STEPS):
+    for _ in range(BISECTIONS):
         middle = float(np.sqrt(low * high))
         chi2, _ = legs.disagreement(spread | {name: middle})
         low, high = (middle, high) if chi2 > target else (low, middle)
@@ -135,7 +135,7 @@ def _bend(legs, curved):
     """Give each leg an error of its own for the way from where it was linearised; (J,) of it."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
-    for _ in range(BENDS if curved else 0):
+    for _ in range(BENDING_PASSES if curved else 0):
         x, _ = legs.solve()
         way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
         bent = (way**2).sum(axis=1) / 2

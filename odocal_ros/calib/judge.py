@@ -16,13 +16,13 @@ MISTAKEN = {
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'a counter of the four edges of a pulse',
                 0.5: 'a counter of both edges of a pulse'}}
-LIKE = 0.04         # of such a ratio
+LIKE_RATIO = 0.04    # of such a ratio
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return which unit a scale so far from its nominal looks like, and what to set then."""
     for known, what in MISTAKEN.get(unit, {}).items():
-        if abs(ratio / known - 1) < LIKE:
+        if abs(ratio / known - 1) < LIKE_RATIO:
             return f', as {what} would be', (
                 f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or mend the sender; '
                 'else check the odometer: odometer.max_scale_deviation is the limit.')
@@ -39,19 +39,24 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
         if relative > config.verdict.max_scale_sigma:
             reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, f'scale sigma {share(relative)}, '
                                   f'{share(config.verdict.max_scale_sigma)} asked'))
-        if nominal_scale:
-            off = scale.value / nominal_scale - 1
-            if abs(off) > config.odometer.max_scale_deviation:
-                why, do = _unit(off + 1, scale.unit, nominal_scale)
-                reasons.append(Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale.value:.6g} '
-                                      f'{scale.unit} is {100 * off:+.1f} % from the nominal '
-                                      f'{nominal_scale:.6g}{why}', do))
+        reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
         sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
         reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '
                               'deg asked'))
     return tuple(reasons)
+
+
+def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) -> list[Reason]:
+    """Return SCALE_FAR_FROM_NOMINAL where a scale is; nominal: 0 unknown."""
+    off = scale / nominal - 1 if nominal else 0.0
+    if abs(off) <= config.odometer.max_scale_deviation:
+        return []
+    why, do = _unit(off + 1, unit, nominal)
+    of = '' if unit == '1' else f' {unit}'
+    return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+.1f} % '
+                   f'from the nominal {nominal:.6g}{why}', do)]
 
 
 def share(relative: float, sign: str = '') -> str:

@@ -1,15 +1,15 @@
-"""The rows of several legs as one least squares: constants they share, one that walks, beliefs."""
+"""The rows of several legs as one least squares: constants they share, one that walks, priors."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, UNIT
+from odocal_ros.calib.border import Border, STEP_UNIT
 
-LEAST_STEP = 1e-7    # of ln K between legs: what no vehicle keeps, and no equations hold
-NO_NEWS = 1e-6       # share of a leg's information on a constant that others do not foresee
-TELLS = 1.0          # information by that believed: what a leg tells of a constant
-SAME = 1e-8          # singular value, of the largest, that is rounding
+LEAST_STEP = 1e-7        # of ln K between legs: what no vehicle keeps, and no equations hold
+NO_NEWS_SHARE = 1e-6     # share of a leg's information on a constant that others do not foresee
+TELLING_RATIO = 1.0      # information by that believed: what a leg tells of a constant
+ROUNDING_VALUE = 1e-8    # singular value, of the largest, that is rounding
 
 
 class LinkedLegs:
@@ -27,7 +27,7 @@ class LinkedLegs:
         self.sigma, self.used, self.usual = (
             np.max([getattr(b, which) for b in self.borders], axis=0)
             for which in ('sigma', 'used', 'usual'))
-        self.unit = np.where(np.isfinite(self.used), self.used, UNIT)
+        self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
         self.steps = np.maximum(steps, LEAST_STEP)
 
@@ -116,12 +116,12 @@ class LinkedLegs:
         Of what legs tell at least as well as it was believed: farther off than that their
         equations need not be true.
         """
-        A, b = self.system(spread, [b.told(self.unit, TELLS) for b in self.borders])
-        # beliefs hold what no leg tells: else two legs that tell half of the constants each, in
+        A, b = self.system(spread, [b.told(self.unit, TELLING_RATIO) for b in self.borders])
+        # priors hold what no leg tells: else two legs that tell half of the constants each, in
         # directions that are never the same, would have one set of them, however far apart
         prior, centre = self._beliefs(A.shape[1])
         U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
-        of_legs, U = slice(len(A)), U[:, size > SAME * size[0]]
+        of_legs, U = slice(len(A)), U[:, size > ROUNDING_VALUE * size[0]]
         rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
         return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
 
@@ -135,12 +135,12 @@ class LinkedLegs:
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
         for j, border in enumerate(self.borders):
-            border = border.told(self.unit, TELLS)
+            border = border.told(self.unit, TELLING_RATIO)
             border = border.loosened(spread) if spread else border
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
-            news = variance > np.maximum(NO_NEWS * np.diag(D), 1e-300)
+            news = variance > np.maximum(NO_NEWS_SHARE * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 
@@ -166,6 +166,6 @@ def _on(border: Border, names) -> Border:
         out = np.full(m, rest)
         out[at] = values
         return out
-    # a belief that a leg does not have is none that it has widened
+    # a prior that a leg does not have is none that it has widened
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
                   on(border.sigma, 0.0), on(border.used, 0.0), on(border.usual, 0.0))

@@ -6,14 +6,17 @@ with them states the whole error; their scatter shows what part of it changes fr
 that part averages down, unless the data show that the slow part moved on within the window too.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-MARK_WINDOW = 1.0    # s, least half-window of fixes about a mark in motion
-OUTLIER = 5.0        # robust sigmas from the median
-ENOUGH = 20          # fixes below which nothing is judged about their correlation
+from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.levels import OUTLIER_SIGMAS
+
+MARK_WINDOW = 1.0         # s, least half-window of fixes about a mark in motion
+FEWEST_CORRELATED = 20    # fixes below which nothing is judged about their correlation
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,7 @@ def _near_middle(position_n, covariance_n):
     # medians: 1.1774 sigma of a Rayleigh law, 0.6745 of a normal one
     spread = max(np.median(level) / 1.1774, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
     spread_up = max(np.median(up) / 0.6745, 0.2 * np.sqrt(stated[2]))
-    return (level <= OUTLIER * spread) & (up <= OUTLIER * spread_up)
+    return (level <= OUTLIER_SIGMAS * spread) & (up <= OUTLIER_SIGMAS * spread_up)
 
 
 def _share(t, residual, whole, weight, correlation_time):
@@ -93,7 +96,7 @@ def _share(t, residual, whole, weight, correlation_time):
         return white
     if not np.isnan(correlation_time):
         return _left(t, weight, correlation_time)
-    if n < ENOUGH:
+    if n < FEWEST_CORRELATED:
         return 1.0
     sigma = np.sqrt(np.diag(whole))
     z = residual[:, :2] / sigma[:2]
@@ -128,7 +131,7 @@ def _correlation_time(t, z, fast, slow):
     return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-moved))
 
 
-def standing_at(t_mark, spans, slack=0.5):
+def standing_at(t_mark: float, spans: Floats, slack: float = 0.5) -> tuple[float, float] | None:
     """Return the standstill (begin, end) that contains or touches a mark, or None."""
     for begin, end in spans:
         if begin - slack <= t_mark <= end + slack:
@@ -136,7 +139,9 @@ def standing_at(t_mark, spans, slack=0.5):
     return None
 
 
-def fix_at(t_mark, span, fixes, displacement_n, correlation_time, window) -> MarkFix | None:
+def fix_at(t_mark: float, span: tuple[float, float] | None, fixes: tuple[Floats, Floats, Floats],
+           displacement_n: Callable[[Floats], Floats], correlation_time: float,
+           window: float) -> MarkFix | None:
     """
     Return the antenna position at a mark.
 

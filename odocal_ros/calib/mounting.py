@@ -11,11 +11,13 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import LEAST, pushes
+from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
 from odocal_ros.screening.screen import Inputs
 
-SURE = np.deg2rad(15.0)        # 1 sigma of the forward axis, to name it
-NEAR = np.deg2rad(30.0)        # an axis this near to another is meant to be it
+# of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but the other way round
+FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
+AXIS_SIGMA = np.deg2rad(15.0)    # 1 sigma of the forward axis, to name it
+MEANT_AXIS = np.deg2rad(30.0)    # an axis this near to another is meant to be it
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +89,9 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
         C = np.stack([forward_i, np.cross(up_i, forward_i), up_i])
         nearest = max(_quarter_turns(), key=lambda q: np.trace(q @ C.T))
         off = float(np.arccos(np.clip((np.trace(nearest @ C.T) - 1) / 2, -1, 1)))
-        return Mounting(nearest if off < NEAR + sigma else None, forward_i, sigma, False, off)
-    if abs(up_i[2]) > np.cos(NEAR):        # upright or upside down: x is forward, most likely
+        found = nearest if off < MEANT_AXIS + sigma else None
+        return Mounting(found, forward_i, sigma, False, off)
+    if abs(up_i[2]) > np.cos(MEANT_AXIS):     # upright or upside down: x is forward, most likely
         C_bi = np.diag([1.0, np.sign(up_i[2]), np.sign(up_i[2])])
         return Mounting(C_bi, None, sigma, True, float(np.arccos(abs(up_i[2]))))
     return Mounting(None, None, sigma, True, 0.0)
@@ -108,7 +111,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     A, F = found.onward + 1j * found.inward, found.force
     A, F = A - A.mean(), F - F.mean()
     power = float(np.vdot(A, A).real)
-    if len(A) < LEAST or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
+    if len(A) < FEWEST_BINS_FACING or power < 1e-3 * len(A) * 0.05:     # hardly a push anywhere
         return None, np.pi
     gain = np.vdot(A, F) / power
     if not gain:            # of no accelerometer
@@ -116,7 +119,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     rest = F - gain * A
     # half the residual lies across the axis; neighbours share noise, so count every third bin
     sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
-    if sigma > SURE:
+    if sigma > AXIS_SIGMA:
         return None, sigma
     theta = np.angle(gain)
     return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma

@@ -8,8 +8,8 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import LegResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
-SURE = 5.0           # sigmas
 MOST_SCALE = 0.05    # tyres: wear 2 %, pressure and load 1 %, another make 3 %
 MOST_YAW = 0.087     # rad (5 deg): no mounting gives way so far
 
@@ -66,7 +66,7 @@ def _farthest(told: list[_Told]) -> tuple[_Told, _Told] | None:
     order = sorted(told, key=lambda one: one.value)
     low, high = order[0], order[-1]
     noise = (high.sigma**2 + low.sigma**2)**0.5
-    return (low, high) if high.value - low.value > SURE * noise else None
+    return (low, high) if high.value - low.value > FAULT_SIGMAS * noise else None
 
 
 def _numbers(numbers: Iterable[int]) -> str:

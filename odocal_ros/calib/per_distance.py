@@ -7,13 +7,13 @@ import numpy as np
 from odocal_ros.calib.result import PerDistance
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-LENGTHS = 100.0, 500.0, 1000.0      # m
-BEGINNINGS = 10     # of pieces, on the length of one
-TOO_LONG = 1.2      # times the length: fixes are missing in there
-FEWEST = 3.0        # pieces end to end, for a word on them
-SURE = 3.0          # sigmas of the difference of two mean squares
-WORSE = 1.1         # times as far, below which nobody would mind
+PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m
+PIECE_STARTS = 10                       # of pieces, on the length of one
+PIECE_TOO_LONG = 1.2                    # times the length: fixes are missing in there
+FEWEST_PIECES = 3.0                     # pieces end to end, for a word on them
+WORSE_TIMES = 1.1                       # times as far, below which nobody would mind
 
 
 def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
@@ -40,21 +40,21 @@ def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistanc
 
 def _lengths(way: Floats, before: Floats,
              after: Floats) -> Iterator[tuple[float, float, list[Floats]]]:
-    for length in LENGTHS:
+    for length in PIECE_LENGTHS:
         a, b = _ends(way, length)
         if len(a):
             squares = [((x[b] - x[a])[:, :2]**2).sum(axis=1) for x in (before, after)]
-            yield length, len(a) / BEGINNINGS, squares
+            yield length, len(a) / PIECE_STARTS, squares
 
 
 def _ends(way: Floats, length: float) -> tuple[Ints, Ints]:
     """Return the rows at which pieces of a length begin and end, a tenth of it apart."""
-    begin = np.arange(way[0], way[-1] - length, length / BEGINNINGS) if len(way) else np.empty(0)
+    begin = np.arange(way[0], way[-1] - length, length / PIECE_STARTS) if len(way) else np.empty(0)
     a = np.searchsorted(way, begin)
     b = np.searchsorted(way, way[a] + length)
     whole = b < len(way)
     a, b = a[whole], b[whole]
-    near = way[b] - way[a] <= TOO_LONG * length
+    near = way[b] - way[a] <= PIECE_TOO_LONG * length
     return a[near], b[near]
 
 
@@ -66,8 +66,8 @@ def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) ->
     """
     for length, pieces, (was, now) in _lengths(way, before, after):
         more = now - was
-        if pieces < FEWEST or now.mean() < WORSE**2 * was.mean() \
-                or more.mean() < SURE * more.std() / np.sqrt(pieces):
+        if pieces < FEWEST_PIECES or now.mean() < WORSE_TIMES**2 * was.mean() \
+                or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(pieces):
             continue
         return [Reason(Code.CHECK_WORSE, f'in {length:g} m the track as calibrated strays '
                        f'{np.sqrt(now.mean()):.2g} m rms from the fixes, '

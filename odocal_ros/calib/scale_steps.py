@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.linked_legs import LinkedLegs
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-CHANGED = 3.0       # sigmas of the difference: by chance once in 370 legs
 FREE = 1.0          # of ln K: what a change may be
 
 
@@ -34,14 +34,14 @@ def scale_steps(borders, steps, drifting: str, angles=()) -> list[ScaleStep]:
 
     Returns
     -------
-    Changes beyond CHANGED, in order. After one, a leg is held against those since.
+    Changes beyond REMARK_SIGMAS, in order. After one, a leg is held against those since.
 
     """
     steps, found = np.array(steps, float), []
     for j in range(1, len(borders)):
         legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
         sigmas = float(legs.deviations()[j, legs.drifting])
-        if abs(sigmas) <= CHANGED:
+        if abs(sigmas) <= REMARK_SIGMAS:
             continue
         steps[j - 1] = FREE
         legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)

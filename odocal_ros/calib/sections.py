@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 
-SECTIONS = 10        # equal parts of the way
-FEWEST = 8           # fixes of a section
-BLOCKS = 24          # means of fixes that a section is made of: noise from one to the next is gone
-SHORTEST = 10.0      # m, of a section
-LEAST = 0.01         # of a stated sigma: fixes are not better than that, one to the next
-LAGS = (1, 3)        # blocks, at which the correlation is looked at
-FAR = 16             # blocks from which the longer lag tells
+SECTIONS = 10              # equal parts of the way
+FEWEST_OF_SECTION = 8      # fixes of a section
+# means of fixes that a section is made of: noise from one to the next is gone
+SECTION_BLOCKS = 24
+SHORTEST_SECTION = 10.0    # m, of a section
+LEAST_OF_STATED = 0.01     # of a stated sigma: fixes are not better than that, one to the next
+BLOCK_LAGS = (1, 3)        # blocks, at which the correlation is looked at
+LONG_LAG = 16         # blocks from which the longer lag tells
 Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
-MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])  # block to block
+MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])    # block to block
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
 
     """
     whole = way[-1] - way[0] if len(way) else 0.0
-    count = int(min(SECTIONS, len(way) // FEWEST, whole // SHORTEST))
+    count = int(min(SECTIONS, len(way) // FEWEST_OF_SECTION, whole // SHORTEST_SECTION))
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
     edges = way[0] + whole * np.linspace(0.0, 1.0, count + 1)
@@ -65,8 +66,8 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     fits = {}
     for i in range(count):
         rows = np.flatnonzero(part == i)
-        if len(rows) >= FEWEST and np.ptp(way[rows]) > 0:
-            blocks = np.array_split(rows, min(len(rows), BLOCKS))
+        if len(rows) >= FEWEST_OF_SECTION and np.ptp(way[rows]) > 0:
+            blocks = np.array_split(rows, min(len(rows), SECTION_BLOCKS))
             fits[i] = _stretched(*(np.array([x[b].mean() for b in blocks]) for x in (z, w)))
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
                         strict=True):
@@ -95,9 +96,9 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
     # white noise on top hides a memory at the next block, not further on: the longer one counts
     memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
                            / whole if whole else 0.0, row, at)
-                 for lag, row in zip(LAGS, alike, strict=True) if lag == 1 or n >= FAR)
+                 for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= LONG_LAG)
     level = np.maximum(power, np.median(power)) / np.interp(memory, at, left_over)
-    level = np.maximum(level, (LEAST * stated)**2)
+    level = np.maximum(level, (LEAST_OF_STATED * stated)**2)
     return [float(np.sqrt(v * np.interp(memory, at, widening) / spread))
             for v, (_, _, spread) in zip(level, fits, strict=True)]
 
@@ -120,5 +121,5 @@ def _process(n: int) -> Floats:
         R = memory**apart
         left = off @ R @ off
         table.append((np.trace(left) / n, x[:, 1] @ R @ x[:, 1],
-                      *(np.trace(left, lag) / np.trace(left) for lag in LAGS)))
+                      *(np.trace(left, lag) / np.trace(left) for lag in BLOCK_LAGS)))
     return np.array(table).T

@@ -10,28 +10,31 @@ not.
 import numpy as np
 
 from odocal_ros.calib.result import Source
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.angles import arctan2
+from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.reasons import Code, Reason
 
-WINDOW = 4.0       # s, longer than a spin, shorter than a hill
-STEP = 0.2         # s, grid
-PINS = 2           # steps each side that the speed at an end is taken over
-LEAST = 0.45       # m: 0.1 m/s^2 of tilt wandering within a window makes a third of it
-TURN = 0.1         # rad in a window: more is a turn
-COUNTS = 8.0       # odometer counts: what pins by counts may make of a window
+SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill
+SPIN_GRID = 0.2      # s, grid
+PIN_STEPS = 2        # steps each side that the speed at an end is taken over
+LEAST_SPIN = 0.45    # m: 0.1 m/s^2 of tilt wandering within a window makes a third of it
+SPIN_TURN = 0.1      # rad in a window: more is a turn
+PIN_COUNTS = 8.0     # odometer counts: what pins by counts may make of a window
 
 
 def rounding(travel) -> float:
     """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
     coarse = travel.coarse
     # speeds at both ends of a window, and within it, err by up to that
-    return travel.quantum if coarse is None else coarse.most * WINDOW / COUNTS
+    return travel.quantum if coarse is None else coarse.most * SPIN_WINDOW / PIN_COUNTS
 
 
-def find_slips(t_imu, f_b, track, f, latitude, quantum):
+def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
+               quantum: float) -> tuple[Floats, Floats]:
     """
     Return when and how far the odometer ran ahead of the Imu.
 
@@ -54,26 +57,26 @@ def find_slips(t_imu, f_b, track, f, latitude, quantum):
 
     """
     K = float(np.linalg.norm(f))
-    grid = np.arange(max(track.t[0], t_imu[0]), min(track.t[-1], t_imu[-1]), STEP)
-    span = round(WINDOW / STEP)
+    grid = np.arange(max(track.t[0], t_imu[0]), min(track.t[-1], t_imu[-1]), SPIN_GRID)
+    span = round(SPIN_WINDOW / SPIN_GRID)
     if len(grid) < 2 * span:
         return np.empty(0), np.empty(0)
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
     excess = excess_way(span, a, K * np.interp(grid, track.t, track.s))
     # in a turn the level error comes to bear on another axis: no window is judged there
     C = track.C_nb_at(grid)
-    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PINS:-PINS]
-    excess[np.abs(yaw[span:] - yaw[:-span]) > TURN] = 0.0
+    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
+    excess[np.abs(yaw[span:] - yaw[:-span]) > SPIN_TURN] = 0.0
     # what the drive as a whole does (rough road, soft suspension) is no event
     usual = np.median(np.abs(excess[excess != 0.0])) / 0.6745 if excess.any() else 0.0
-    limit = max(LEAST, COUNTS * quantum * K, 6 * usual)
-    return _events(grid[PINS:-span - PINS] + WINDOW / 2, excess, limit)
+    limit = max(LEAST_SPIN, PIN_COUNTS * quantum * K, 6 * usual)
+    return _events(grid[PIN_STEPS:-span - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 
 def acceleration(grid, t_imu, f_b, track, forward, latitude):
     """Return the mean acceleration along the forward axis from each grid time to the next."""
     along = by_row(lambda f_b: f_b @ forward, f_b)
-    force = np.diff(integral_at(grid, t_imu, along)) / STEP
+    force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
     return force - gravity(latitude, 0.0) * rise
 
@@ -85,12 +88,12 @@ def excess_way(span, a, way):
     The speed by acceleration is set to the odometer's at both ends by a straight line; both are
     taken as means over the same few steps, so that a jump of acceleration there does no harm.
     """
-    u = np.concatenate([[0.0], np.cumsum(a) * STEP])        # speed but for a constant
-    x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * STEP])
+    u = np.concatenate([[0.0], np.cumsum(a) * SPIN_GRID])        # speed but for a constant
+    x = np.concatenate([[0.0], np.cumsum((u[:-1] + u[1:]) / 2) * SPIN_GRID])
     ahead = way - x                 # its slope is what the speed by acceleration lacks
-    lacks = (ahead[2 * PINS:] - ahead[:-2 * PINS]) / (2 * PINS * STEP)
-    ahead = ahead[PINS:-PINS]
-    return ahead[span:] - ahead[:-span] - (lacks[:-span] + lacks[span:]) / 2 * span * STEP
+    lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
+    ahead = ahead[PIN_STEPS:-PIN_STEPS]
+    return ahead[span:] - ahead[:-span] - (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID
 
 
 def _events(middle, excess, limit):
@@ -101,7 +104,7 @@ def _events(middle, excess, limit):
     limit are one group, and in its middle stand those that hold the event whole.
     """
     far = np.flatnonzero(np.abs(excess) > limit)
-    groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > WINDOW / 2) + 1)
+    groups = np.split(far, np.flatnonzero(np.diff(middle[far]) > SPIN_WINDOW / 2) + 1)
     centres = [(g[0] + g[-1]) // 2 for g in groups if len(g)]
     k = np.array([c for c in centres if abs(excess[c]) > limit], int)
     return middle[k], excess[k]

@@ -3,16 +3,17 @@
 import numpy as np
 
 from odocal_ros.calib.marks import MarkFix, standing_at
+from odocal_ros.data.arrays import Floats
 
-CHI2_MEDIAN = 0.4549      # of one squared normal
-UNCLEAR = 2.0             # of a variance: nearer, neither of two estimates is the better
-TIMES = np.geomspace(2.0, 2000.0, 100)    # s, time constants that SLOW can tell
-SLOW = 20.0               # s, window in which white errors average down
+CHI2_MEDIAN = 0.4549                               # of one squared normal
+UNCLEAR_RATIO = 2.0    # of a variance: nearer, neither of two estimates is the better
+TIME_CONSTANTS = np.geomspace(2.0, 2000.0, 100)    # s, time constants that SLOW_WINDOW can tell
+SLOW_WINDOW = 20.0                                 # s, window in which white errors average down
 
 
 def slow_variance(t, along, way, variance, drift):
     """
-    Return the variance of fix errors averaged over SLOW seconds, m^2, and how long they last, s.
+    Return the variance of fix errors averaged over SLOW_WINDOW, m^2, and how long they last, s.
 
     Means of the residuals over windows hold it, where white errors have averaged down. A fifth of
     the variance being slow is not seen in a mark's own scatter, and yet rules its mean. Along the
@@ -29,7 +30,7 @@ def slow_variance(t, along, way, variance, drift):
         What the gyros may have done along it, m: no error of the fixes.
 
     """
-    window = ((t - t[0]) / SLOW).astype(int)
+    window = ((t - t[0]) / SLOW_WINDOW).astype(int)
     count = np.bincount(window)
     full = count >= max(5, 0.5 * count.max())
     if full.sum() < 5:
@@ -50,15 +51,16 @@ def slow_variance(t, along, way, variance, drift):
 
 
 def _lasting(alike):
-    """Return the time constant, s, that makes neighbouring means over SLOW s so much alike."""
-    x = SLOW / TIMES
-    return float(np.interp(alike, (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x))), TIMES))
+    """Return the time constant, s, that makes neighbouring means of SLOW_WINDOW so alike."""
+    x = SLOW_WINDOW / TIME_CONSTANTS
+    correlation = (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x)))
+    return float(np.interp(alike, correlation, TIME_CONSTANTS))
 
 
 def slow_share(seconds, tau):
-    """Return the variance of a mean of slow errors over a time, against that over SLOW s."""
+    """Return the variance of a mean of slow errors over a time, against that over SLOW_WINDOW."""
     share = [2 * (x - 1 + np.exp(-x)) / x**2 if x > 1e-4 else 1.0
-             for x in (seconds / tau, SLOW / tau)]       # of a Gauss-Markov process
+             for x in (seconds / tau, SLOW_WINDOW / tau)]       # of a Gauss-Markov process
     return float(share[0] / share[1])
 
 
@@ -86,11 +88,15 @@ def no_better(mark: MarkFix, slow, tau, span, stated, up_ratio) -> MarkFix:
     begin, end = span or (mark.t, mark.t)
     floor = slow * slow_share(end - begin, tau)
     own = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
-    took_for_white = own * mark.used < UNCLEAR * stated
-    return mark.at_least(floor, up_ratio) if took_for_white or floor > UNCLEAR * own else mark
+    took_for_white = own * mark.used < UNCLEAR_RATIO * stated
+    if took_for_white or floor > UNCLEAR_RATIO * own:
+        return mark.at_least(floor, up_ratio)
+    return mark
 
 
-def marks_no_better(marks, spans, t, way_n, chord_n, residual, covariance_n, drift_n):
+def marks_no_better(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, way_n: Floats,
+                    chord_n: Floats, residual: Floats, covariance_n: Floats,
+                    drift_n: Floats) -> tuple[MarkFix, MarkFix]:
     """
     Return both marks of a leg no better than the slow part of its fix errors allows.
 
@@ -113,5 +119,6 @@ def marks_no_better(marks, spans, t, way_n, chord_n, residual, covariance_n, dri
     slow, tau = slow_variance(t, residual[:, :2] @ along, way_n[:, :2] @ along, stated,
                               np.linalg.norm(along @ drift_n[:2]))
     up_ratio = np.median(covariance_n[:, 2, 2] / stated)
-    return tuple(no_better(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
-                           up_ratio) for mark in marks)
+    start, end = (no_better(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
+                            up_ratio) for mark in marks)
+    return start, end

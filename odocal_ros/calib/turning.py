@@ -7,14 +7,14 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.integral import twice_integral_at
 from odocal_ros.reasons import Code, Reason
 
-TURNED = 1.0         # rad, root of the sum of squares of turns, to compare gyro and course
-APART = 5.0, 10.0    # m, and fix sigmas: between fixes that give a course
-ALIKE = 0.9          # correlation from which they are the same turns
-SURE = 8.0           # sigmas of the slope: of a few courses chance makes some alike
-ABOUT = 2.0          # rad from one course to the next
-RIGHT = 0.6, 1.6     # of the ratio: no scale error, skid or lean is so large
-NOTHING = 0.01     # of the turns of the fixes: no unit makes that of a turn
-DEGREES = 40.0, 80.0     # the same, of deg/s
+TURNS_COMPARED = 1.0    # rad, root of the sum of squares of turns, to compare gyro and course
+COURSE_APART = 5.0, 10.0      # m, and fix sigmas: between fixes that give a course
+SAME_TURNS = 0.9              # correlation from which they are the same turns
+SLOPE_SIGMAS = 8.0            # sigmas of the slope: of a few courses chance makes some alike
+MOST_TURN_BETWEEN = 2.0       # rad from one course to the next
+RIGHT_RATIO = 0.6, 1.6        # of the ratio: no scale error, skid or lean is so large
+NO_TURN_SHARE = 0.01          # of the turns of the fixes: no unit makes that of a turn
+DEGREES_RATIO = 40.0, 80.0    # the same, of deg/s
 
 
 def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
@@ -31,7 +31,7 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
         s, m, and m horizontally.
 
     """
-    knots = knots_of(fixes_n, max(APART[0], APART[1] * sigma))
+    knots = knots_of(fixes_n, max(COURSE_APART[0], COURSE_APART[1] * sigma))
     if len(knots) < 5:
         return None
     step = np.diff(fixes_n[knots, :2], axis=0)
@@ -41,27 +41,27 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     ends = t_fix[knots]
     gyro = np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends)
     # where the course turns about at once a vehicle may have backed up: by how much is left open
-    about = np.flatnonzero(np.abs(np.diff(course)) > ABOUT)
+    about = np.flatnonzero(np.abs(np.diff(course)) > MOST_TURN_BETWEEN)
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
-    if course @ course < TURNED**2 or power == 0:
+    if course @ course < TURNS_COMPARED**2 or power == 0:
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
     alike = slope**2 * power / (course @ course)
-    certain = alike * (len(t) - 1 - drift.shape[1]) > SURE**2 * (1 - alike)
-    return 1 / slope if alike > ALIKE**2 and certain else None
+    certain = alike * (len(t) - 1 - drift.shape[1]) > SLOPE_SIGMAS**2 * (1 - alike)
+    return 1 / slope if alike > SAME_TURNS**2 and certain else None
 
 
 def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
     """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, tells it."""
-    if ratio is None or RIGHT[0] < ratio < RIGHT[1]:
+    if ratio is None or RIGHT_RATIO[0] < ratio < RIGHT_RATIO[1]:
         return ()
-    if ratio < -RIGHT[0]:
+    if ratio < -RIGHT_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right (ratio '
                        f'{ratio:.2f} instead of 1)'),)
-    degrees = DEGREES[0] < ratio < DEGREES[1]
-    if abs(ratio) < NOTHING:
+    degrees = DEGREES_RATIO[0] < ratio < DEGREES_RATIO[1]
+    if abs(ratio) < NO_TURN_SHARE:
         return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.2g} times as far as the course '
                        'of the fixes, next to nothing', 'Mend the sender, or set '
                        'imu.mounting_rpy: the axis that turns may be another.'),)

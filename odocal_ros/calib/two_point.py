@@ -22,6 +22,7 @@ from odocal_ros.calib.budget import (
     total_covariance,
 )
 from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.nav.alignment import Alignment
@@ -31,12 +32,10 @@ from odocal_ros.nav.projection import geodesic_chord, plane_chord
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
-CHORD_SHARE = 0.2        # of the path: under it, the chord is no measure of the path
-PITCH_PRIOR = 0.05       # rad, what is believed of the pitch where heights say nothing
-BACKWARDS = np.deg2rad(160.0)    # of yaw from nominal: no mounting, but the other way round
-FAR = np.deg2rad(20.0)           # of yaw from nominal: a nominal rotation or heading is wrong
-PITCH_LIMIT = 0.26       # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
-PLANE_LIMIT = 3e-5       # relative: a plane about the leg keeps ratios of chords far better
+CHORD_OF_PATH = 0.2              # of the path: under it, the chord is no measure of the path
+PITCH_PRIOR = 0.05               # rad, what is believed of the pitch where heights say nothing
+PITCH_LIMIT = 0.26    # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
+PLANE_LIMIT = 3e-5    # relative: a plane about the leg keeps ratios of chords far better
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +107,7 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
     # the length of the track's own chord, whatever the yaw: M is a turn times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
-        if chord_length <= CHORD_SHARE * path:
+        if chord_length <= CHORD_OF_PATH * path:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
                            f'{chord_length:.1f} m, under a fifth of the way driven, about '
                            f'{path:.0f} m'),)
@@ -189,7 +188,7 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
     t = track.t[keep]
     D = (track.P[keep] - track.at(chord.start.t)) @ f * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
-    if not vertical_known:       # the belief in the pitch stands in for the heights
+    if not vertical_known:       # the prior in the pitch stands in for the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
     C_nb = matrix_from_quat(track.q_nb[keep])
@@ -216,7 +215,7 @@ def _doubt(chord, f):
 
 
 def _blind_height(mark, sigma=0.0):
-    """Return the mark with its height replaced by a belief of sigma, m."""
+    """Return the mark with its height replaced by a prior of sigma, m."""
     covariance = mark.covariance_n.copy()
     covariance[2, :] = covariance[:, 2] = 0.0
     covariance[2, 2] = sigma**2
@@ -237,11 +236,11 @@ def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
                            f'{np.rad2deg(asked):.3f} deg: end points see but their sum'),)
     nominal = config.imu.nominal_yaw
     far = abs(float(wrap(yaw - (0.0 if np.isnan(nominal) else nominal))))
-    if alignment.heading_separable and far > BACKWARDS:
+    if alignment.heading_separable and far > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
                            f'counts mean backwards, or the Imu faces backwards (yaw '
                            f'{np.rad2deg(yaw):+.1f} deg)'),)
-    elif alignment.heading_separable and far > FAR:
+    elif alignment.heading_separable and far > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
                            f'course make a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
                            f'{np.rad2deg(far):.1f} deg from the nominal one'),)

@@ -15,13 +15,13 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import let_go
 
 Array = NDArray[Any]
-CHUNK = 2**16     # rows
+PIECE_ROWS = 2**16    # rows
 
 
 def chunks(n: int, *columns: Array) -> Iterator[slice]:
     """Yield slices of n rows; what is mapped of the columns is let go after each."""
-    for first in range(0, n, CHUNK):
-        yield slice(first, min(first + CHUNK, n))
+    for first in range(0, n, PIECE_ROWS):
+        yield slice(first, min(first + PIECE_ROWS, n))
         let_go(*columns)
 
 

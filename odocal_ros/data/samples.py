@@ -137,7 +137,7 @@ def freeze(owner: Samples, **rows: Any) -> None:
 def take(samples: SomeSamples, index: Index) -> SomeSamples:
     """Return the rows that a numpy index picks, as the same type."""
     return of_columns(type(samples), {f.name: getattr(samples, f.name)[index]
-                                  for f in fields(samples)})
+                                      for f in fields(samples)})
 
 
 def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
@@ -147,7 +147,7 @@ def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
         return blocks[0]
     names = [f.name for f in fields(blocks[0])]
     return of_columns(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
-                                    for n in names})
+                                        for n in names})
 
 
 def of_columns(kind: type[SomeSamples], columns: Mapping[str, NDArray[Any]]) -> SomeSamples:

@@ -1,5 +1,5 @@
 """
-Rows of a topic: up to MEMORY in memory, hours of them in a file without a name.
+Rows of a topic: up to MEMORY_BYTES in memory, hours of them in a file without a name.
 
 Two hours of an Imu at 1 kHz are 0.8 GB. What lies in the file is mapped: whoever reads it sees
 arrays like any others, and ``samples.let_go`` gives their memory back. Where the disk takes no
@@ -18,10 +18,10 @@ import numpy as np
 from odocal_ros.data.arrays import Bools
 from odocal_ros.data.samples import join, of_columns, Samples, take
 
-MEMORY = 2**26        # bytes of a topic's rows from which they go to the file
-TAIL = 2**23          # bytes after those of the file, the same
-MERGE = 2**20         # bytes: so much of small blocks is made one
-SOME = 2**20          # bytes moved at a time
+MEMORY_BYTES = 2**26    # bytes of a topic's rows from which they go to the file
+TAIL_BYTES = 2**23      # bytes after those of the file, the same
+MERGED_BYTES = 2**20    # bytes: so much of small blocks is made one
+MOVED_BYTES = 2**20     # bytes moved at a time
 
 
 class Rows:
@@ -42,9 +42,9 @@ class Rows:
         self._fresh.append(block)
         self._fresh_size += size
         self._size += size
-        if self._fresh_size >= MERGE:
+        if self._fresh_size >= MERGED_BYTES:
             self._merge()
-            if self._size > (MEMORY if self._file is None else TAIL):
+            if self._size > (MEMORY_BYTES if self._file is None else TAIL_BYTES):
                 self._to_file()
 
     def all(self) -> Samples:
@@ -130,7 +130,7 @@ class _Columns:
             data = np.ascontiguousarray(getattr(block, name), dtype).data.cast('B')
             offset = at * dtype.itemsize * int(np.prod(shape))
             while data:
-                done = os.pwrite(file.fileno(), data[:SOME], offset)
+                done = os.pwrite(file.fileno(), data[:MOVED_BYTES], offset)
                 data, offset = data[done:], offset + done
         return at + len(block.stamp_ns)
 

@@ -10,15 +10,15 @@ import math
 import numpy as np
 
 from odocal_ros.calib.choice import deciding
-from odocal_ros.pipeline.align import HEADING_LIMIT
+from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
-from odocal_ros.plan.alignment import plan_alignment
-from odocal_ros.plan.drive import from_rates
+from odocal_ros.planning.alignment import plan_alignment
+from odocal_ros.planning.drive import from_rates
+from odocal_ros.screening.glitches import Oriented, oriented
 from odocal_ros.settings.config import Config, with_settings
 
-EXACT = 1e-6          # rad, of a heading that is said to be known exactly
-ROWS = 100            # newest orientations that tell how good they claim to be
-COURSE_FIX = 1.5      # m, sigma of a fix that a course is taken to come from
+EXACT_HEADING = 1e-6      # rad, of a heading that is said to be known exactly
+COURSE_FIX_SIGMA = 1.5    # m, sigma of a fix that a course is taken to come from
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
            'imu_orientation': "the Imu's orientation", 'gyrocompass': 'the gyrocompass'}
 ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside
@@ -104,18 +104,15 @@ def _alignment(config, heard):
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
                        latitude=heard.latitude)
-    return plan_alignment(drive, with_heading(config, heard.variances), COURSE_FIX,
+    return plan_alignment(drive, with_heading(config, heard.variances), COURSE_FIX_SIGMA,
                           drive.standstills(config.leg.standstill))[0]
 
 
-def stated_variance(q_ni, yaw_variance) -> float:
-    """
-    Return the variance of the yaw that orientations state, rad^2; inf: none is sent.
-
-    q_ni, yaw_variance : (n, 4), (n,) as in ``ImuSamples``.
-    """
-    sent = ~np.isnan(yaw_variance) & (np.linalg.norm(q_ni, axis=1) > 0.5)
-    return float(np.median(yaw_variance[sent][-ROWS:])) if sent.any() else math.inf
+def stated_variance(sent: Oriented) -> float:
+    """Return the variance of the yaw that orientations as sent state, rad^2; inf: none is sent."""
+    variance = oriented(sent).yaw_variance
+    stated = variance[~np.isnan(variance)]
+    return float(np.median(stated)) if len(stated) else math.inf
 
 
 def with_heading(config: Config, variances: dict[str, float]) -> Config:
@@ -126,7 +123,7 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
     alignment itself decides.
     """
     asked = config.alignment
-    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT)
+    source, sigma = asked.heading_source, max(asked.heading_sigma, EXACT_HEADING)
     if source == 'auto' and not math.isnan(asked.heading):
         source = 'fixed'
     if source == 'fixed' and math.isnan(asked.heading):

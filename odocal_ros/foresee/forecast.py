@@ -1,13 +1,13 @@
 """What is foreseen of a leg while it is recorded, and how it is said."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
-COARSE = 0.01        # relative sigma from which it is said in per cent
-FARTHEST = 2e4       # m: who must drive on for more needs something else
+PERCENT_FROM = 0.01    # relative sigma from which it is said in per cent
+FARTHEST = 2e4         # m: who must drive on for more needs something else
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
@@ -39,10 +39,10 @@ class Prospect:
 
     def words(self, name: str, unit: str, factor: float) -> str:
         """Return it for people, sigmas times ``factor`` in ``unit``."""
-        if unit == 'ppm' and self.sigma is not None and self.sigma >= COARSE:
+        if unit == 'ppm' and self.sigma is not None and self.sigma >= PERCENT_FROM:
             unit, factor = '%', 100.0
-        asked = _three_digits(self.asked * factor)
-        sigma = None if self.sigma is None else _three_digits(self.sigma * factor)
+        asked = three_digits(self.asked * factor)
+        sigma = None if self.sigma is None else three_digits(self.sigma * factor)
         known = name if sigma is None else f'{name} {sigma} {unit}'
         if self.now and sigma is not None:
             known = f'{name} {self.now} +- {sigma} {unit}'
@@ -111,7 +111,32 @@ class Forecast:
     @property
     def lacks(self) -> list[str]:
         """Return what to drive besides metres."""
-        return [prospect.lack for prospect in (self.scale, self.yaw) if prospect.lack]
+        return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
+
+
+def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
+    """
+    Return what two parts of a leg tell, each quantity by the one that tells it better.
+
+    Together they tell no less. Only the newest goes on: what more brings is its to say.
+    """
+    if earlier is None or newest is None:
+        return newest or earlier
+    values = {name: min((f.estimates[name] for f in (newest, earlier) if name in f.estimates),
+                        key=lambda e: math.inf if e.value is None or e.sigma is None else e.sigma)
+              for name in {**earlier.estimates, **newest.estimates}}
+    pitch = min((f.pitch for f in (newest, earlier) if f.pitch is not None), default=None)
+    return replace(newest, scale=_better(earlier.scale, newest.scale),
+                   yaw=_better(earlier.yaw, newest.yaw), pitch=pitch, estimates=values,
+                   wheels=newest.wheels or earlier.wheels)
+
+
+def _better(earlier: Prospect, newest: Prospect) -> Prospect:
+    if earlier.sigma is None or (newest.sigma is not None and newest.sigma <= earlier.sigma):
+        return newest
+    if earlier.metres == 0.0 and not earlier.lack:
+        return earlier
+    return replace(earlier, metres=newest.metres, why=newest.why, lack=newest.lack)
 
 
 def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict:
@@ -128,7 +153,7 @@ def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict:
             f'metres_to_go_{name}': '' if of.metres is None else of.metres,
             f'largest_error_source_{name}': of.sources[0][0] if of.sources else '',
             f'predicted_{name}_sources_{unit}': ', '.join(
-                f'{source} {_three_digits(sigma * factor)}' for source, sigma in of.sources)}
+                f'{source} {three_digits(sigma * factor)}' for source, sigma in of.sources)}
     return keys
 
 
@@ -151,6 +176,6 @@ def _rounded_up(metres: float) -> int:
     return math.ceil(metres / step) * step
 
 
-def _three_digits(value: float) -> str:
+def three_digits(value: float) -> str:
     """Return a number in three digits, never as a power of ten where it is large."""
     return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'

@@ -1,7 +1,7 @@
 """
 Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
 
-Foreseen for a vehicle that comes to rest where it is and stands for REST seconds in all, with the
+Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN in all, with the
 start mark and the way as recorded. Shown to the operator, never part of a result.
 """
 
@@ -12,7 +12,9 @@ import math
 import numpy as np
 
 from odocal_ros.calib.choice import choose, deciding
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.ability import stated_variance, with_heading
 from odocal_ros.foresee.forecast import Abandoned, FARTHEST, Forecast, Prospect
@@ -25,17 +27,20 @@ from odocal_ros.foresee.smoother_forecast import (
 )
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.wheels_so_far import sources_of, with_wheels
-from odocal_ros.plan.drive import AT_REST, PlannedDrive
-from odocal_ros.plan.leg_profile import fix_figures, profile_of
-from odocal_ros.plan.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.planning.drive import PlannedDrive, REST_SPEED
+from odocal_ros.planning.leg_profile import fix_figures, profile_of
+from odocal_ros.planning.predict import metres_to_go, predict, Prediction, Sigmas
+from odocal_ros.screening.force import felt
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
-REST = 10.0          # s of standstill at the end that is foreseen
-MOST_ROWS = 1000     # of the drive that a prediction is made from
+REST_FORESEEN = 10.0    # s of standstill at the end that is foreseen
+MOST_ROWS = 1000        # of the drive that a prediction is made from
 NEAR_NS = 1_000_000_000
+NEWEST = 100    # orientations that tell how good they claim to be
+DRIVE_ON = 'drive on with stops, starts and turns'
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class DriveSoFar(PlannedDrive):
         """Return the drive with so many metres more straight on from here, at its own speed."""
         if not self.wanted():
             raise Abandoned
-        moving = np.flatnonzero(np.abs(self.speed) > AT_REST)
+        moving = np.flatnonzero(np.abs(self.speed) > REST_SPEED)
         here = int(moving[-1])
         usual = float(np.median(np.abs(self.speed[moving])))
         on = np.linspace(0.0, metres / usual, 50)[1:]
@@ -60,8 +65,8 @@ class DriveSoFar(PlannedDrive):
 
 
 def forecast_of(leg: Leg, fix_rate: float, config: Config,
-               wanted: Callable[[], bool] = lambda: True,
-               smoother: SmootherSoFar | None = None) -> Forecast:
+                wanted: Callable[[], bool] = lambda: True,
+                smoother: SmootherSoFar | None = None) -> Forecast:
     """
     Return what is foreseen of a leg that would end here, and what its methods say so far.
 
@@ -89,6 +94,9 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
         forecast = nothing_foreseen(config)
     else:
         forecast = _by_ends(leg, fix_rate, config, wanted)
+        if smoother is not None and 'smoother' in deciding(config.method) and felt(leg.imu.f_i):
+            forecast = replace(forecast, scale=_open_yet(forecast.scale),
+                               yaw=_open_yet(forecast.yaw))
     if not wanted():
         raise Abandoned
     forecast = with_wheels(forecast, leg, config)
@@ -121,6 +129,11 @@ def _by_ends(leg, fix_rate, config, wanted) -> Forecast:
         now.method.estimates[PITCH].sigma)
 
 
+def _open_yet(by_ends: Prospect) -> Prospect:
+    """Return what the ends foresee, but no never: the smoother may do it yet."""
+    return by_ends if by_ends.metres is not None else replace(by_ends, lack=DRIVE_ON)
+
+
 def _yaw_limit(now: Prediction, asked: float) -> str:
     """Return why no drive brings the yaw to what is asked, empty where one may."""
     alignment = now.alignment
@@ -135,11 +148,12 @@ def _yaw_limit(now: Prediction, asked: float) -> str:
 
 def _heading_found(leg: Leg, config: Config) -> Config:
     """Return config with the heading source, and its sigma, that the alignment will find."""
-    variances = {}
-    for slot, name in ((leg.heading, 'heading_topic'), (leg.imu, 'imu_orientation')):
-        before = slot.stamp_ns <= leg.start_ns + NEAR_NS
-        variances[name] = stated_variance(slot.q_ni[before], slot.yaw_variance[before])
-    return with_heading(config, variances)
+    def before(stamp_ns: Ints) -> Ints:
+        return np.flatnonzero(stamp_ns <= leg.start_ns + NEAR_NS)[-NEWEST:]
+
+    return with_heading(config, {
+        'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
+        'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
 
 
 def _quantum(leg: Leg, config: Config) -> float:
@@ -154,7 +168,7 @@ def _quantum(leg: Leg, config: Config) -> float:
 
 def _thinned(drive: PlannedDrive) -> PlannedDrive:
     """Return a drive of not many rows; where it stops and starts it stays as it is."""
-    rest = np.abs(drive.speed) <= AT_REST
+    rest = np.abs(drive.speed) <= REST_SPEED
     change = np.flatnonzero(np.diff(rest))
     if len(change) > MOST_ROWS // 4:
         change = change[:0]
@@ -165,10 +179,10 @@ def _thinned(drive: PlannedDrive) -> PlannedDrive:
 
 
 def _at_rest(drive: PlannedDrive, wanted) -> DriveSoFar:
-    """Return the drive with as much rest at its end as makes REST seconds."""
-    moving = np.flatnonzero(np.abs(drive.speed) > AT_REST)
+    """Return the drive with as much rest at its end as makes REST_FORESEEN seconds."""
+    moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
-    if rested < REST:
-        drive = drive.until(drive.duration, REST - rested)
+    if rested < REST_FORESEEN:
+        drive = drive.until(drive.duration, REST_FORESEEN - rested)
     return DriveSoFar(drive.t, drive.speed, drive.yaw, drive.slope, drive.latitude,
                       drive.longitude, drive.height, wanted)

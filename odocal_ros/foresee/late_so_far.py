@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.data.samples import join, OdometerForm, OdometerSamples, take
-from odocal_ros.screening.late_rows import on_time, WINDOW
+from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
-SETTLED_NS = round(WINDOW * 1e9)    # after which no row to come moves one
+SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # after which no row to come moves one
 BESIDE_NS = 3 * SETTLED_NS          # of rows before, that tell the rhythm
 COUNT = OdometerForm('cumulative', 0, '')
 

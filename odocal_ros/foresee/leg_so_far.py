@@ -14,7 +14,7 @@ from odocal_ros.screening.screen import imu_gap
 from odocal_ros.settings.config import Config, with_settings
 
 MOST_GAP = 10.0      # s, of the setting leg.max_gap
-SILENT_S = 1.0       # what comes in no order may be as late on a busy machine
+SILENT_TIME = 0.9    # what comes in no order may be as late; said within a second
 
 
 class ImuGaps:
@@ -44,7 +44,7 @@ class ImuGaps:
         t = np.concatenate([[0.0], t])
         sound = np.concatenate([np.arange(a, b, self._limit_s / 2)
                                 for a, b in t.reshape(-1, 2)] or [t])
-        end = t[-1] + (silent_s if silent_s > SILENT_S else 0.0)
+        end = t[-1] + (silent_s if silent_s > SILENT_TIME else 0.0)
         return imu_gap(np.union1d(sound, t), 0.0, float(end), self._limit_s)
 
 

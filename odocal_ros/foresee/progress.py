@@ -4,25 +4,23 @@ What the operator wants to know while driving: distance, speed, standing or not,
 Light estimates from the blocks as they come; nothing here enters a result.
 """
 
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.foresee.ability import Heard, stated_variance
+from odocal_ros.foresee.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
 from odocal_ros.screening.force import felt
 from odocal_ros.screening.odometer_steps import Steps
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
-FASTEST = 100.0        # m/s: what goes faster is a counter reset
-SPEED_NS = 1_000_000_000   # speeds are taken over that long, or longer
-STANDS_S = 0.5         # without a count: the vehicle stands
-REST_NS = 1_000_000_000   # a shorter pause is no standstill
-CLOCK_LIMIT = 0.5      # s
-CLOCK_ROWS = 10
+SPEED_NS = 1_000_000_000         # speeds are taken over that long, or longer
+STANDS_S = 0.5                   # without a count: the vehicle stands
+SHORT_REST_NS = 1_000_000_000    # a shorter pause is no standstill
 
 
 def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -59,7 +57,7 @@ class Travel:
         for total, stamp in zip(path, stamps, strict=True):
             if total - self._anchor > self._rows.still:
                 rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
-                if rest_ns > REST_NS:
+                if rest_ns > SHORT_REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
                 self._anchor, self.moved_ns = total, int(stamp)
         self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
@@ -109,59 +107,6 @@ class FixPath:
                 self._anchor = (lat, lon, stamp)
 
 
-class Clocks:
-    """
-    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
-
-    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
-    """
-
-    def __init__(self, simulated: bool = False) -> None:
-        self._simulated = simulated
-        self._imu: deque = deque(maxlen=40)
-        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
-        self._ahead_s: dict[str, deque] = {}
-
-    def feed(self, slot: str, block) -> None:
-        """Take a block."""
-        if slot != 'imu':
-            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
-            return
-        self._imu.append((block.received_ns, block.stamp_ns))
-        if not self._waiting:
-            return
-        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
-        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
-        first_received, first_stamp = int(received[0]), int(stamps[0])
-        received, stamps = received - first_received, stamps - first_stamp
-        # messages that queued for a node in simulated time arrive late, the Imu's more so than
-        # others': which of them belong together is not known then
-        queued = self._simulated and np.ptp(received - stamps) > CLOCK_LIMIT * 1e9
-        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
-            row = row_ns - first_received
-            if row > received.max():
-                continue
-            del self._waiting[name]
-            if row >= received.min() and not queued:
-                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
-                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
-
-    def differing(self, config: Config) -> list[tuple[str, float]]:
-        """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
-        offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
-                   'odometer_right': config.odometer.time_offset,
-                   'fix_velocity': config.gnss.time_offset}
-        result = []
-        for slot, ahead in self._ahead_s.items():
-            offset = offsets.get(slot, 0.0) - config.imu.time_offset
-            # latency on the way makes a row look older: behind are those of whom the freshest is;
-            # that of an Imu's row makes others look newer: ahead are those of whom most are
-            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
-            if abs(value) > CLOCK_LIMIT:
-                result.append((slot, value))
-        return result
-
-
 class Progress:
     """All of it, for one node; ``begin_leg`` sets distance and speed to zero."""
 
@@ -197,8 +142,8 @@ class Progress:
                           height=bool(np.isfinite(fix.height[-1])))
         sent = {name: self._last.get(slot) for slot, name in (
             ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
-        variances = {name: np.inf if block is None else stated_variance(
-            block.q_ni, block.yaw_variance) for name, block in sent.items()}
+        variances = {name: np.inf if block is None else stated_variance(block)
+                     for name, block in sent.items()}
         imu = self._last.get('imu')
         return replace(place, variances=variances, felt=imu is None or felt(imu.f_i),
                        rested_s=travel.rested_s(preroll_s) if travel else 0.0)

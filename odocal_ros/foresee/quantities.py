@@ -45,7 +45,7 @@ def nothing_known() -> dict[str, str]:
 
 
 def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
-               lost: bool = False) -> dict[str, str]:
+                lost: bool = False) -> dict[str, str]:
     """
     Return what is good enough in a leg that ends where the vehicle is.
 

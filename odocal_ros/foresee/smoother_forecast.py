@@ -15,11 +15,11 @@ from odocal_ros.settings.config import Config
 
 ONLY = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
-BRISK = 1.5            # m/s^2, of an ordinary stop and start
-SLOWEST = 5.0          # m/s that one would do them from
+BRISK_FORCE = 1.5    # m/s^2, of an ordinary stop and start
+SLOWEST_TOP = 5.0    # m/s that one would do them from
 # the way goes with the sigma to the power of minus this: with white errors of the fixes, with slow
 BY_WAY, BY_WAY_SLOW = 1.0, 2.0
-FAR_TOO_FEW = 50       # stops and starts: nobody does so many
+FAR_TOO_FEW = 50    # stops and starts: nobody does so many
 
 
 def look(leg: Leg, config: Config, smoother: SmootherSoFar | None, wanted) -> Running | None:
@@ -53,7 +53,7 @@ def gives_all(running: Running | None) -> bool:
 def nothing_foreseen(config: Config) -> Forecast:
     """Return an forecast that only tells what is asked."""
     return Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
-                   Prospect(None, config.verdict.max_yaw_sigma, None))
+                    Prospect(None, config.verdict.max_yaw_sigma, None))
 
 
 def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
@@ -95,7 +95,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
     sigma = float(running.sigmas[1])
     ratio, lack = sigma / asked, ''
     if ratio > 1:
-        one = 2 * BRISK * max(running.speed, SLOWEST)
+        one = 2 * BRISK_FORCE * max(running.speed, SLOWEST_TOP)
         stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
         often = 'often' if stops > FAR_TOO_FEW else f'{stops} time{"s" * (stops > 1)}'
         lack = f'stop and start {often}, or turn as often, for the yaw'

@@ -1,7 +1,7 @@
 """
 What the smoother makes of the way so far: run on the thinned of a leg, each look from the last.
 
-A look starts from the state, noise levels, beliefs and slips that the one before ended with,
+A look starts from the state, noise levels, priors and slips that the one before ended with,
 reckons on over what is new, and is there after two passes. The accelerometer's scale error is
 judged on the way. What is decided once for a leg, the sort of fix errors and where the Imu faces,
 is decided anew from nothing whenever the leg has grown by half.
@@ -25,10 +25,10 @@ from odocal_ros.calib.smoother.outcome import floored, outcome
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit, too_little
 from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, YAW
+from odocal_ros.calib.smoother.warm_start import carried, rows_of
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.forecast import Abandoned
-from odocal_ros.foresee.smoother_warm_start import carried, rows_of
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.calibrate import turned_over
@@ -38,12 +38,12 @@ from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 
-FINE, COARSE = 1.0, 2.0     # s between keyframes, of a leg up to LONG and beyond
-LONG = 660.0                # s
-FEW_KEYS = 150              # keyframes of a fit from nothing: it takes ten times the passes
-PASSES, MORE = 2, 6         # from the last look, and where that was not enough
-GROWN = 1.5                 # of the leg, until what is decided once is decided anew
-AGREE = 3.0                 # sigmas within which a fit from nothing bears the running one out
+FINE_SPACING, COARSE_SPACING = 1.0, 2.0# s between keyframes, of a leg up to LONG_LEG and beyond
+LONG_LEG = 660.0                   # s
+FEW_KEYS = 150                     # keyframes of a fit from nothing: it takes ten times the passes
+LOOK_PASSES, MORE_PASSES = 2, 6    # from the last look, and where that was not enough
+ANEW_GROWTH = 1.5                  # of the leg, until what is decided once is decided anew
+BEARS_OUT_SIGMAS = 3.0    # sigmas within which a fit from nothing bears the running one out
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ class SmootherSoFar:
             self._last = None
             raise BadData('the smoother has not settled on the way so far')
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
-        self._thin = problem.thin
+        self._thin = problem.per_effective
         return running
 
     def _view(self, leg, config) -> SmootherLeg:
@@ -128,7 +128,7 @@ class SmootherSoFar:
         few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
-        found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
+        found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)
         _refuse_unusable(found)
         inputs = turned_over(inputs) if z_down else inputs
         placed = place(inputs, config)
@@ -153,9 +153,9 @@ class SmootherSoFar:
 
     def _fit(self, view, config, trace):
         duration = view.t_stop - view.t_begin
-        spacing = FINE if duration < LONG else COARSE
+        spacing = FINE_SPACING if duration < LONG_LEG else COARSE_SPACING
         problem = Problem.of(view, config, rows_of(view, spacing))
-        problem.thin = self._thin
+        problem.per_effective = self._thin
         begun = None if self._last is None else carried(self._last, problem)
         if begun is None:
             begin = time.thread_time()
@@ -167,10 +167,10 @@ class SmootherSoFar:
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
         best = judge_running(best, problem.grade).outline()     # more of a drive tells more of it
-        best = fit(problem, best.state, best.levels, PASSES, about=best, trace=trace)
+        best = fit(problem, best.state, best.levels, LOOK_PASSES, about=best, trace=trace)
         if not best.settled:
-            best = fit(problem, best.state, best.levels, MORE, about=best, trace=trace)
-        if duration > GROWN * self._judged:
+            best = fit(problem, best.state, best.levels, MORE_PASSES, about=best, trace=trace)
+        if duration > ANEW_GROWTH * self._judged:
             best = self._borne_out(best, problem, config, trace)
         return best, problem
 
@@ -179,11 +179,11 @@ class SmootherSoFar:
         begin = time.thread_time()
         view = problem.leg
         duration = view.t_stop - view.t_begin
-        other = Problem.of(view, config, rows_of(view, max(FINE, duration / FEW_KEYS)))
+        other = Problem.of(view, config, rows_of(view, max(FINE_SPACING, duration / FEW_KEYS)))
         anew = likeliest_fit(other, config, trace)
         self._judged = duration
         if anew.settled:
-            problem.thin = other.thin
+            problem.per_effective = other.per_effective
             best = _decided_anew(best, anew, problem, config, trace)
         self.once_s += time.thread_time() - begin
         return best
@@ -203,10 +203,10 @@ def _decided_anew(best, anew, problem, config, trace):
     if slow or not unjudged:
         about = replace(best, first=none, priors=with_imperfect(
             best.priors, problem.priors.constants[IMPERFECT]))
-        best = fit(problem, state, levels, MORE, about=about, trace=trace)
+        best = fit(problem, state, levels, MORE_PASSES, about=about, trace=trace)
     sigma = np.sqrt(np.diag(anew.solved.covariance))
     apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
-    if apart.max() > AGREE:
+    if apart.max() > BEARS_OUT_SIGMAS:
         return best_fit(problem, config, trace)
     return judge_imperfect(problem, best, trace)
 

@@ -15,7 +15,7 @@ from odocal_ros.data.samples import ImuSamples, join, OdometerForm, OdometerSamp
 from odocal_ros.foresee.late_so_far import LateSoFar
 
 CELL_NS = 100_000_000
-MOST = 16_000           # cells of a topic: 26 minutes of 0.1 s, pre-roll and all
+MOST_CELLS = 16_000    # cells of a topic: 26 minutes of 0.1 s, pre-roll and all
 FLOATS = OdometerForm('cumulative', 0, '')
 
 
@@ -52,7 +52,7 @@ class ThinnedLeg:
             return
         done = _gathered(take(rows, slice(None, over)), cell[:over], self._averaged(slot))
         cells = join([self._cells[slot], done]) if slot in self._cells else done
-        while len(cells.stamp_ns) > MOST:
+        while len(cells.stamp_ns) > MOST_CELLS:
             width_ns *= 2
             cells = _gathered(cells, cells.stamp_ns // width_ns, self._averaged(slot))
         self._cells[slot], self._width_ns[slot] = cells, width_ns
@@ -80,7 +80,7 @@ class ThinnedLeg:
     def fix_rate(self) -> float:
         """Return fixes a second by the median of their intervals, NaN where there are too few."""
         steps = np.concatenate([np.empty(0, np.int64), *self._fix_steps])
-        self._fix_steps = [steps[-MOST:]]
+        self._fix_steps = [steps[-MOST_CELLS:]]
         rising = steps[steps > 0]
         return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
 

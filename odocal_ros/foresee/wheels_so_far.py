@@ -13,7 +13,7 @@ from odocal_ros.reasons import Verdict
 from odocal_ros.screening.force import felt
 from odocal_ros.settings.config import Config, with_settings
 
-SHARE = 0.01         # of the variance: a source of less is not told
+SOURCE_SHARE = 0.01    # of the variance: a source of less is not told
 
 
 def with_wheels(forecast: Forecast, leg: Leg, config: Config) -> Forecast:
@@ -49,7 +49,7 @@ def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float],
     """Return the sources of a parameter's error that matter, the largest first."""
     row = method.parameters.index(parameter)
     sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
-    least = SHARE * sum(size**2 for size in sizes.values())
+    least = SOURCE_SHARE * sum(size**2 for size in sizes.values())
     return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > least),
                         key=lambda source: -source[1]))
 

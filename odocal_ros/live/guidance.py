@@ -2,9 +2,10 @@
 
 from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.foresee import quantities
+from odocal_ros.foresee.clocks_so_far import clocks_differ
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.reasons import Code, Verdict
+from odocal_ros.reasons import Verdict
 
 REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
 KMH = 3.6
@@ -46,13 +47,6 @@ def action_first(now: SessionView) -> str:
         actions, facts = _while_recording(now)
         return '; '.join([*(actions or ['drive on']), *facts])
     return hint(now)
-
-
-def clocks_differ(clocks: list[tuple[str, float]]) -> str:
-    """Return the sentence about clocks that differ from the Imu's."""
-    seen = ', '.join(f'{slot} stamps are {abs(s):.3g} s {"ahead of" if s > 0 else "behind"} the '
-                     "Imu's" for slot, s in clocks)
-    return f'CLOCKS_DIFFER: {seen}. {Code.CLOCKS_DIFFER.remedy}'
 
 
 def quantities_ok(now: SessionView) -> dict[str, str]:

@@ -12,12 +12,14 @@ from rclpy.task import Future
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.foresee.ability import Ability, ability
+from odocal_ros.foresee.clocks_so_far import clocks_differ
+from odocal_ros.foresee.leg_so_far import SILENT_TIME
 from odocal_ros.foresee.quantities import words
 from odocal_ros.live import answers, jobs, result_files as outputs
 from odocal_ros.live.computing import Computing
 from odocal_ros.live.console import Console
 from odocal_ros.live.filing import Filing
-from odocal_ros.live.guidance import after_result, clocks_differ, hint, quantities_ok
+from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.journal_text import replay_command
 from odocal_ros.live.params import restored_from
@@ -57,6 +59,7 @@ class LegCompletion:
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._distance_m = 0.0                # of the leg last touched
+        self._silent = False                  # the Imu, in the leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -72,7 +75,15 @@ class LegCompletion:
         self._close_when_complete()
         if self.session.state is State.RECORDING:
             self._watch.look(self._recording.newest_imu_ns)
+            self._hear_silence()
         self._journal.tick(self._config(), self.session.busy)
+
+    def _hear_silence(self) -> None:
+        """Say at once that the Imu is silent, or speaks again."""
+        silent = self._recording.imu_silent_s() > SILENT_TIME
+        if silent is not self._silent:
+            self._silent = silent
+            self.show_status()
 
     def pump(self) -> None:
         """Decode what has arrived."""

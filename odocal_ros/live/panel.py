@@ -1,12 +1,15 @@
 """A terminal panel of ``~/status``: state, what to do, bars of what is enough."""
 
-from math import isfinite
+from math import degrees, isfinite, nan
 
 from rich.console import Group
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
+
+from odocal_ros.foresee.forecast import three_digits
+from odocal_ros.output.figures import with_sigma
 
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
 REST_S = 10.0
@@ -15,7 +18,8 @@ REST_S = 10.0
 def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
     """Return a status (its keys and values as sent) as one panel."""
     colour = COLOURS.get(level, 'white')
-    state = Text(status.get('state', ''), style=f'bold {colour}')
+    state = Text(', '.join(filter(None, (status.get('state'), status.get('verdict')))),
+                 style=f'bold {colour}')
     for text, key in (('distance', 'distance_m'), ('time', 'duration_s')):
         state.append(f'   {text} {status.get(key, "")} {key[-1]}', style='default')
     rates = '   '.join(f'{slot} {status.get(f"{slot}_rate_hz", "")} Hz'
@@ -35,12 +39,21 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
              'standing': (1 - stand / REST_S, f'{stand:.0f} s to go')}
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         asked = number(status, f'asked_{name}_sigma_{unit}')
-        sigma = number(status, f'predicted_{name}_sigma_{unit}')
+        sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
         # a sigma falls with the way or its root: its share of what is asked is a modest measure
         share = min(asked / sigma, 1.0) if sigma > 0 else 0.0
-        known = f'{sigma:.3g} {unit}' if sigma > 0 else 'not known'
-        found[name] = share, f'{known}, asked {asked:.3g}'
+        known = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
+        found[name] = share, f'{known}, asked {three_digits(asked)} {unit}'
     return found
+
+
+def _of_result(status) -> dict[str, float]:
+    """Return the sigmas of the result, as what is foreseen has them; 0 in a leg, or of none."""
+    if status.get('state') == 'recording':
+        return {'scale': 0.0, 'yaw': 0.0}
+    relative = number(status, 'scale_factor_sigma') / (number(status, 'scale_factor') or nan)
+    return {'scale': 1e6 * relative if isfinite(relative) else 0.0,
+            'yaw': degrees(number(status, 'yaw_mounting_angle_sigma_rad'))}
 
 
 def number(status: dict[str, str], key: str) -> float:
@@ -64,8 +77,9 @@ def _bars(status) -> Table:
 def _values(status) -> str:
     running = status.get('state') == 'recording'
     prefix = 'estimate_' if running else ''
-    keys = (('scale factor', 'scale_factor', 'scale_factor_sigma'),
-            ('yaw, rad', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad'))
-    said = [f'{label} {number(status, prefix + value):.7g} ± {number(status, prefix + sigma):.2g}'
-            for label, value, sigma in keys if number(status, prefix + value)]
+    keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),
+            ('yaw', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad', degrees(1), ' deg'))
+    said = [f'{label} {with_sigma(found, number(status, prefix + sigma) or None, factor)}{unit}'
+            for label, value, sigma, factor, unit in keys
+            if (found := number(status, prefix + value))]
     return '   '.join(said) or 'no value yet'

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.utilities import remove_ros_args
 
+from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live.memory import hold_little
 from odocal_ros.outside.names import one_line, said_by
@@ -42,8 +43,8 @@ def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
 
     name : of the command.   about : what --help prints.   make : returns the node.
 
-    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help was asked
-    for; 1 when it cannot start, with one line that says why.
+    Returns 0 after SIGINT, SIGTERM or a shutdown of the context, and where only help or version
+    was asked for; 1 when it cannot start, with one line that says why.
     """
     hold_little()
     # rclpy's handler ends the context on either signal, and calls this one: no KeyboardInterrupt
@@ -52,6 +53,9 @@ def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
         asked = remove_ros_args(args)[1:]
         if {'-h', '--help'} & set(asked):
             print(about)
+            return 0
+        if '--version' in asked:
+            print(f'odocal_ros {__version__}')
             return 0
         if asked:
             return complain(name, f'{asked[0]} means nothing here: settings are ROS parameters, '

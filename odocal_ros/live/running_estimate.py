@@ -6,7 +6,7 @@ import time
 
 from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, take
-from odocal_ros.foresee.forecast import Forecast
+from odocal_ros.foresee.forecast import better, Forecast
 from odocal_ros.foresee.foresight import Abandoned, forecast_of
 from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
@@ -24,6 +24,8 @@ class RunningEstimate:
     """
     Keeps the newest forecast of the leg that is recorded, None without one.
 
+    Of a leg that a gap cuts, each quantity is of the part that tells it better: both count.
+
     The callback thread only collects blocks; cells and prediction are made in the worker, one look
     at a time. ``end`` makes a look that is under way give up at its next step, so that the result
     of the leg need not wait for it. What fails here is a note in the log, never more.
@@ -31,7 +33,8 @@ class RunningEstimate:
 
     def __init__(self, worker: Worker, log) -> None:
         self._worker, self._log = worker, log
-        self.forecast: Forecast | None = None
+        self._newest: Forecast | None = None     # of the part that is driven
+        self._earlier: Forecast | None = None    # of those before it
         self._faults: tuple[Reason, ...] = ()
         self._gaps: ImuGaps | None = None
         self._thinned: ThinnedLeg | None = None
@@ -55,12 +58,17 @@ class RunningEstimate:
     def end(self) -> None:
         """Let go of the leg."""
         self._forget()
-        self._thinned = self._gaps = None
+        self._thinned = self._gaps = self._earlier = None
+
+    @property
+    def forecast(self) -> Forecast | None:
+        """Return what is foreseen of the leg."""
+        return better(self._earlier, self._newest)
 
     def _forget(self) -> None:
         """Let a look that is under way give up, and forget what was seen."""
         self._over.set()
-        self.forecast = self._before = None
+        self._newest = self._before = None
         self._faults = ()
         self._fresh = []
         self._looking = self._warm = False
@@ -77,7 +85,7 @@ class RunningEstimate:
         if self._thinned is None:
             return
         if slot == 'imu' and self._gaps is not None and (again_ns := self._gaps.feed(block)):
-            # the leg is cut there: what is foreseen is of the part since then
+            self._earlier = self.forecast
             self._forget()
             self._look_from(again_ns, self._thinned.form)
             block = take(block, block.stamp_ns >= again_ns)
@@ -91,10 +99,9 @@ class RunningEstimate:
         """
         if self._gaps is None:
             return ()
-        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there, figures are of the part '
-                      'since') for r in self._gaps.reasons(silent_s)]
-        seen = (*cut, *self._faults,
-                *(self.forecast.faults if self.forecast else ()))
+        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there, figures are of the better '
+                      'part') for r in self._gaps.reasons(silent_s)]
+        seen = (*cut, *self._faults, *(self._newest.faults if self._newest else ()))
         first = {r.code: r for r in reversed(seen)}
         order = list(Verdict)
         return tuple(sorted(first.values(), key=lambda r: -order.index(r.code.gravity)))
@@ -116,7 +123,7 @@ class RunningEstimate:
         if over.is_set():
             return
         self._looking = False
-        self.forecast, self._faults, seconds, failure = look or (None, (), 0.0, error)
+        self._newest, self._faults, seconds, failure = look or (None, (), 0.0, error)
         # the first look brings in the pre-roll, and modules: a cost that comes once
         self._pause_until = time.monotonic() + seconds / SHARE if self._warm else 0.0
         self._warm = True

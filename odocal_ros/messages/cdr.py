@@ -2,8 +2,8 @@
 Decode many serialised messages at once with numpy, without a ROS or rosbags import.
 
 Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same bytes: one message tells the layout, the others are read as columns of one table. What has
-no such layout (big endian, unknown type, damaged) is left to the caller.
+same bytes: one message tells the layout, the others are read as columns. What has no such layout
+(big endian, unknown type, damaged) is left to the caller.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Bools, Ints
+from odocal_ros.messages.raws import Raws, Rows
 
 MAX_LAYOUTS = 16   # per call; a stream with more is odd enough to be read message by message
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
@@ -31,6 +34,7 @@ def _twist(prefix: str) -> tuple[str, ...]:
 
 
 _HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
+FRAME_AT = 16       # where the text of _HEADER stands
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
 
@@ -106,6 +110,14 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     return layout if layout.size <= len(raw) else None
 
 
+def frame_of(msgtype: str, raw: bytes) -> str | None:
+    """Return the frame_id of one message; None where a layout does not tell it."""
+    if SCHEMAS.get(msgtype, ())[:3] != _HEADER or layout_of(msgtype, raw) is None:
+        return None
+    at, length = FRAME_AT, int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')
+    return raw[at:at + max(length - 1, 0)].decode()
+
+
 class _Walk:
     """Walks over one message and notes where everything lies."""
 
@@ -170,63 +182,56 @@ class _Walk:
         return self.raw[at:at + length - 1].decode() if keep and length else ''
 
 
-Rows = NDArray[np.intp] | slice
-Table = NDArray[np.uint8]
-
-
-def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None, Rows, Table]]:
+def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None, Rows, Raws]]:
     """
     Sort messages by layout.
 
     Yields
     ------
-    Layout, where its rows stand (numbers, or a slice: all of them) and the messages' bytes
-    (n, size). Rows that have no layout come last, with None and an empty table.
+    Layout, where its rows stand (numbers, or a slice: all of them) and the messages. Rows that
+    have no layout come last, with None and no messages.
 
     """
-    sizes = set(map(len, raws))
-    odd: list[NDArray[np.intp]] = []
-    for size in sizes:
-        if len(sizes) == 1:
-            rows, joined = np.arange(len(raws)), b''.join(raws)
-        else:
-            rows = np.flatnonzero(np.array([len(raw) == size for raw in raws]))
-            joined = b''.join([raws[i] for i in rows.tolist()])
-        table = np.frombuffer(joined, np.uint8).reshape(len(rows), size)
+    raws = Raws.of(raws)
+    odd: list[Ints] = []
+    for same in raws.by_size():
+        rows, table = same, raws.take(same)
         for _ in range(MAX_LAYOUTS):
-            layout = layout_of(msgtype, table[0].tobytes())
-            alike = _alike(table, layout.fixed if layout else [(0, size)])
+            layout = layout_of(msgtype, table[0])
+            alike = _alike(table, layout.fixed if layout else [(0, len(table[0]))])
             whole = bool(alike.all())
-            mine = table if whole else table[alike]
             if layout is None:
                 odd.append(rows[alike])
+            elif whole and len(rows) == len(raws):
+                yield layout, slice(None), raws
             else:
-                yield layout, slice(None) if len(mine) == len(raws) else rows[alike], mine
+                yield layout, rows[alike], table.take(alike)
             if whole:
                 break
-            rows, table = rows[~alike], table[~alike]
+            rows, table = rows[~alike], table.take(~alike)
         else:
             odd.append(rows)
     if odd:
-        yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
+        yield None, np.sort(np.concatenate(odd)), Raws.of([])
 
 
-def _alike(table: Table, fixed: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
-    """Tell which rows equal the first one in the bytes that make a layout."""
+def _alike(table: Raws, fixed: Sequence[tuple[int, int]]) -> Bools:
+    """Tell which messages of one length equal the first one in the bytes that make a layout."""
     alike = np.ones(len(table), bool)
     for start, stop in fixed:
-        alike &= (table[:, start:stop] == table[0, start:stop]).all(axis=1)
+        size = stop - start
+        part = table.column(start, *((f'u{size}', 1) if size in (2, 4, 8) else ('u1', size)))
+        alike &= (part == part[0]).all(axis=1)
     return alike
 
 
-def columns(layout: Layout, table: Table, paths: Sequence[str]) -> NDArray[Any] | None:
+def columns(layout: Layout, table: Raws, paths: Sequence[str]) -> NDArray[Any] | None:
     """
     Return the values at some paths.
 
     Returns
     -------
-    (n, len(paths)) array of the first path's dtype (a view where the values lie side by side);
-    None where a path is not in the layout.
+    (n, len(paths)) array of the first path's dtype; None where a path is not in the layout.
 
     """
     places = [place for place in map(layout.find, paths) if place]
@@ -234,8 +239,6 @@ def columns(layout: Layout, table: Table, paths: Sequence[str]) -> NDArray[Any] 
         return None
     offset, dtype = places[0]
     item = np.dtype(dtype).itemsize
-    n, size = table.shape
     if places == [(offset + i * item, dtype) for i in range(len(paths))]:
-        return np.ndarray((n, len(paths)), dtype, table.data, offset, (size, item))
-    return np.concatenate([np.ndarray((n, 1), dtype, table.data, offset, (size, item))
-                           for offset, dtype in places], axis=1)
+        return table.column(offset, dtype, len(paths))
+    return np.concatenate([table.column(offset, dtype, 1) for offset, dtype in places], axis=1)

@@ -2,7 +2,7 @@
 Messages to samples: one set of readers for the wire and for bags.
 
 A reader takes messages as they were serialised. Those of one layout are read as columns by
-``bagio.cdr``; any other goes through ``deserialize`` and gives the same row to the last bit.
+``messages.cdr``; any other goes through ``deserialize`` and gives the same row to the last bit.
 """
 
 from collections.abc import Callable, Sequence
@@ -97,7 +97,7 @@ class Reader:
         """Return the keys (joints, indices) that odometer values are taken from, left first."""
         return self._plan.keys if isinstance(self._plan, OdometerPlan) else ()
 
-    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int],
+    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
              deserialize: Deserialize) -> Pairs:
         """
         Decode messages.
@@ -106,7 +106,7 @@ class Reader:
         ----------
         raws : sequence of bytes
             Messages as serialised (CDR), in order of arrival.
-        received_ns : sequence of int
+        received_ns : sequence or array of int
             Their arrival; the stamp of messages that have none.
         deserialize : callable
             Turns one of them into an object with its fields; asked only where needed.

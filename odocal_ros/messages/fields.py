@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages import cdr
+from odocal_ros.messages.raws import Raws
 
 PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
@@ -100,7 +101,7 @@ class Column:
     width: int
     pick: Callable[[View], Sequence[str] | None]
 
-    def of_table(self, layout: cdr.Layout, table: cdr.Table) -> NDArray[Any] | None:
+    def of_table(self, layout: cdr.Layout, table: Raws) -> NDArray[Any] | None:
         """Return (n, width) values of messages of one layout, None if they are not there."""
         paths = self.pick(layout)
         return cdr.columns(layout, table, paths) if paths else None

@@ -15,12 +15,14 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
-RULED_OUT = 10.0   # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
+# sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
+RULED_OUT_SIGMAS = 10.0
 # what a leg is aligned by, recorded or planned
 MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
 COURSE_DISTANCE = 30.0    # m of track for a course
+HEADING_LIMIT = 0.5      # rad: an orientation worse than this is no heading
 COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
-EDGE = 0.3     # s cut off each end of a standstill: a slow start leans the specific force
+REST_EDGE = 0.3    # s cut off each end of a standstill: a slow start leans the specific force
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
     value.
 
     """
-    cut = min(EDGE, (span[1] - span[0]) / 4)
+    cut = min(REST_EDGE, (span[1] - span[0]) / 4)
     inside = (t >= span[0] + cut) & (t <= span[1] - cut)
     if not inside.any():        # rows at its very ends only
         inside = (t >= span[0]) & (t <= span[1])
@@ -253,5 +255,5 @@ def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, latitude: float,
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
     measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)
     known = (sigma < grade.gyro_bias) | (
-        np.abs(measured) > RULED_OUT * np.hypot(sigma, grade.gyro_bias))
+        np.abs(measured) > RULED_OUT_SIGMAS * np.hypot(sigma, grade.gyro_bias))
     return np.where(known, measured, 0.0), np.where(known, sigma, grade.gyro_bias)

@@ -13,21 +13,22 @@ from functools import cached_property
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.nav.gaps import MISSING_INTERVALS
 
-FEWEST = 20          # distinct values to know a grid by
-FEW, OFTEN, DIVIDES = 4, 5, 0.02     # a slow drive's: distinct, times sent, of a cell
-LOWEST = 3.0         # cells that the values must span
-CROWDS = 6           # cells that they must lie in
-ON_GRID = 0.9        # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
-CELLS, PADDED = 2**17, 2**20     # of the values' span, and with zeros: frequencies between
-COLLINEAR = 1e-6     # of the top speed: a second difference that vanishes
-KNOTS = 0.5          # share of the rows that change: more are no knots of an interpolation
-KNOT_STEP = 1.5      # the knots' grid over that of all rows, at least, of an interpolation
-LEAST_CELL = 2       # cells from zero: in the first, a dead band may be at work
-GAP = 2.5            # median steps: longer ones tell no crossing
-GOLDEN = 0.618034    # steps through a range evenly
-SHARP = 0.5          # of a cell: a speed that changes by more in a step tells no crossing
-SHARPEST = 0.02      # of a cell, sigma of a crossing: what speeds do beside
+FEWEST_VALUES = 20         # distinct values to know a grid by
+# a slow drive's: distinct, times sent, of a cell
+FEW_VALUES, OFTEN_SENT, DIVIDES_CELL = 4, 5, 0.02
+LEAST_CELLS = 3.0          # cells that the values must span
+FEWEST_CELLS = 6           # cells that they must lie in
+GRID_COHERENCE = 0.9       # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
+GRID_CELLS, GRID_PADDED = 2**17, 2**20# of the values' span, and with zeros: frequencies between
+COLLINEAR_OF_TOP = 1e-6    # of the top speed: a second difference that vanishes
+KNOT_SHARE = 0.5           # share of the rows that change: more are no knots of an interpolation
+KNOT_STEP = 1.5            # the knots' grid over that of all rows, at least, of an interpolation
+LEAST_CELL = 2             # cells from zero: in the first, a dead band may be at work
+GOLDEN = 0.618034          # steps through a range evenly
+SHARP_CHANGE = 0.5         # of a cell: a speed that changes by more in a step tells no crossing
+LEAST_CROSSING = 0.02      # of a cell, sigma of a crossing: what speeds do beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +86,17 @@ class CoarseSpeed:
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
         # in a long step a cruise ends anywhere, and before it the speed was that of the cruise
         gained = _gain(middle, edge, q) * h
-        jump = np.where(gained > SHARP * q, 2, jump)
+        jump = np.where(gained > SHARP_CHANGE * q, 2, jump)
         single = (jump == 1) & (outer >= LEAST_CELL) & (inner > 0)
         if not self.interpolated:
-            single &= h <= GAP * usual
+            single &= h <= MISSING_INTERVALS * usual
         sigma = gained[single]
         run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
         # one of its rows by turns: where the speed turns about, the middle one is the fastest
         row = first + (length * (np.arange(len(first)) * GOLDEN % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
-        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), SHARPEST * q)
+        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), LEAST_CROSSING * q)
         order = np.argsort(when, kind='stable')
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 
@@ -121,9 +122,9 @@ def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     top = np.abs(value).max(initial=0.0)
     knots = np.ones(len(value), bool)
     if len(value) > 2:
-        knots[1:-1] = np.abs(np.diff(value, n=2)) > COLLINEAR * top
+        knots[1:-1] = np.abs(np.diff(value, n=2)) > COLLINEAR_OF_TOP * top
     changes = np.diff(value, prepend=value[:1]) != 0
-    if (knots & changes).sum() < KNOTS * changes.sum():
+    if (knots & changes).sum() < KNOT_SHARE * changes.sum():
         own = grid(value[knots])
         if own and own > KNOT_STEP * (step or 0.0):
             return CoarseSpeed(own, t[knots], value[knots], True)
@@ -141,31 +142,31 @@ def grid(value: Floats) -> float | None:
     span = np.ptp(value) if len(value) else 0.0
     if span <= 0:
         return None
-    u, count = np.unique(np.rint((value - value.min()) / span * (CELLS - 1)).astype(int),
+    u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)
-    if len(u) < FEWEST:
-        return _of_few(value, u * (span / (CELLS - 1)) + value.min(), count)
-    there = np.zeros(PADDED)
+    if len(u) < FEWEST_VALUES:
+        return _of_few(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
+    there = np.zeros(GRID_PADDED)
     there[u] = 1.0
     phase = np.abs(np.fft.rfft(there)) / len(u)
-    f = np.arange(len(phase)) * ((CELLS - 1) / PADDED / span)
-    high = np.flatnonzero((phase > ON_GRID) & (f > LOWEST / span))
+    f = np.arange(len(phase)) * ((GRID_CELLS - 1) / GRID_PADDED / span)
+    high = np.flatnonzero((phase > GRID_COHERENCE) & (f > LEAST_CELLS / span))
     if not len(high):
         return None
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
     step = _refined(value, 1 / float(f[peak]))
     # where a speed bends into a cruise values crowd: at two or three speeds, on some grid
-    return step if len(np.unique(np.rint(value / step))) >= CROWDS else None
+    return step if len(np.unique(np.rint(value / step))) >= FEWEST_CELLS else None
 
 
 def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
     """Return the step of few distinct values u, each sent time and again, that it divides."""
-    if len(u) < FEW or np.median(count) < OFTEN:
+    if len(u) < FEW_VALUES or np.median(count) < OFTEN_SENT:
         return None
     step = _refined(value, float(np.diff(u).min()))
     off = u / step - np.rint(u / step)
-    return step if np.abs(off).max() < DIVIDES else None
+    return step if np.abs(off).max() < DIVIDES_CELL else None
 
 
 def _refined(value: Floats, step: float) -> float:

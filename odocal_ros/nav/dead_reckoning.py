@@ -18,7 +18,7 @@ from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
-TINY = 1e-9     # s, no two epochs are nearer
+LEAST_EPOCH_STEP = 1e-9    # s, no two epochs are nearer
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Track:
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
         after = np.minimum(k + 1, last)         # a track of one epoch has but that
-        step = np.maximum(self.t[after] - self.t[k], TINY)
+        step = np.maximum(self.t[after] - self.t[k], LEAST_EPOCH_STEP)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
         return self.P[k] * (1 - x) + self.P[after] * x
 

@@ -5,9 +5,10 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_step
 
-FACTOR = 5.0         # of the median interval: what is longer is a gap
-SHORTEST = 0.2       # s
-FEWEST = 10          # rows that show a rhythm
+MISSING_INTERVALS = 2.5  # median intervals: a message or more is missing
+GAP_INTERVALS = 5.0      # of the median interval: what is longer is a gap
+SHORTEST_GAP = 0.2       # s
+FEWEST_INTERVALS = 10    # rows that show a rhythm
 
 
 def gaps_longer(t: Floats, limit: float) -> Floats:
@@ -18,6 +19,6 @@ def gaps_longer(t: Floats, limit: float) -> Floats:
 
 def gaps_in_rhythm(t: Floats) -> Floats:
     """Return begin and end of the steps far beyond the stream's own rhythm: (k, 2) s."""
-    if len(t) < FEWEST:
+    if len(t) < FEWEST_INTERVALS:
         return np.empty((0, 2))
-    return gaps_longer(t, max(FACTOR * float(np.median(np.diff(t))), SHORTEST))
+    return gaps_longer(t, max(GAP_INTERVALS * float(np.median(np.diff(t))), SHORTEST_GAP))

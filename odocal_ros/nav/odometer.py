@@ -10,8 +10,8 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.reasons import Code, Reason
 
-RESET_FACTOR = 5.0   # a step this many times the 95th percentile of the moving rate is no motion
-ENOUGH = 20          # steps below which no reset is looked for
+RESET_FACTOR = 5.0    # a step this many times the 95th percentile of the moving rate is no motion
+FEWEST_STEPS = 20     # steps below which no reset is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
 def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
     """Tell which steps no wheel can make: far above the drive's speed, alone or in pairs."""
     dt = np.diff(t)
-    if len(step) < ENOUGH or not step.any():
+    if len(step) < FEWEST_STEPS or not step.any():
         return np.zeros(len(step), bool)
     usual = np.median(dt)
     size = np.abs(step) / np.maximum(dt, usual)    # bursts of stamps are no speed

@@ -10,9 +10,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 
-LEAST = 1e-4         # s^2: below, as much in proportion (and of an estimate below zero)
-STEP = 1e-4          # relative, of the difference that gives a derivative
-BEYOND = 10.0        # s that the way goes on at its last velocity
+LEAST_LAG2 = 1e-4      # s^2: below, as much in proportion (and of an estimate below zero)
+LAG2_STEP = 1e-4       # relative, of the difference that gives a derivative
+TRACK_BEYOND = 10.0    # s that the way goes on at its last velocity
 
 
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
@@ -26,11 +26,11 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     def late(square: float) -> Floats:
         return _late(t, place, velocity, at, np.sqrt(square))
 
-    if square <= LEAST:
-        rate = late(LEAST) / LEAST
+    if square <= LEAST_LAG2:
+        rate = late(LEAST_LAG2) / LEAST_LAG2
         return rate * square, rate
     here = late(square)
-    return here, (late(square * (1 + STEP)) - here) / (square * STEP)
+    return here, (late(square * (1 + LAG2_STEP)) - here) / (square * LAG2_STEP)
 
 
 def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
@@ -40,8 +40,8 @@ def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) ->
     On a cubic the filter's answer is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is
     left of before dies away.
     """
-    t = np.append(t, t[-1] + BEYOND)
-    place = np.concatenate([place, place[-1:] + BEYOND * velocity[-1:]])
+    t = np.append(t, t[-1] + TRACK_BEYOND)
+    place = np.concatenate([place, place[-1:] + TRACK_BEYOND * velocity[-1:]])
     velocity = np.concatenate([velocity, velocity[-1:]])
     T = np.diff(t)[:, None]
     mean = np.diff(place, axis=0) / T

@@ -6,12 +6,12 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
-CELL = 0.1            # s, grid of the detector
-WINDOW = 0.5          # s, each side
-MOVE = 0.03           # m, travel within the window that still counts as standing
-COARSE = 0.5          # m, a count beyond which one is motion
-CREEP = 0.02          # m/s, mean speed at which a long slow stretch is no standstill
-TURN = 0.02           # rad/s, wander of the gyro that still counts as standing
+REST_GRID = 0.1       # s, grid of the detector
+REST_WINDOW = 0.5     # s, each side
+REST_TRAVEL = 0.03    # m, travel within the window that still counts as standing
+COARSE_COUNT = 0.5    # m, a count beyond which one is motion
+CREEP_SPEED = 0.02    # m/s, mean speed at which a long slow stretch is no standstill
+REST_TURN = 0.02      # rad/s, wander of the gyro that still counts as standing
 MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
 
 
@@ -34,8 +34,8 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     Returns
     -------
     (k, 2) array of begin and end times, s, in order. The edges lie inside the true standstill by
-    up to the window; a start so slow that it takes longer than that to move MOVE, or a count and
-    a half, is included as far.
+    up to the window; a start so slow that it takes longer than that to move REST_TRAVEL, or a
+    count and a half, is included as far.
 
     """
     if len(t_imu) < 2 or len(travel.t) < 2:
@@ -43,21 +43,22 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     t0, t1 = max(t_imu[0], travel.t[0]), min(t_imu[-1], travel.t[-1])
     if t1 - t0 < shortest:
         return np.empty((0, 2))
-    edges = np.linspace(t0, t1, max(2, round((t1 - t0) / CELL)) + 1)
+    edges = np.linspace(t0, t1, max(2, round((t1 - t0) / REST_GRID)) + 1)
     middle = (edges[:-1] + edges[1:]) / 2
     rate, steady = _gyro(edges, t_imu, w_b)
     quiet = _still_wheels(middle, travel, metres_per_unit) & steady
     quiet &= _not_turning(rate, quiet, edges, shortest)
     spans = _spans(quiet, edges, shortest)
     moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
-    return spans[moved <= CREEP * (spans[:, 1] - spans[:, 0]) + _allowed(travel, metres_per_unit)]
+    allowed = _allowed(travel, metres_per_unit)
+    return spans[moved <= CREEP_SPEED * (spans[:, 1] - spans[:, 0]) + allowed]
 
 
 def _allowed(travel: Travel, metres_per_unit: float) -> float:
-    """Return the travel, m, of one that stands: MOVE, or a count or so of jitter."""
+    """Return the travel, m, of one that stands: REST_TRAVEL, or a count or so of jitter."""
     count = travel.quantum * metres_per_unit
     # a few counts a turn of the wheel: one of them is motion, not jitter
-    return max(MOVE, (1.5 if count <= COARSE else 0.5) * count)
+    return max(REST_TRAVEL, (1.5 if count <= COARSE_COUNT else 0.5) * count)
 
 
 def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
@@ -70,24 +71,24 @@ def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
     """Tell where travel in the window is that of one that stands."""
     # range of the travel in the window by a few probes, so that rocking to and fro is seen
-    probes = [travel.at(middle + x) for x in np.linspace(-WINDOW, WINDOW, 5)]
+    probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
     still: Bools = reach * metres_per_unit <= _allowed(travel, metres_per_unit)
     return still
 
 
 def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
-    """Return the mean turn rate about each cell, (m, 3), and where it wanders less than TURN."""
+    """Return the mean turn rate about each cell, (m, 3), and where it is steady to REST_TURN."""
     dt = np.diff(t_imu)
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
-    reach = round(WINDOW / CELL)
+    reach = round(REST_WINDOW / REST_GRID)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
     seen = np.ones(len(rate), bool)
-    if (dt > WINDOW).any():
-        unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > WINDOW, dt, 0.0))])
+    if (dt > REST_WINDOW).any():
+        unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
         seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing known within a gap
-    return windows.mean(axis=-1), (windows.std(axis=-1) < TURN).all(axis=-1) & seen
+    return windows.mean(axis=-1), (windows.std(axis=-1) < REST_TURN).all(axis=-1) & seen
 
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
@@ -105,5 +106,5 @@ def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> 
     rest = min(means, key=np.linalg.norm)
     if np.abs(rest).max() > MOST_BIAS:
         return np.zeros_like(quiet)
-    as_at_rest: Bools = (np.abs(rate - rest) < TURN).all(axis=-1)
+    as_at_rest: Bools = (np.abs(rate - rest) < REST_TURN).all(axis=-1)
     return as_at_rest

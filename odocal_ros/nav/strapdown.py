@@ -12,10 +12,10 @@ from odocal_ros.data.arrays import Complexes, Floats
 from odocal_ros.data.samples import let_go
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
-BLOCK = 64       # quaternions a scan multiplies up in step; 40 to 800 make no difference
-CHUNK = 16384    # intervals worked on at a time: their arrays stay in the cache
-EVEN = 2.0       # ratio of neighbouring intervals up to which a cubic is laid through them
-TINY = 1e-9      # s, of the stamps: keeps the slope of equal stamps finite
+SCAN_BLOCK = 64    # quaternions a scan multiplies up in step; 40 to 800 make no difference
+SAMPLES_AT_A_TIME = 16384    # intervals worked on at a time: their arrays stay in the cache
+EVEN_RATIO = 2.0    # ratio of neighbouring intervals up to which a cubic is laid through them
+LEAST_INTERVAL = 1e-9        # s, of the stamps: keeps the slope of equal stamps finite
 
 
 def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None = None) -> Floats:
@@ -32,8 +32,8 @@ def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None 
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     end = max(len(t) - 1, 0) if end is None else end
     phi = np.empty((3, end - begin))
-    for first in range(begin, end, CHUNK):
-        last = min(first + CHUNK, end)
+    for first in range(begin, end, SAMPLES_AT_A_TIME):
+        last = min(first + SAMPLES_AT_A_TIME, end)
         phi[:, first - begin:last - begin] = _increments(t, w_b, first, last)
         let_go(w_b)
     return phi
@@ -69,11 +69,11 @@ def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     twist : how much less the middle slope, times the interval, rises than the chord.
     From divided differences of the rates over intervals h, (m,), with rises (3, m) over them.
     """
-    safe = np.maximum(h, TINY)
+    safe = np.maximum(h, LEAST_INTERVAL)
     curve = np.diff(rise / safe) / (safe[:-1] + safe[1:])       # half the second derivative
     before, own, after = safe[:-2], safe[1:-1], safe[2:]
-    even = ((EVEN * before > own) & (before < EVEN * own)
-            & (EVEN * after > own) & (after < EVEN * own))
+    even = ((EVEN_RATIO * before > own) & (before < EVEN_RATIO * own)
+            & (EVEN_RATIO * after > own) & (after < EVEN_RATIO * own))
     weight = np.where(even, own**2 / 4 / (before + own + after), 0.0)
     left, right = curve[:, :-1], curve[:, 1:]
     bow = left * (weight * (own / 2 + after)) + right * (weight * (own / 2 + before))
@@ -119,7 +119,7 @@ def _scan(a: Complexes, b: Complexes) -> Pairs:
             a, b = a.copy(), b.copy()
             a[1], b[1] = _times(a[0], b[0], a[1], b[1])
         return a, b
-    width = min(BLOCK, max(2, int(np.sqrt(n))))
+    width = min(SCAN_BLOCK, max(2, int(np.sqrt(n))))
     rows = -(-n // width)
     A, B = np.ones((rows * width), complex), np.zeros((rows * width), complex)
     A[:n], B[:n] = a, b
@@ -139,7 +139,7 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
     n = len(t) - 1
     groups = -(-n // every)
     a, b = np.empty(groups, complex), np.empty(groups, complex)
-    step = max(1, CHUNK // every)
+    step = max(1, SAMPLES_AT_A_TIME // every)
     for g in range(0, groups, step):
         first, last = g * every, min((g + step) * every, n)
         c, d = _pairs_from_rotvec(_increments(t, w_b, first, last, bias))

@@ -12,12 +12,14 @@ from odocal_ros.offline.say import warn
 
 COMMANDS = {
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
+    'fleet': ('odocal_ros.fleet.command', 'calibrate many vehicles from many bags, on many cores'),
     'inspect': ('odocal_ros.offline.inspect_bag', 'tell what a bag holds and what it lacks'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
     'patent': ('odocal_ros.offline.patent', 'compute the embodiment of CN104359492A'),
     'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
     'watch': ('odocal_ros.live.watch_command', 'show what a running node is at, with bars'),
+    'doctor': ('odocal_ros.offline.doctor', 'what is installed: one screen to paste'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
 LONGEST = 2000       # characters of a sentence: a bag may hold a name of any length

@@ -1,28 +1,27 @@
 """What a bag's inputs show together: units, axes, standstills, legs."""
 
-import math
-
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
 from odocal_ros.calib.drive import way_and_chord
+from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
+from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.offline.legs import EACH_STOP, find_legs, LegSpan, marked_legs
 from odocal_ros.offline.stretches import (
     straight_stretches,
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
+from odocal_ros.screening.sanity import imu_sanity, MAX_RATE, RAD_PER_DEG
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.nominal import nominal_scale
 
 CLOSED = 0.2            # chord over way: below, a leg ends where it began
-RAD_PER_DEG = math.pi / 180
 
 
 def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
@@ -63,6 +62,9 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': drive.slowest * truer, 'fastest': drive.fastest * truer,
         'usable_fixes': len(drive.t_fix), 'travel': driven}
+    if scale:
+        findings += far_from_nominal(float(f'{scale:.3g}'), inputs.scale_unit,
+                                     nominal_scale(config, inputs.scale_unit), config)
     found['standstills'] = [[base + a, base + b] for a, b in drive.stops.tolist()]
     options += _axes(inputs, w_i, f_i, drive, config, found, findings)
     options += _legs(bag, recorder, inputs, drive, first, config, found)
@@ -81,14 +83,14 @@ def _driven(inputs, drive) -> float:
 
 def _units(inputs, config, findings):
     """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
-    findings += with_axes(imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)[0], inputs)
+    findings += with_axes(imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
     w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
     options = []
     if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:
-        options.append('imu.accel_scale=9.80665')
+        options.append(f'imu.accel_scale={9.80665 * config.imu.accel_scale:.10g}')
     spread = np.linalg.norm(w_i - np.median(w_i, axis=0), axis=1)
     if np.percentile(spread, 99.9) > MAX_RATE:
-        options.append(f'imu.gyro_scale={RAD_PER_DEG!r}')
+        options.append(f'imu.gyro_scale={RAD_PER_DEG * config.imu.gyro_scale!r}')
         w_i = w_i * RAD_PER_DEG
     return options, w_i, f_i
 
@@ -128,8 +130,9 @@ def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
 
     marks = marked_legs(bag)
     found['legs'] = [described(a, b, marked=bool(marks))
-                     for a, b in find_legs(recorder, bag, [], marks, config)]
-    stops = find_legs(recorder, bag, [EACH_STOP], [], config) if len(drive.stops) > 2 else []
+                     for a, b in find_legs(recorder, bag, [], marks, config, inputs)]
+    stops = find_legs(recorder, bag, [EACH_STOP], [], config, inputs) if len(
+        drive.stops) > 2 else []
     found['each_stop'] = [described(a, b) for a, b in stops]
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (

@@ -12,7 +12,7 @@ STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
 
 
 def text(found: dict) -> str:
-    """Return one screen of text (more where there is more to say)."""
+    """Return one screen for people, more where there is more to say."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']

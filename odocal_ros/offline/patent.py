@@ -63,4 +63,7 @@ def driven(fix_noise: str, seed: int):
     leg = drive.leg()
     inputs, _ = screen(leg, config)
     prepared, _ = prepare(leg, inputs, config)
-    return planar_of(prepared, wheel_leg(prepared), 0.0)
+    assert prepared is not None     # a drive made for it
+    wheels = wheel_leg(prepared)
+    assert wheels is not None
+    return planar_of(prepared, wheels, 0.0)

@@ -8,6 +8,7 @@ import sys
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
 
+SLOTS = ('imu', 'odometer', 'fix', 'heading')
 NOISE = {'white': 0.0, 'correlated': 60.0}
 
 
@@ -45,36 +46,32 @@ def add_arguments(parser) -> None:
     add('--config', metavar='FILE', help='ROS parameter file, as replay takes it')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
-    for slot in ('imu', 'odometer', 'fix', 'heading'):
+    for slot in SLOTS:
         add(f'--{slot}-topic', metavar='TOPIC', help=f'of --bag, topic of the {slot}')
     add('--json', action='store_true', help='print JSON, nothing else')
 
 
 def run(args) -> int:
     """Predict and print; return 0."""
-    from odocal_ros.offline.plan_text import as_json, screen
-    from odocal_ros.offline.what_helps import changes
-    from odocal_ros.plan.methods import plan_methods
-    config = _config(args)
-    drive, figures = _drive(args, config)
-    sigmas = _sigmas(args, config, figures)
-    before = plan_methods(drive, sigmas)
-    found = changes(drive, sigmas, before)
+    from odocal_ros.library.plan import plan
+    from odocal_ros.offline.plan_text import screen
+    drive = {name: getattr(args, name) for name in (
+        'scenario', 'duration', 'gpx', 'bag', 'distance', 'speed', 'standstill', 'turns',
+        'acceleration')}
+    topics = {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
+    planned = plan(**drive, topics=topics, config=_config(args), **_figures(args))
     if args.json:
-        json.dump(as_json(before, sigmas, found), sys.stdout, indent=2, allow_nan=False)
+        json.dump(planned.to_dict(), sys.stdout, indent=2, allow_nan=False)
         say('')
     else:
-        say(screen(before, sigmas, found))
+        say(screen(planned))
     return 0
 
 
-def _config(args):
-    """Return defaults < --config < --set < the options named for a plan."""
-    from odocal_ros.settings.config import Config, with_settings
+def _config(args) -> dict:
+    """Return the settings asked for: --config < --set < the options named for a plan."""
     from odocal_ros.settings.config_file import parse_set, read_config_file
-    config = Config()
-    if args.config:
-        config = with_settings(config, read_config_file(Path(args.config)))
+    from_file = read_config_file(Path(args.config)) if args.config else {}
     asked = dict(parse_set(text) for text in args.settings)
     if args.imu_grade:
         asked['imu.grade'] = args.imu_grade
@@ -88,47 +85,14 @@ def _config(args):
         asked['alignment.heading_source'] = args.heading_source
     if args.fix_noise:
         asked['gnss.correlation_time'] = NOISE[args.fix_noise]
-    return with_settings(config, asked)
+    return from_file | asked
 
 
-def _drive(args, config):
-    """Return the planned drive and the figures of its fixes where a bag gives them."""
-    from odocal_ros.offline import profile
-    kinds = [k for k in ('scenario', 'gpx', 'bag', 'distance') if getattr(args, k) is not None]
-    if len(kinds) != 1:
-        raise BadUsage('plan: give one drive: --scenario NAME, --gpx FILE, --bag BAG, or '
-                       f'--distance with --speed{"; not " if kinds else ""}'
-                       f'{" and ".join("--" + k for k in kinds)}')
-    if args.duration is not None and not args.scenario:
-        raise BadUsage('--duration goes with --scenario; elsewhere distance and speed give it')
-    if kinds[0] != 'distance' and (args.standstill is not None or args.turns is not None):
-        raise BadUsage(f'--standstill and --turns go with --distance, not with --{kinds[0]}')
-    if args.speed is not None and not (math.isfinite(args.speed) and args.speed > 0):
-        raise BadUsage(f'--speed {args.speed:g}: want a number above 0; a drive must move')
-    if args.scenario:
-        return profile.from_scenario(args.scenario, args.duration), {}
-    if args.gpx:
-        return profile.from_gpx(Path(args.gpx), args.speed), {}
-    if args.bag:
-        topics = {s: getattr(args, f'{s}_topic') for s in ('imu', 'odometer', 'fix', 'heading')}
-        return profile.from_bag(Path(args.bag), config, {s: t for s, t in topics.items() if t})
-    if args.speed is None:
-        raise BadUsage('--distance needs --speed, m/s')
-    standstill = 30.0 if args.standstill is None else args.standstill
-    return profile.from_figures(args.speed, args.distance, standstill, args.turns or 0,
-                                args.acceleration), {}
-
-
-def _sigmas(args, config, figures):
-    """Return the error figures: those of the bag, replaced by what is asked."""
-    from odocal_ros.offline.what_helps import RTK
-    from odocal_ros.plan.predict import Sigmas
+def _figures(args) -> dict:
+    """Return the error figures that are asked for."""
+    from odocal_ros.library.what_helps import RTK
     if args.rtk and args.fix_sigma is not None:
         raise BadUsage('--rtk and --fix-sigma both give the error of a fix; give one')
-    fix = RTK if args.rtk else args.fix_sigma
-    if fix is not None:
-        figures = figures | {'fix': fix, 'fix_up': None}
-    asked = {'fix_rate': args.fix_rate, 'quantum': args.pulse, 'sway': args.sway,
-             'slip': args.slip_walk}
-    figures = figures | {name: value for name, value in asked.items() if value is not None}
-    return Sigmas(config=config, **figures)
+    asked = {'fix': RTK if args.rtk else args.fix_sigma, 'fix_rate': args.fix_rate,
+             'quantum': args.pulse, 'sway': args.sway, 'slip': args.slip_walk}
+    return {name: value for name, value in asked.items() if value is not None}

@@ -3,45 +3,20 @@
 import math
 import textwrap
 
-from odocal_ros.offline.what_helps import ranked, SCALE, YAW
+from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
+from odocal_ros.library.what_helps import ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
-from odocal_ros.plan.methods import NOT_PREDICTED, Plan
-from odocal_ros.plan.smoother import SWAY_RATE, WHITE_SHARE
+from odocal_ros.planning.methods import NOT_PREDICTED
+from odocal_ros.planning.smoother import SWAY_RATE, WHITE_SHARE
 
-PITCH = 'pitch_mounting_angle'
-PARAMETERS = (SCALE, YAW, PITCH)
 SHOWN = 0.01          # share of the variance from which a source has its row
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 
-def as_json(before: Plan, sigmas, found) -> dict:
-    """Return the content of ``odocal plan --json``; sigmas of the scale are relative."""
-    two_point, alignment = before.two_point, before.two_point.alignment
-    return {
-        'drive': {'distance': two_point.distance, 'chord': two_point.chord,
-                  'duration': two_point.duration, 'standing': list(two_point.standing)},
-        'sigmas': {'imu_grade': sigmas.config.imu.grade,
-                   'heading_source': alignment.heading_source,
-                   'heading_sigma': alignment.heading_sigma, 'fix_sigma': sigmas.fix,
-                   'fix_rate': sigmas.fix_rate, 'correlation_time': sigmas.correlation_time,
-                   'pulse': sigmas.quantum, 'sway': sigmas.sway, 'slip_walk': sigmas.slip},
-        'verdict': before.verdict.value, 'reasons': [r.as_dict() for r in before.reasons],
-        'estimates': {name: {'sigma': before.sigma(name), 'method': before.by(name) or None}
-                      for name in PARAMETERS},
-        'methods': {name: {
-            'estimates': {name: {'sigma': e.sigma, 'unit': e.unit}
-                          for name, e in method.estimates.items() if name != 'scale_ratio'},
-            'reasons': [r.as_dict() for r in before.reasons_of(name)],
-            'budget': method.details.get('budget', {})}
-            for name, method in before.methods.items()},
-        'methods_not_predicted': list(NOT_PREDICTED),
-        'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
-                    for c in found]}
-
-
-def screen(before: Plan, sigmas, found) -> str:
+def screen(planned: Planned) -> str:
     """Return the prediction as one screen of plain text."""
+    before, sigmas, found = planned.plan, planned.sigmas, planned.helps
     return '\n'.join([*_head(before, sigmas), '', *_methods(before), '', *_budgets(before),
                       *_helps(before, found), *_reasons(before)])
 

@@ -1,6 +1,5 @@
 """odocal replay: the node's pipeline over recorded bags."""
 
-from datetime import datetime, UTC
 import json
 import os
 from pathlib import Path
@@ -8,224 +7,115 @@ from shutil import get_terminal_size
 import sys
 from textwrap import fill
 
-from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.errors import BadUsage
+from odocal_ros.library.hearer import Hearer
 from odocal_ros.offline.say import say, warn
 from odocal_ros.outside.names import one_line
 
-NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
-
-
-class LegDropped(BadUsage):
-    """A journal holds a leg that the operator dropped."""
+SLOTS = ('imu', 'odometer', 'fix', 'heading', 'odometer_right', 'fix_velocity')
 
 
 def add_arguments(parser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
+    add_calibration_arguments(parser)
+    add('--holdout', action='store_true', help='keep the last fifth of each leg back and check '
+        'the correction on it')
+    add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
+    add('--export', metavar='FILES', default='', help='time series beside the results, by commas: '
+        'trajectory.tum, states.csv, residuals.parquet, track.kml, debug.mcap ...')
+    add('--force', action='store_true', help='replace an existing calibration.json')
+    add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
+    add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
+
+
+def add_calibration_arguments(parser) -> None:
+    """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
+    add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
-    for slot, name in (('imu', 'imu'), ('odometer', 'odometer'), ('fix', 'fix'),
-                       ('heading', 'heading'), ('odometer_right', 'odometer-right'),
-                       ('fix_velocity', 'fix-velocity')):
-        add(f'--{name}-topic', metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {name.replace("-", " ")}; found by its type where there is one')
+    for slot in SLOTS:
+        add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
+            help=f'topic of the {slot.replace("_", " ")}; found by its type where there is one')
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
     add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
         help='method whose figures are the result')
-    add('--holdout', action='store_true', help='keep the last fifth of each leg back and check '
-        'the correction on it')
-    add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
-    add('--force', action='store_true', help='replace an existing calibration.json')
-    add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
-    add('--quiet', action='store_true', help='print nothing but errors')
+    add('--accept', action='append', default=[], metavar='NAME=LOW:HIGH',
+        help='pass or fail: value plus and minus 2 sigma within limits, as '
+        'yaw_mounting_angle_deg=-0.5:0.5; repeatable; prints a line of JSON a vehicle')
+    add('--strict', action='store_true', help='a caution is not good enough: it exits with 1, '
+        'and does not pass')
 
 
 def run(args) -> int:
-    """Replay bags; return 0 accepted or caution, 1 rejected."""
-    from odocal_ros.offline.legs import EACH_STOP, parse_leg
-    config = _config(args)
-    asked = [text if text == EACH_STOP else parse_leg(text) for text in args.leg]
+    """Replay bags; return 0 accepted or caution (of --accept: pass), else 1."""
+    from odocal_ros.library.asked import legs_of
+    config = asked_config(args)
+    legs_of(args.leg)
+    series = [name.strip() for name in args.export.split(',') if name.strip()]
+    if series:
+        from odocal_ros.library.export import check_names
+        check_names(series)
     output = Path(args.output) if args.output else Path(
         f'odocal_{one_line(Path(args.bags[0]).stem)}')
     if (output / 'calibration.json').exists() and not args.force:     # said before the work
         raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
                        'or another --output')
     from odocal_ros.calib.failed import traces
-    from odocal_ros.offline.bags import about, look_at_all, once, told_apart, unlike_settings
+    from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
-    from odocal_ros.offline.journal import journal_notes
-    from odocal_ros.output.frames import framed
-    from odocal_ros.output.stored import known_imu
-    from odocal_ros.pipeline.calibrate import combine
-    imu = known_imu(_config(args))
-    paths, again = once([Path(bag) for bag in args.bags])
-    for path in again:
-        _tell(args, f'{path} is given twice: it is read once')
-    if len(paths) > 1:
-        look_at_all(paths, lambda path: _look(path, args))
-    done, dropped, imu_frame, unit = [], None, '', None
-    for path in paths:
-        journal = journal_notes(path)
-        own = _config(args, journal)
-        try:
-            new, described, frame, unit = _legs_of(path, args, asked, own, journal, unit)
-        except LegDropped as error:
-            dropped = error
-            if len(paths) > 1:
-                _tell(args, str(error))
-            continue
-        except OdocalError as error:
-            if len(paths) == 1:
-                raise
-            raise BadUsage(about(path, error)) from None
-        done.append((path, own, new, described))
-        imu_frame = imu_frame or frame
-    if dropped and not done:
-        raise dropped
-    used, configs, legs, inputs = (list(column) for column in zip(*done, strict=True))
-    config = configs[-1]
-    if unlike := unlike_settings(configs):
-        _tell(args, f'{", ".join(unlike)}: not the same in all journals; each leg is computed '
-              f'with its own, limits and files are by those of {used[-1].name}')
-    legs, inputs = told_apart(used, legs, inputs)
-    for name, trace in traces(legs):
+    calibration = calibrate_bag(args.bags, asked_topics(args), config, args.leg,
+                                holdout=args.holdout, hearer=_Screen(args))
+    for name, trace in traces(calibration.result.legs):
         warn(f'odocal: method {name} broke; please report it with {trace_file(trace)}')
-    calibration, config = framed(combine(legs, config, imu=imu), config, imu_frame)
-    return _report(calibration, config, inputs, output, args)
+    code = _report(calibration, output, args)
+    if series:
+        exported = calibration.export(*(output / name for name in series))
+        _Screen(args).note(f'exported: {", ".join(map(str, exported))}')
+    return code
 
 
-def _look(path, args) -> None:
-    """Open a bag and see that it has what a replay wants of it."""
-    from odocal_ros.bagio.read import open_bag
-    from odocal_ros.offline.journal import journal_notes
-    journal = journal_notes(path)
-    with open_bag(path) as bag:
-        _readers(bag, args, _config(args, journal), journal)
+class _Screen(Hearer):
+    """Shows on the terminal how it goes."""
+
+    def __init__(self, args) -> None:
+        self._quiet, self._silent = args.quiet, args.quiet or args.json
+
+    def note(self, text: str) -> None:
+        """Print a sentence."""
+        if not self._quiet:
+            warn(f'odocal: {text}')
+
+    def phase(self, title: str):
+        """Return a line that is gone when the phase is over."""
+        from odocal_ros.offline.phases import Phase
+        return Phase(title, self._silent)
 
 
-def _tell(args, note: str) -> None:
-    if not args.quiet:
-        warn(f'odocal: {note}')
-
-
-def _config(args, journal=None):
-    """Return defaults < a journal's settings < --config < --set, each checked."""
+def asked_config(args) -> dict:
+    """Return the settings asked for: --config < --set < --accept and --method, each checked."""
+    from odocal_ros.settings.accept_option import parse_accept
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.config_file import parse_set, read_config_file
-    config = with_settings(Config(), journal.settings if journal else {})
-    if args.config:
-        config = with_settings(config, read_config_file(Path(args.config)))
-    config = with_settings(config, dict(parse_set(text) for text in args.settings))
-    return with_settings(config, {'method': args.method}) if args.method else config
+    asked = read_config_file(Path(args.config)) if args.config else {}
+    asked |= dict(parse_set(text) for text in args.settings)
+    for text in args.accept:
+        asked |= parse_accept(text)
+    if args.strict:
+        asked['accept.strict'] = True
+    if args.method:
+        asked['method'] = args.method
+    with_settings(Config(), asked)
+    return asked
 
 
-def _readers(bag, args, config, journal):
-    """Return slot -> topic of a bag, and topic -> reader."""
-    from odocal_ros.messages.decode import make_reader
-    from odocal_ros.offline.topics import choose_topics
-    overrides = {slot: getattr(args, f'{slot}_topic') for slot in (
-        'imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')}
-    overrides = {slot: topic for slot, topic in overrides.items() if topic}
-    if journal:
-        overrides = journal.topics_in(bag.topics) | overrides
-    topics = choose_topics(bag.topics, config, overrides)
-    return topics, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
-                    for slot, topic in topics.items()}
-
-
-def _legs_of(path, args, asked, config, journal, unit):
-    """
-    Return the results of a bag's legs, its entry for calibration.json, the Imu's frame, the unit.
-
-    unit : of the scale in the bags before, None for the first; another one is refused.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    from odocal_ros.bagio.read import bag_sha256, open_bag
-    from odocal_ros.data.leg import LegRecorder
-    from odocal_ros.offline.legs import (
-        dropped_legs,
-        find_legs,
-        marked_legs,
-        open_ended,
-        OPEN_LEG,
-    )
-    from odocal_ros.offline.phases import Phase
-    quiet = args.quiet or args.json
-    # the hash costs as long as reading the file: beside the decoding, which holds one core
-    with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
-        name = one_line(bag.name)
-        if journal:
-            _tell(args, f'{bag.name} is a journal: settings and topics from {journal.path}; '
-                  'options go before them')
-        topics, readers = _readers(bag, args, config, journal)
-        digest = beside.submit(bag_sha256, bag)
-        recorder = LegRecorder()
-        with Phase(f'reading {name}', quiet) as phase:
-            bag.read(readers, recorder.feed, phase)
-        recorder.form = readers[topics['odometer']].form or recorder.form
-        if recorder.form.scale_unit != (unit or recorder.form.scale_unit):
-            raise BadUsage(f'{path}: the scale of its odometer {topics["odometer"]} is in '
-                           f'{NAMED[recorder.form.scale_unit]}, that of the bags before in '
-                           f'{NAMED[unit]}: there is no mean of them; calibrate them apart, or '
-                           'name topics of one kind')
-        if 'odometer_right' in topics:
-            recorder.form_right = readers[topics['odometer_right']].form
-        marks = [] if asked else marked_legs(bag)
-        if journal and not (marks or asked) and dropped_legs(bag):
-            raise LegDropped(f'{bag.name}: its leg was cancelled or undone, so it is not '
-                             'replayed; give --leg : to replay it all the same')
-        if any(not stop for _, stop in marks):
-            _tell(args, f'{bag.name}: {OPEN_LEG}')
-        spans = find_legs(recorder, bag, asked, marks, config)
-        seen = tuple(n for n in bag.notes if not isinstance(n, str))
-        notes = [seen + note for note in open_ended(spans, marks)]
-        for note in bag.notes:
-            if isinstance(note, str):
-                _tell(args, note)
-        results = _calibrated(recorder, spans, config, notes, name, args)
-        if config.leg.automatic and not (marks or asked):
-            results = _worth_keeping(results, args)
-        with Phase(f'checksum of {name}', quiet):
-            described = {'bag': name, 'sha256': digest.result(), 'topics': topics}
-        frame = next((m.header.frame_id for _, m in bag.messages(topics['imu'])), '')
-    return results, described, frame, recorder.form.scale_unit
-
-
-def _calibrated(recorder, spans, config, notes, name, args):
-    from dataclasses import replace
-
-    from odocal_ros.offline.phases import Phase
-    from odocal_ros.pipeline.parts import calibrate_parts
-    results = []
-    with Phase('calibrating', args.quiet or args.json) as phase:
-        for number, (start_ns, stop_ns) in enumerate(spans, 1):
-            which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
-            leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-            parts = calibrate_parts(
-                leg, config, notes=notes[number - 1], holdout=args.holdout,
-                progress=lambda share, stage, done=number - 1, which=which: phase(
-                    (done + share) / len(spans), which + stage))
-            results += [replace(one, bag=name) for one in parts]
-    return results
-
-
-def _worth_keeping(results, args):
-    """Return legs found by themselves but for those that are no good, as the node has it."""
-    from odocal_ros.pipeline.automatic import refusal
-    why = [refusal(leg) for leg in results]
-    if all(why):
-        return results
-    for leg, reason in zip(results, why, strict=True):
-        if reason:
-            start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
-            _tell(args, f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
-                  f'{reason.code.name}: {reason.text}')
-    return [leg for leg, reason in zip(results, why, strict=True) if not reason]
+def asked_topics(args) -> dict[str, str]:
+    """Return slot -> topic of those asked for."""
+    return {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
 
 
 def _styled(stream) -> bool:
@@ -241,45 +131,71 @@ def _size(stream) -> tuple[int, int | None]:
     return max(40, min(98, columns)), rows
 
 
-def _report(calibration, config, inputs, output, args) -> int:
-    from odocal_ros.offline.cli import OK, REJECTED
-    from odocal_ros.offline.phases import Phase
-    from odocal_ros.output.files import as_json, said_when_interrupted, write_results
+def _report(calibration, output, args) -> int:
+    from odocal_ros.output.files import Results
     from odocal_ros.output.worse import replacing, stored_in
-    from odocal_ros.reasons import Verdict
-    created = datetime.now(UTC).isoformat(timespec='seconds')
+    screen = _Screen(args)
     old = stored_in(output)
-    troubles: list[str] = []
-    with Phase('writing the results', args.quiet or args.json):
-        written = write_results(calibration, config, output, inputs, created, force=args.force,
-                                tell=troubles.append)
-    try:
-        for trouble in troubles:
-            _tell(args, trouble)
+    results = Results(calibration.result, calibration.config, output, list(calibration.inputs),
+                      calibration.created)
+    with results.said_when_interrupted():
+        with screen.phase('writing the results'):
+            written = results.write(args.force)
         if worse := replacing(old, output):
-            _tell(args, f'{output}: a better calibration was replaced, as --force asks: {worse}')
+            screen.note(f'{output}: a better calibration was replaced, as --force asks: {worse}')
+        gone = None if args.quiet or args.json else _show(calibration.result, args)
+        with screen.phase('drawing the report'):
+            trouble = results.draw()
+        if gone:
+            raise gone
+        if trouble:
+            screen.note(f'{results.report[0]}: not drawn: {trouble}')
         if args.json:
-            json.dump(as_json(calibration, config, inputs, created), sys.stdout, indent=2)
+            json.dump(calibration.to_dict(), sys.stdout, indent=2)
             say('')
         elif not args.quiet:
-            _show(calibration, output, written, args, drawn=not troubles)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(said_when_interrupted(output)) from None
-    return REJECTED if calibration.verdict is Verdict.REJECTED else OK
+            _show_files(calibration.result, output, written, results.report * (not trouble))
+        return _exit_code(calibration.result, calibration.config, args)
 
 
-def _show(calibration, output, written, args, drawn) -> None:
-    """Print the result and where it is."""
-    from odocal_ros.output.report import NAME as REPORT
-    from odocal_ros.output.summary import screen, sentence
+def _exit_code(calibration, config, args) -> int:
+    """Return 0 for what is good enough, after telling of limits what there is to tell."""
+    from odocal_ros.offline.cli import OK, REJECTED
+    from odocal_ros.output.acceptance import accept_line, accept_words
+    from odocal_ros.pipeline.acceptance import accept, Decision
+    from odocal_ros.reasons import Verdict
+    acceptance = accept(calibration, config)
+    if acceptance is None:
+        bad = [Verdict.REJECTED, *([Verdict.CAUTION] if config.accept.strict else [])]
+        return REJECTED if calibration.verdict in bad else OK
+    if not (args.quiet or args.json):
+        say('\n' + '\n'.join(accept_words(acceptance)))
+    if not args.json:
+        say(accept_line(calibration, acceptance, config))
+    return OK if acceptance.decision is Decision.PASS else REJECTED
+
+
+def _show(calibration, args) -> OSError | None:
+    """Print the result, for which a report need not be drawn; return what a stream raises."""
+    from odocal_ros.output.summary import screen
     columns, rows = _size(sys.stdout)
-    say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 9))
-    if args.holdout:
-        say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
-    others = ', '.join(p.name for p in written if p.name != REPORT)
-    text = f'written: {output}/ ({others})'
+    try:
+        say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 9))
+        if args.holdout:
+            say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
+        sys.stdout.flush()
+    except OSError as error:
+        return error
+    return None
+
+
+def _show_files(calibration, output, written, report) -> None:
+    """Print where the result is."""
+    from odocal_ros.output.summary import sentence
+    columns, rows = _size(sys.stdout)
+    text = f'written: {output}/ ({", ".join(p.name for p in written)})'
     say('\n' + (fill(text, columns, subsequent_indent='  ', break_long_words=False,
                      break_on_hyphens=False) if rows else text))
-    if output / REPORT in written and drawn:
-        say(f'report:  {output / REPORT}')
+    for path in report:
+        say(f'report:  {path}')
     say(sentence(calibration))      # what scrolled away, once more

@@ -7,11 +7,8 @@ import sys
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
-from odocal_ros.outside.names import for_comment, for_shell, one_line
-from odocal_ros.outside.whole import uninterrupted, write_text
+from odocal_ros.outside.names import for_shell
 
-TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
-MADE_HERE = 'Made by odocal simulate.'
 # option: (what follows it, help); its name is SimOptions' field
 NUMBERS = {
     'duration': ('S', "seconds of the whole drive (default: the scenario's)"),
@@ -94,6 +91,10 @@ def add_arguments(parser) -> None:
     add('--storage', default='mcap', metavar='KIND', help='mcap (default), sqlite3 or rosbag1')
     add('--compression', default='none', metavar='KIND',
         help='none (default), message, file or storage (mcap chunks)')
+    add('--fleet', type=int, metavar='N', help='so many vehicles of three models instead, with '
+        'tyres changed, Imus moved and counters broken: --out is their folder')
+    add('--bags', type=int, default=10, metavar='N', help='of each vehicle of --fleet, one a week '
+        '(default 10)')
     add('--force', action='store_true', help='replace the bag and the files beside it')
     add('--quiet', action='store_true', help='print nothing but errors')
 
@@ -154,65 +155,29 @@ def _with_figures(args, given):
 
 
 def run(args) -> int:
-    """Simulate, write the bag and the two files beside it; return 0."""
-    out = Path(args.out)
-    beside = _beside(out)
-    for path in beside:
-        _check_beside(path, args.force)
+    """Simulate, write the bag and the two files beside it, or those of a fleet; return 0."""
+    if args.fleet is not None:
+        from odocal_ros.offline.simulate_fleet import simulate_fleet
+        return simulate_fleet(args, options_of(args))
     known = args.known_heading_sigma_deg
     if known is not None and not 0 <= known <= 180:
         raise BadUsage(f'--known-heading-sigma-deg {known:g}: want 0 to 180')
-    from odocal_ros.bagio.write import check_target, drive_topics, write_bag
-    from odocal_ros.sim.scenarios import simulate
-    from odocal_ros.sim.truth import settings, topic_arguments, truth_entries
-    check_target(out, args.storage, args.compression, args.force)
-    drive = simulate(options_of(args))
-    topics = drive_topics(drive)
-    write_bag(out, topics, args.storage, args.compression, args.force, _progress(args.quiet))
-    known = None if known is None else math.radians(known)
-    with uninterrupted():      # a bag is never without its truth
-        _write_yaml(beside[0], truth_entries(drive, out.name), f'Truth of {out.name}.')
-        _write_yaml(beside[1], {'/**/calibrator': {'ros__parameters': settings(drive, known)}},
-                    f'What an operator of {out.name} would know.')
+    from odocal_ros.bagio.write import drive_topics
+    from odocal_ros.library.simulate import beside, simulate
+    from odocal_ros.sim.truth import topic_arguments
+    out = Path(args.out)
+    truth, settings = beside(out)
+    drive = simulate(options_of(args), out, storage=args.storage,
+                     compression=args.compression, force=args.force,
+                     heading_sigma=None if known is None else math.radians(known),
+                     progress=_progress(args.quiet))
     if not args.quiet:
-        replay = ['odocal', 'replay', str(out), '--config', str(beside[1]),
+        replay = ['odocal', 'replay', str(out), '--config', str(settings),
                   *topic_arguments(drive)]
         say(f'{out}: {drive.motion.duration:g} s, {drive.truth.distance:.1f} m, '
-            f'{sum(len(t.time_ns) for t in topics)} messages; truth in {beside[0]}; next: '
-            f'{for_shell(replay)}')
+            f'{sum(len(t.time_ns) for t in drive_topics(drive))} messages; truth in {truth}; '
+            f'next: {for_shell(replay)}')
     return 0
-
-
-def _beside(out: Path) -> list[Path]:
-    """Return where truth and settings go: with the bag's name where another bag's are there."""
-    plain = [out.parent / name for name in (TRUTH, SETTINGS)]
-    text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
-    if MADE_HERE in text and one_line(f'Truth of {out.name}.') not in text:
-        return [path.with_name(f'{out.name}.{path.name}') for path in plain]
-    return plain
-
-
-def _check_beside(path: Path, force: bool) -> None:
-    """Refuse to write over a file, unless forced and it was made here."""
-    if not path.exists():
-        return
-    if not force:
-        raise BadUsage(f'{path} is there already; give --force to replace it, or --out in '
-                       'another folder')
-    if MADE_HERE not in path.read_text(encoding='utf-8', errors='replace'):
-        raise BadUsage(f'{path} was not made by odocal simulate and is kept; give --out in '
-                       'another folder')
-
-
-def _write_yaml(path: Path, content: dict, title: str) -> None:
-    """Write a file whole or not at all."""
-    import yaml
-    try:
-        write_text(path, for_comment(one_line(f'{title} {MADE_HERE}'))
-                   + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-    except OSError as error:
-        raise BadUsage(f'{path}: cannot write ({error.strerror}); the bag itself is '
-                       'complete') from None
 
 
 def _progress(quiet: bool):

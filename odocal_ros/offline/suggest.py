@@ -2,7 +2,7 @@
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.topics import candidates, choose_topics, named, OPTION, wanted
+from odocal_ros.library.topics import candidates, choose_topics, named, OPTION, wanted
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config, with_settings
 

@@ -16,6 +16,7 @@ from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
 from odocal_ros.output.report import NAME as REPORT, report_or_why
 from odocal_ros.output.track_table import in_pieces, overall
+from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1
@@ -58,6 +59,8 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
     left: dict = {}
+    if (acceptance := accept(calibration, config)) is not None:
+        left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         left['imu'] = calibration.carried.only(IMU_CONSTANTS, IMU_KEEPS).as_dict()
         if config.leg.automatic:
@@ -140,16 +143,11 @@ def write_results(calibration: Calibration, config: Config, directory: Path, inp
 
     """
     results = Results(calibration, config, directory, inputs, created)
-    try:
+    with results.said_when_interrupted():
         written = results.write(force)
-        if results.has_report:
-            if why := results.draw():
-                tell(f'{results.directory / REPORT}: not drawn: {why}')
-            written.append(results.directory / REPORT)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(said_when_interrupted(results.directory) if results.folder.written
-                                else '') from None
-    return written
+        if why := results.draw():
+            tell(f'{results.report[0]}: not drawn: {why}')
+    return written + results.report
 
 
 class Results:
@@ -163,6 +161,7 @@ class Results:
                  inputs: list[dict], created: str) -> None:
         self.directory = Path(directory)
         self.has_report = 'report' in config.output.formats
+        self.report = [self.directory / REPORT] * self.has_report
         self.folder = ResultFolder(self.directory, MAIN,
                                    frozenset(ros_files.NAMES | {MAIN, REPORT}))
         self._of = calibration, config, as_json(calibration, config, inputs, created)
@@ -176,7 +175,9 @@ class Results:
         return [self.directory / name for name in texts]
 
     def draw(self) -> str:
-        """Add the report; return why it could not be drawn, which it then says itself."""
+        """Add the report, if one is asked for; return why it cannot be drawn."""
+        if not self.has_report:
+            return ''
         page, why = report_or_why(*self._of)
         with self._said():
             self.folder.add(REPORT, page)
@@ -191,8 +192,13 @@ class Results:
                 f'{self.directory}: results cannot be written ({error.strerror}); choose a folder '
                 'that can (--output, or output.directory of the node)') from None
 
-
-def said_when_interrupted(directory: Path) -> str:
-    """Return what an interrupted command has left where it had written its result."""
-    report = (directory / REPORT).exists()
-    return f'the results are in {directory}/' + ('' if report else f', {REPORT} is not')
+    @contextmanager
+    def said_when_interrupted(self) -> Iterator[None]:
+        """Have an interruption say what it has left, where results were written."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            if not self.folder.written:
+                raise
+            left = '' if (self.directory / REPORT).exists() else f', {REPORT} is not'
+            raise KeyboardInterrupt(f'the results are in {self.directory}/{left}') from None

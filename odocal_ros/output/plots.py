@@ -66,12 +66,12 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     return figures
 
 
-def _track(found, name, before_word, slips):
+def draw_track(ax, found, before_word='as configured', slips=()):
+    """Draw on axes the track as configured and as calibrated over the fixes."""
     start = found.track_n[0]
     factor, unit = lengths(np.ptp(found.track_n[:, :2], axis=0).max())
     after, before, fixes = (factor * (x - start)[:, :2] for x in (
         found.track_n, found.track_before_n, found.fix_n))
-    figure, (ax,) = sheet(5.2)
     few = evenly(len(fixes))
     ax.plot(*fixes[few].T, 'o', color='0.62', markersize=4.5, markeredgewidth=0, label='fixes')
     ax.plot(*before[thinned(before)].T, '--', color=RED, label=before_word, linewidth=1.2)
@@ -88,6 +88,11 @@ def _track(found, name, before_word, slips):
     ax.set(xlabel=f'east of the start, {unit}', ylabel=f'north of the start, {unit}')
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.06)
+
+
+def _track(found, name, before_word, slips):
+    figure, (ax,) = sheet(5.2)
+    draw_track(ax, found, before_word, slips)
     key(figure, ax)
     says = ('Dead reckoning over the fixes. Both tracks begin at the start mark; the line as '
             'calibrated should cover the fixes.')
@@ -119,19 +124,35 @@ def _marks(ax, found, at, slips):
                 markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')
 
 
+def draw_residuals(ax, found):
+    """Draw on axes dead reckoning less fix along and across, as calibrated."""
+    factor, unit = lengths(found.distance[-1])
+    way = factor * found.fix_distance
+    _band(ax, way, found.fix_sigma)
+    rows = thinned(found.residual)
+    for column, colour, word in zip(found.residual.T, (BLUE, RED), ('along', 'across'),
+                                    strict=True):
+        ax.plot(way[rows], column[rows], '-', color=colour, linewidth=0.9, label=word)
+    ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning less fix, m')
+
+
+def _band(ax, way, sigma):
+    band = evenly(len(way))
+    ax.fill_between(way[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
+                    label='± sigma of a fix')
+    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
+        ax.plot(way[band], edge, '--', color='black', linewidth=0.6)
+
+
 def _residuals(found, name, before_word):
     factor, unit = lengths(found.distance[-1])
-    way, sigma = factor * found.fix_distance, found.fix_sigma
+    way = factor * found.fix_distance
     figure, axes = sheet(5.2, 3)
     rows = thinned(found.residual)
     for ax, column, word in zip(axes, found.residual.T, ('along', 'across'), strict=False):
-        band = evenly(len(way))
-        ax.fill_between(way[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
-                        label='± sigma of a fix')
-        ax.axhline(0.0, color=GREY, linewidth=0.8)
+        _band(ax, way, found.fix_sigma)
         ax.plot(way[rows], column[rows], '-', color=BLUE, linewidth=0.9, label='as calibrated')
-        for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
-            ax.plot(way[band], edge, '--', color='black', linewidth=0.6)
         ax.set_ylabel(f'{word}, m')
     rows = thinned(found.residual_before)
     for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),

@@ -14,10 +14,10 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
 LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
-          'yaw_mounting_angle': 'yaw mounting angle',
-          'pitch_mounting_angle': 'pitch mounting angle',
-          'scale_factor_left': 'scale factor, left wheel',
-          'scale_factor_right': 'scale factor, right wheel'}
+                    'yaw_mounting_angle': 'yaw mounting angle',
+                    'pitch_mounting_angle': 'pitch mounting angle',
+                    'scale_factor_left': 'scale factor, left wheel',
+                    'scale_factor_right': 'scale factor, right wheel'}
 LOST = 'not determined'
 SMALL = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}      # of a budget's figures
 WORTH_A_ROW = 0.005      # share of a variance

@@ -67,7 +67,7 @@ def read_stored(path: Path) -> Stored:
         if path.stat().st_size > BIGGEST:
             raise BadUsage(f'{name}: too large for a calibration.json')
         content = json.loads(path.read_text(encoding='utf-8'), parse_constant=_no_constant)
-        return _stored(content, name)
+        return stored_from(content, name)
     except OSError as error:
         in_folder = isinstance(error, FileNotFoundError) and path != Path(name)
         why = f'there is no {MAIN} in it' if in_folder else error.strerror
@@ -82,7 +82,8 @@ def _no_constant(text):
     raise ValueError(f'{text} is no number')
 
 
-def _stored(content, name) -> Stored:
+def stored_from(content, name: str) -> Stored:
+    """Return the calibration of the content of a calibration.json; ValueError where it is none."""
     if not isinstance(content, dict):
         raise ValueError('no object at the top')
     schema = content.get('schema')

@@ -70,7 +70,8 @@ class Allowance:
         """Return how many bytes may still come."""
         return int(self.most * factor()) - self._used
 
-    def unpack(self, packing: str, data: bytes, size: int | None = None) -> bytes:
+    def unpack(self, packing: str, data: bytes | bytearray | memoryview, size: int | None = None
+               ) -> bytes | bytearray | memoryview:
         """
         Return what compressed data hold, as much as came out of a stream that is cut off.
 

@@ -4,15 +4,19 @@ Alignment of a leg: which standstill, which heading source.
 Pure: takes screened inputs, returns an Alignment and what was found on the way.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import (
+    Alignment,
     COMPASS_LIMIT,
     complete,
     COURSE_DISTANCE,
     gyrocompass,
+    HEADING_LIMIT,
     Level,
     level_at_rest,
     level_in_motion,
@@ -20,24 +24,26 @@ from odocal_ros.nav.alignment import (
     off_the_earth,
 )
 from odocal_ros.nav.angles import wrap, yaw_from_heading
-from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.dead_reckoning import dead_reckon, Origin
 from odocal_ros.nav.earth import C_en, earth_rate_n
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.force import TILT
+from odocal_ros.screening.force import TILT_SIGMA
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 
 COURSE_TIME = 300.0       # s within which the way for a course must be driven
-HEADING_LIMIT = 0.5       # rad: an orientation worse than this is no heading
-NOISY = 10.0              # times the noise of the grade at rest: another gyro, or another unit
-NO_EARTH = 4.0            # sigmas: a gyro with such a bias is no compass
-NEAR = 0.5                # s: a heading sample this near to a moving start is taken
+NOISIER_AT_REST = 10.0    # times the noise of the grade at rest: another gyro, or another unit
+NO_EARTH_SIGMAS = 4.0     # sigmas: a gyro with such a bias is no compass
+HEADING_REACH = 0.5       # s: a heading sample this near to a moving start is taken
+
+Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
 
 
-def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Config):
+def align(inputs: Inputs, spans: Floats, metres_per_unit: float, fixes_n: Floats, origin: Origin,
+          config: Config) -> tuple[Alignment, tuple[Reason, ...]]:
     """
     Align a leg.
 
@@ -63,7 +69,7 @@ def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Confi
     """
     grade = grade_of(config.imu)
     if not inputs.felt:
-        grade = replace(grade, accel_bias=TILT * G)
+        grade = replace(grade, accel_bias=TILT_SIGMA * G)
     level, gyro_noise, reasons = _level(inputs, spans, metres_per_unit, origin.latitude, grade)
     level = replace(level, C_np=_from_place(inputs, level.standstill, fixes_n, origin))
     yaw, sigma, source, shared, why = _heading(inputs, level, origin.latitude, grade, config)
@@ -74,13 +80,14 @@ def align(inputs: Inputs, spans, metres_per_unit, fixes_n, origin, config: Confi
     return complete(level, yaw, sigma, source, shared, origin.latitude, grade, gyro_noise), reasons
 
 
-def choose_standstill(spans):
+def choose_standstill(spans: Floats) -> Floats | None:
     """Return the standstill that holds or last ended before the start mark (t = 0), or None."""
     before = [s for s in spans if s[0] <= 0.5]
     return before[-1] if before else None
 
 
-def _from_place(inputs, span, fixes_n, origin):
+def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes_n: Floats,
+                origin: Origin) -> Floats:
     """
     Return C_np of the place of a standstill: east, north and up differ from those at the origin.
 
@@ -96,7 +103,8 @@ def _from_place(inputs, span, fixes_n, origin):
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
-def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
+def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: float,
+           grade: Grade) -> tuple[Level, float, tuple[Reason, ...]]:
     span = choose_standstill(spans)
     if span is not None:
         seen = _measured_noise(inputs, span)
@@ -121,17 +129,17 @@ def _level(inputs, spans, metres_per_unit, latitude, grade: Grade):
     return level, grade.gyro_noise, (found,)
 
 
-def _against_grade(noise, grade: Grade):
+def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
     """Return a caution where the gyro at rest is far noisier than its grade: walks will be too."""
     times = noise / max(grade.gyro_noise, 1e-12)
-    if times <= NOISY:
+    if times <= NOISIER_AT_REST:
         return ()
     unit = ', as one that sends deg/s would be' if 30 < times < 120 else ''
     return (Reason(Code.IMU_WORSE_THAN_GRADE, f'at rest the gyro is {times:.0f} times as noisy as '
                    f'its grade{unit}'),)
 
 
-def _measured_noise(inputs, span):
+def _measured_noise(inputs: Inputs, span: Floats) -> float:
     """Return the white gyro noise seen at rest, rad/s/sqrt(Hz), the largest axis."""
     pick = (inputs.t_imu >= span[0]) & (inputs.t_imu <= span[1])
     t, w = inputs.t_imu[pick], inputs.w_b[pick]
@@ -141,7 +149,8 @@ def _measured_noise(inputs, span):
                  * np.sqrt((t[-1] - t[0]) / (len(t) - 1)))
 
 
-def _heading(inputs, level: Level, latitude, grade, config: Config):
+def _heading(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+             config: Config) -> tuple[float, float, str, bool, tuple[Reason, ...]]:
     """Return yaw of L's x axis, sigma, source, shared, reasons; a course has no yaw yet."""
     asked = config.alignment.heading_source
     order = [asked] if asked != 'auto' else ['heading_topic', 'imu_orientation', 'gyrocompass']
@@ -161,7 +170,7 @@ def _heading(inputs, level: Level, latitude, grade, config: Config):
     return 0.0, np.pi, 'course', True, reasons
 
 
-def _fixed(inputs, level, latitude, grade, config):
+def _fixed(inputs: Inputs, level: Level, latitude: float, grade: Grade, config: Config) -> Found:
     if np.isnan(config.alignment.heading):
         return None, 'alignment.heading is not set'
     mark_yaw = float(yaw_from_heading(config.alignment.heading))
@@ -172,7 +181,7 @@ def _fixed(inputs, level, latitude, grade, config):
     return (float(wrap(mark_yaw - turned)), config.alignment.heading_sigma), ''
 
 
-def _turn_since(inputs, level):
+def _turn_since(inputs: Inputs, level: Level) -> float:
     """Return how far b has turned about the vertical from the level's epoch to the mark, rad."""
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
     if pick.sum() < 2:
@@ -183,27 +192,30 @@ def _turn_since(inputs, level):
     return float(np.arctan2(C[1, 0], C[0, 0]))
 
 
-def _imu_orientation(inputs, level, latitude, grade, config):
+def _imu_orientation(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                     config: Config) -> Found:
     C_bi = inputs.C_bi
     return _from_quaternions(inputs.t_imu, inputs.q_ni, inputs.yaw_variance, level, config,
                              lambda C_ni: C_ni @ transpose(C_bi), 0.0)
 
 
-def _heading_topic(inputs, level, latitude, grade, config):
+def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                   config: Config) -> Found:
     return _from_quaternions(inputs.t_heading, inputs.q_heading, inputs.heading_variance, level,
                              config, lambda C: C, config.alignment.heading_offset)
 
 
-def _from_quaternions(t, q, variance, level, config, to_b, offset):
+def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,
+                      to_b: Callable[[Floats], Floats], offset: float) -> Found:
     """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
     # of hours only the rows that are looked at
-    begin, end = level.standstill or (level.t - NEAR, level.t + NEAR)
+    begin, end = level.standstill or (level.t - HEADING_REACH, level.t + HEADING_REACH)
     near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
     t, q, variance = t[near], q[near], variance[near]
     pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     if not level.standstill:
         away = np.where(pick, np.abs(t - level.t), np.inf)
-        pick = (away <= NEAR) & (away == away.min(initial=np.inf))
+        pick = (away <= HEADING_REACH) & (away == away.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
     C = to_b(matrix_from_quat(q[pick]))
@@ -215,7 +227,8 @@ def _from_quaternions(t, q, variance, level, config, to_b, offset):
     return (float(wrap(yaw)), float(sigma)), ''
 
 
-def _gyrocompass(inputs, level, latitude, grade, config):
+def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
+                 config: Config) -> Found:
     if level.standstill is None:
         return None, 'needs a standstill'
     yaw, sigma = gyrocompass(level, latitude, grade)
@@ -223,7 +236,7 @@ def _gyrocompass(inputs, level, latitude, grade, config):
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
     off = off_the_earth(level, latitude, grade)
-    if off > NO_EARTH:
+    if off > NO_EARTH_SIGMAS:
         return None, (f'at rest the gyro does not show the turn of the Earth, by {off:.0f} sigma: '
                       f'its bias is not that of the {config.imu.grade} grade')
     return (yaw, sigma), ''
@@ -233,7 +246,8 @@ SOURCES = {'fixed': _fixed, 'imu_orientation': _imu_orientation, 'heading_topic'
            'gyrocompass': _gyrocompass}
 
 
-def _course(inputs, level, metres_per_unit, fixes_n, origin, grade):
+def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Floats, origin: Origin,
+            grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + COURSE_TIME)

@@ -16,17 +16,17 @@ import numpy as np
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.samples import OdometerForm
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.odometer_steps import Steps
 from odocal_ros.settings.config import Config
 
 SECOND = 10**9
-REST_NS = 10 * SECOND        # of the standstill that ends a leg: it tells place and biases
-PARKED_NS = 120 * SECOND     # a longer standstill ends a leg of any length
-BEFORE_NS = 1 * SECOND       # of the first count of a drive-off the vehicle stood
-MOST_WAITING = 200_000       # odometer rows that wait for the Imu
+LEG_END_REST_NS = 10 * SECOND    # of the standstill that ends a leg: it tells place and biases
+PARKED_NS = 120 * SECOND         # a longer standstill ends a leg of any length
+STOOD_NS = 1 * SECOND            # of the first count of a drive-off the vehicle stood
+MOST_WAITING = 200_000           # odometer rows that wait for the Imu
 
 
 @dataclass
@@ -49,7 +49,7 @@ class LegSearch:
         self._steps: Steps | None = None
         self._still = 0.0
         self._standstill_ns = round(config.leg.standstill * 1e9)
-        self._rest_ns = max(REST_NS, self._standstill_ns)
+        self._rest_ns = max(LEG_END_REST_NS, self._standstill_ns)
         self._longest_ns = round(config.leg.automatic_minutes * 60e9)
         self._max_gap_ns = round(config.leg.max_gap * 1e9)
         surveyed = config.reference.start and config.reference.end
@@ -65,18 +65,18 @@ class LegSearch:
         self._needs_rest = False
 
     @property
-    def open(self) -> Span | None:
+    def unended(self) -> Span | None:
         """Return the leg that has not ended."""
         return self.spans[-1] if self.spans and not self.spans[-1].stop_ns else None
 
-    def feed(self, slot: str, block, form: OdometerForm | None = None) -> None:
+    def feed(self, slot: str, block: Samples, form: OdometerForm | None = None) -> None:
         """Take rows as they went into the recorder; the odometer's say nothing without form."""
         if slot not in self._first_ns or not len(block.stamp_ns):
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
         if slot == 'imu':
             self._hear(block.stamp_ns)
-        elif slot == 'odometer' and form is not None:
+        elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or Steps(form)
             self._still = self._steps.still
             steps, stamps, _ = self._steps.of(block)
@@ -128,21 +128,21 @@ class LegSearch:
             self._stands(t, self._anchor[0])
 
     def _moves(self, t: int, stood_ns: int) -> None:
-        self._stands(t - BEFORE_NS, stood_ns)
+        self._stands(t - STOOD_NS, stood_ns)
         rested = t - stood_ns >= self._standstill_ns
-        leg, off_ns = self.open, max(t - BEFORE_NS, stood_ns, self._from_ns)
+        leg, off_ns = self.unended, max(t - STOOD_NS, stood_ns, self._from_ns)
         if leg is not None and rested and self._long_enough(leg, stood_ns):
             self._close(off_ns)
         elif leg is not None and t - leg.start_ns >= self._longest_ns:
             self._close(t)
             off_ns = t
-        if self.open is None and not self._needs_rest:
+        if self.unended is None and not self._needs_rest:
             self.spans.append(Span(off_ns))
 
     def _stands(self, t: int, since_ns: int) -> None:
         stood_ns = t - since_ns
         self._needs_rest = self._needs_rest and stood_ns < self._standstill_ns
-        leg = self.open
+        leg = self.unended
         if leg is not None and (stood_ns >= PARKED_NS or stood_ns >= self._rest_ns
                                 and self._long_enough(leg, since_ns)):
             self._close(since_ns + self._rest_ns)
@@ -151,7 +151,7 @@ class LegSearch:
         return 2 * (until_ns - leg.start_ns) >= self._longest_ns
 
     def _close(self, stop_ns: int) -> None:
-        leg = self.open
+        leg = self.unended
         if leg is not None and stop_ns > leg.start_ns:
             leg.stop_ns = stop_ns
         elif leg is not None:

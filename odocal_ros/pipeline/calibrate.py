@@ -4,13 +4,14 @@ The pipeline: one pure function from a leg to its result, one from results to a 
 No state, no clock, no files: the live node and the replay call these and nothing else.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import let_go
 from odocal_ros.nav.alignment import Alignment
@@ -59,7 +60,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     progress = progress or (lambda share, stage: None)
     inputs, reasons, usable = _screened(leg, config, notes)
 
-    def result_of(inputs, reasons):
+    def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
         return leg_result(leg, inputs, found) if prepared is None else run_leg(prepared, progress)
 
@@ -86,7 +87,8 @@ def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
-def _screened(leg, config, notes=()):
+def _screened(leg: Leg, config: Config,
+              notes: Sequence[Reason] = ()) -> tuple[Inputs, tuple[Reason, ...], bool]:
     """Return inputs, what is said of them, and whether a leg can be made of them."""
     inputs, found = screen(leg, config)
     reasons = (*notes, *found)
@@ -94,7 +96,7 @@ def _screened(leg, config, notes=()):
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
         return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
-    sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi)
+    sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)
     reasons += tuple(with_axes(sanity, inputs))
     let_go(*vars(leg.imu).values())
     if z_down:
@@ -102,12 +104,12 @@ def _screened(leg, config, notes=()):
     return inputs, reasons, not UNUSABLE & {r.code for r in sanity}
 
 
-def _reversed(result, inputs):
+def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
     """Return where a counter without a sign shows in the smoother's slips, (m, 2) s, and scale."""
     smoother = result.methods.get('smoother')
-    scale = smoother and smoother.estimates['scale_factor'].value
-    if not scale:
-        return (), None
+    scale = None if smoother is None else smoother.estimates['scale_factor'].value
+    if smoother is None or not scale:
+        return np.empty((0, 2)), None
     return doubled(smoother.details['slips'], inputs.travel, scale), scale
 
 

@@ -12,8 +12,8 @@ from odocal_ros.screening.screen import Inputs
 
 NAME = 'speed_truncation'
 ADDED_UP = ('two_point', 'wheels')      # methods whose travel is the sum of the speeds
-WORTH = 5e-4        # of the scale: half a step that is worth a word
-COARSE = 0.2        # m, a count that is
+COARSE_WORTH = 5e-4     # of the scale: half a step that is worth a word
+COARSE_COUNT_M = 0.2    # m, a count that is
 
 
 def half_step(inputs: Inputs) -> float:
@@ -43,11 +43,11 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     """Say that speed or counts come in coarse steps."""
     K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
-    if count > COARSE:
+    if count > COARSE_COUNT_M:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '
                        'by up to that')]
     coarse = _coarse(inputs)
-    if coarse is None or size < WORTH:
+    if coarse is None or size < COARSE_WORTH:
         return []
     metres = coarse.step * K
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \

@@ -1,5 +1,6 @@
 """Several legs to one calibration: which legs count, what is said of the whole."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from odocal_ros.calib.carried import Carried
@@ -7,8 +8,9 @@ from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.one_vehicle import unlike_legs
-from odocal_ros.calib.result import Calibration, Estimate, MethodResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.calib.smoother.several import combine_legs
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
@@ -22,7 +24,7 @@ SMOOTHER = 'smoother'      # the method whose legs are combined on their border
 OF_ALL = {Code.LEGS_DISAGREE, Code.SCALE_CHANGED}
 
 
-def combine(legs, config: Config, carried: Carried | None = None,
+def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None = None,
             imu: Carried | None = None) -> Calibration:
     """
     Combine legs of one vehicle.
@@ -78,19 +80,20 @@ def combine(legs, config: Config, carried: Carried | None = None,
                        _carried_on(methods, good, carried))
 
 
-def _belongs(carried, legs):
+def _belongs(carried: Carried, legs: Sequence[LegResult]) -> bool:
     """Tell whether legs are of the odometer of earlier ones, and driven after them."""
     smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
     return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
         and min(leg.start_ns for leg in legs) > carried.last_ns
 
 
-def _of_others(imu, legs):
+def _of_others(imu: Carried, legs: Sequence[LegResult]) -> bool:
     """Tell whether none of the legs may be among those that told of the Imu."""
     return not any(imu.first_ns <= leg.start_ns <= imu.last_ns for leg in legs)
 
 
-def _carried_on(methods, good, before):
+def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
+                before: Carried | None) -> Carried | None:
     """Return what legs leave for those to come, None where they tell nothing."""
     whole = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in good if SMOOTHER in leg.methods
@@ -102,7 +105,7 @@ def _carried_on(methods, good, before):
                    len(times) + (before.legs if before else 0))
 
 
-def driven_twice(legs):
+def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
     """Return legs that share more than a tenth of their time with one before: not independent."""
     twice = []
     for i, leg in enumerate(legs):
@@ -114,7 +117,8 @@ def driven_twice(legs):
     return twice
 
 
-def together(name, results, times_ns, config, numbers=None, carried=None) -> MethodResult:
+def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
+             numbers: Sequence[int] | None = None, carried: Carried | None = None) -> MethodResult:
     """
     Return what a method says of several legs, and of those carried on where it can.
 
@@ -130,7 +134,8 @@ def together(name, results, times_ns, config, numbers=None, carried=None) -> Met
     return combine_method(name, results)
 
 
-def _combined(name, driven, config, carried=None):
+def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,
+              carried: Carried | None = None) -> MethodResult:
     """
     Return a method's combination of the legs where it is not rejected, of all if of none.
 
@@ -138,7 +143,7 @@ def _combined(name, driven, config, carried=None):
     """
     good = [one for one in driven if one[0].verdict is not Verdict.REJECTED]
     results, times_ns, numbers = zip(*(good or driven), strict=True)
-    whole = together(name, list(results), times_ns, config, numbers, good and carried)
+    whole = together(name, list(results), times_ns, config, numbers, carried if good else None)
     if good or len(results) == 1:
         return whole
     why = dict.fromkeys(r for one in results for r in one.reasons
@@ -146,7 +151,9 @@ def _combined(name, driven, config, carried=None):
     return replace(whole, reasons=(*whole.reasons, *why))
 
 
-def _leg_reasons(legs, good, twice, giving, estimates, carried):
+def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Sequence[LegResult],
+                 giving: Sequence[str], estimates: Mapping[str, Estimate],
+                 carried: bool) -> list[Reason]:
     """Return the legs' own reasons, numbered where there are several."""
     alone = len(legs) == 1 and not carried
     reasons = []
@@ -174,27 +181,28 @@ def _leg_reasons(legs, good, twice, giving, estimates, carried):
     return reasons
 
 
-def _further(method, leg):
+def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
     """Return a method's reasons without what rejects the leg already, in other words."""
     known = {r.code for r in leg.reasons if r.code.gravity is Verdict.REJECTED}
     return [r for r in method.reasons if r.code not in known]
 
 
-def _why(reasons):
+def _why(reasons: Sequence[Reason]) -> str:
     """Return what rejects, in words."""
     return '; '.join(dict.fromkeys(r.text for r in reasons
                                    if r.code.gravity is Verdict.REJECTED))
 
 
-def _imu_rotation(estimates, C_bi):
+def _imu_rotation(estimates: Mapping[str, Estimate],
+                  C_bi: Floats | None) -> tuple[
+        tuple[float, ...] | None, tuple[float, ...] | None]:
     """Return the static rotation base_link <- imu frame, x y z w and rpy, None without a yaw."""
     yaw = estimates.get('yaw_mounting_angle')
     pitch = estimates.get('pitch_mounting_angle')
-    if yaw is None or yaw.value is None:
+    if C_bi is None or yaw is None or yaw.value is None:
         return None, None
     small = [0.0, pitch.value if pitch is not None and pitch.value is not None else 0.0,
              yaw.value]
     C_vi = matrix_from_rpy(small) @ C_bi
     return (tuple(float(x) for x in quat_from_matrix(C_vi)),
             tuple(float(x) for x in rpy_from_matrix(C_vi)))
-

@@ -6,10 +6,10 @@ import numpy as np
 
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-SURE = 3.0          # sigmas
-LEAST = 0.1         # m: a lever arm need not be known better either
-HIDDEN = 0.25       # of a fix's sigma: what a delay makes of less, no fix shows
+LEAST_DELAY_WAY = 0.1    # m: a lever arm need not be known better either
+HIDDEN_BY_FIX = 0.25     # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
@@ -32,7 +32,8 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     notes = []
     for name, (late, sigma) in seen.items():
         way = abs(late) * speed
-        if not (abs(late) > SURE * sigma and way > max(LEAST, HIDDEN * prepared.fix_sigma)):
+        worth = max(LEAST_DELAY_WAY, HIDDEN_BY_FIX * prepared.fix_sigma)
+        if not (abs(late) > REMARK_SIGMAS * sigma and way > worth):
             continue
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(

@@ -1,29 +1,34 @@
 """One leg: its methods run, what they found put together, the result chosen and checked."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over
 from odocal_ros.calib.drive import way_and_chord
-from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.result import LegResult, MethodResult
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import Leg
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
 from odocal_ros.pipeline.prepare import judged_by
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import check_of, tracks
-from odocal_ros.reasons import Code
+from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
+from odocal_ros.screening.screen import Inputs
 
-WORTH = 0.05            # relative sigma up to which a scale gives the distance
+DISTANCE_SIGMA = 0.05    # relative sigma up to which a scale gives the distance
 # of the time that methods take, and of the tracks after them
-EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
+METHOD_EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
 TRACKS = 2
-USUAL_PASSES = 6.0      # of a fit, in which it comes to two thirds of its way: 10 are usual
+USUAL_PASSES = 6.0    # of a fit, in which it comes to two thirds of its way: 10 are usual
 
 
-def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
+def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
+               methods: dict[str, MethodResult] | None = None, **more: Any) -> LegResult:
     """Return the result of a leg: its counts, findings and what more there is."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
     if 'distance' not in more:
@@ -36,7 +41,7 @@ def leg_result(leg, inputs, reasons, methods=None, **more) -> LegResult:
         C_bi=inputs.C_bi, **more)
 
 
-def _way_of(t_fix, geodetic):
+def _way_of(t_fix: Floats, geodetic: Floats) -> float:
     """Return the way by the fixes, m: what is known of a leg that is refused."""
     if not len(t_fix):
         return 0.0
@@ -55,13 +60,14 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
     found += passed_over(methods, asked, {r.code for r in (*prepared.reasons, *found)})
     estimates, _ = choose(methods, asked)
     scale = estimates.get('scale_factor')
-    if scale is None or runs[scale.method].paths is None:
+    paths = None if scale is None else runs[scale.method].paths
+    if scale is None or paths is None:
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                           distance=prepared.distance, deciding=deciding(asked))
     # truer than the rough scale
-    if scale.value and scale.sigma is not None and scale.sigma < WORTH * scale.value:
+    if scale.value and scale.sigma is not None and scale.sigma < DISTANCE_SIGMA * scale.value:
         prepared = judged_by(prepared, scale.value)
-    shown, said = tracks(prepared, runs[scale.method].paths)
+    shown, said = tracks(prepared, paths)
     found += said
     for name, run in runs.items():
         if run.paths is not None:
@@ -72,13 +78,13 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
                       distance=prepared.distance, deciding=deciding(asked), **shown)
 
 
-def _once(found):
+def _once(found: Sequence[Reason]) -> list[Reason]:
     """Return what methods and tracks found, of fixes far off a path only what the first said."""
     far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
     return [r for k, r in enumerate(found) if k not in far[1:]]
 
 
-def _methods_of(prepared):
+def _methods_of(prepared: PreparedLeg) -> list[str]:
     """Return the methods to run: those asked for, of auto those that the leg can carry."""
     asked, inputs = prepared.config.method, prepared.inputs
     wanted = deciding(asked, shown=True)
@@ -88,17 +94,18 @@ def _methods_of(prepared):
             and not (name == 'wheels' and one_counter)]
 
 
-def _effort(names):
-    return sum(EFFORT[name] for name in names) + TRACKS
+def _effort(names: Iterable[str]) -> int:
+    return sum(METHOD_EFFORT[name] for name in names) + TRACKS
 
 
-def _teller(names, progress):
+def _teller(names: Iterable[str],
+            progress: Callable[[float, str], None]) -> Callable[[str], Callable[[int], None]]:
     """Return what tells that a method begins, and gives what tells of its passes."""
     done = 0.0
 
-    def begun(name):
+    def begun(name: str) -> Callable[[int], None]:
         nonlocal done
-        begin, width = done, EFFORT[name] / _effort(names)
+        begin, width = done, METHOD_EFFORT[name] / _effort(names)
         progress(begin, name)
         done += width
         return lambda passes: progress(

@@ -7,6 +7,8 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Reason
 
+Path = Callable[[Floats], Floats]     # t (n,) s to (n, 3) m, or t () to (3,)
+
 
 class Paths(NamedTuple):
     """
@@ -16,8 +18,8 @@ class Paths(NamedTuple):
     the calibration changes and in nothing else.
     """
 
-    before: Callable[[Floats], Floats]
-    after: Callable[[Floats], Floats]
+    before: Path
+    after: Path
 
 
 class MethodRun(NamedTuple):

@@ -1,12 +1,15 @@
 """The methods of a leg: each a pure function of it, and what becomes of one that breaks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 from odocal_ros.calib.failed import failed, told_if_wild
+from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
+from odocal_ros.calib.wheels.slips import WheelSlips
 from odocal_ros.calib.wheels.unseen import with_unseen
 from odocal_ros.data.samples import let_go
 from odocal_ros.errors import OdocalError
@@ -20,18 +23,22 @@ from odocal_ros.pipeline.smoother_run import smoother
 from odocal_ros.pipeline.two_point_run import two_point
 from odocal_ros.pipeline.wheels_run import wheels
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.screen import Inputs
 
 # as they are shown; two_point, the operator's own marks, is always computed
-METHODS = {'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
+METHODS: dict[str, Callable[[PreparedLeg, Callable[[int], None]], MethodRun]] = {
+    'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
 # what each gives where it refuses: (inputs, reason) to MethodResult
-UNKNOWN = {'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
+UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
+           'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
            'wheels': wheels_refused,
            'smoother': lambda inputs, why: smoother_refused((why,), inputs.scale_unit)}
 # methods that begin with the alignment: what it had to say is said of them
 ALIGNED = ('two_point', 'wheels')
 
 
-def run_methods(names, prepared: PreparedLeg, begun: Callable) -> dict[str, MethodRun]:
+def run_methods(names: Iterable[str], prepared: PreparedLeg,
+                begun: Callable[[str], Callable[[int], None]]) -> dict[str, MethodRun]:
     """
     Run methods on a leg; what breaks in one costs this method, not the leg.
 
@@ -47,12 +54,11 @@ def run_methods(names, prepared: PreparedLeg, begun: Callable) -> dict[str, Meth
     for name in names:
         passed = begun(name)
         let_go(*vars(prepared.leg.imu).values())
-        runs[name] = _guarded(name, prepared, lambda name=name, passed=passed: METHODS[name](
-            prepared, passed))
+        runs[name] = _guarded(name, prepared, partial(METHODS[name], prepared, passed))
     slips = prepared.wheel_slips
     for run in runs.values():
         slips = with_unseen(slips, run.slips)
-    return {name: _guarded(name, prepared, lambda run=run: _doubted(run, prepared, slips))
+    return {name: _guarded(name, prepared, partial(_doubted, run, prepared, slips))
             for name, run in runs.items()}
 
 
@@ -69,7 +75,7 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     return found + notes
 
 
-def _doubted(run, prepared, slips) -> MethodRun:
+def _doubted(run: MethodRun, prepared: PreparedLeg, slips: WheelSlips) -> MethodRun:
     """Return a method's run with the errors that its own model does not hold."""
     result = upright(held_steps(held(run.result, prepared, slips), prepared), prepared)
     about = prepared.about_alignment if result.name in ALIGNED else ()
@@ -77,7 +83,7 @@ def _doubted(run, prepared, slips) -> MethodRun:
     return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
 
 
-def _guarded(name, prepared, work) -> MethodRun:
+def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) -> MethodRun:
     inputs = prepared.inputs
     try:
         # what runs away is told by the number that is none, not by warnings and what follows

@@ -1,26 +1,28 @@
 """A leg whose Imu was silent for a while: cut there, its parts are legs of the same vehicle."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.calib.result import LegResult
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg, part_of
 from odocal_ros.data.pieces import by_step
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
-SHORTEST_NS = 10**9              # of a part: less is lost with the gap
-MOST = 20                        # an Imu with more gaps stutters: its leg is rejected
-MARGIN_NS = 1000                 # below the limit: more than seconds in floating point are off
-BEFORE_NS = 60 * 10**9           # what lies nearer to the start mark belongs to the leg
+SHORTEST_NS = 10**9           # of a part: less is lost with the gap
+MOST_PARTS = 20               # an Imu with more gaps stutters: its leg is rejected
+GAP_MARGIN_NS = 1000          # below the limit: more than seconds in floating point are off
+NEAR_START_NS = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
 
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
     gaps = _gaps(leg, limit_s)
-    if not 0 < len(gaps) < MOST:
+    if not 0 < len(gaps) < MOST_PARTS:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
     ends = [*gaps[:, 0].tolist(), leg.stop_ns]
@@ -29,12 +31,12 @@ def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     return [part_of(leg, *span) for span in spans if span[1] - span[0] >= SHORTEST_NS] or [leg]
 
 
-def _gaps(leg, limit_s):
+def _gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the Imu, ns: (k, 2); one up to a mark is one, too."""
-    near = _near(leg.imu.stamp_ns, leg.start_ns - BEFORE_NS, leg.stop_ns)
+    near = _near(leg.imu.stamp_ns, leg.start_ns - NEAR_START_NS, leg.stop_ns)
     if len(near) < 2:
         return np.empty((0, 2), np.int64)
-    least_ns = round(limit_s * 1e9) - MARGIN_NS
+    least_ns = round(limit_s * 1e9) - GAP_MARGIN_NS
     k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
     begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
     if ((begin < leg.start_ns) & (leg.start_ns < end)).any():
@@ -43,7 +45,7 @@ def _gaps(leg, limit_s):
     return np.stack([begin, end], -1)[t[:, 1] - t[:, 0] > limit_s]
 
 
-def _near(stamps, first_ns, stop_ns):
+def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
     """Return the stamps between two, rising: a view where they rise as they came."""
     if by_step(lambda stamps: np.diff(stamps) > 0, stamps).all():
         return stamps[slice(*np.searchsorted(stamps, [first_ns, stop_ns + 1]))]
@@ -51,7 +53,8 @@ def _near(stamps, first_ns, stop_ns):
 
 
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
-                    holdout: bool = False, progress=None) -> list[LegResult]:
+                    holdout: bool = False,
+                    progress: Callable[[float, str], None] | None = None) -> list[LegResult]:
     """
     Take a leg from samples to results: one, or one of each part that carries.
 
@@ -61,7 +64,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     parts = parts_of(leg, config.leg.max_gap)
     results = []
     for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
-        def told(share, stage, k=k):
+        def told(share: float, stage: str, k: int = k) -> None:
             if progress is not None:
                 progress((k + share) / len(parts), stage)
         results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=told))
@@ -74,7 +77,7 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     cut_from_ns=leg.start_ns) for one in good]
 
 
-def _cut(leg, one, count) -> Reason:
+def _cut(leg: Leg, one: LegResult, count: int) -> Reason:
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
     return Reason(Code.LEG_CUT, f'this is the leg from {begin:.1f} to {end:.1f} s of '
                   f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s'

@@ -1,11 +1,13 @@
 """The search of patent CN104359492A on one leg, beside method wheels: by positions alone."""
 
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.patent.planar import planar_leg, PlanarLeg
 from odocal_ros.patent.ranges import ranges_of
 from odocal_ros.patent.search import search, SearchResult
+from odocal_ros.pipeline.prepared import PreparedLeg
 
 
-def planar_of(ready, leg, pitch) -> PlanarLeg:
+def planar_of(ready: PreparedLeg, leg: WheelLeg, pitch: float) -> PlanarLeg:
     """
     Return a leg as the patent sees it: two tracks in the plane, and fixes.
 
@@ -16,7 +18,7 @@ def planar_of(ready, leg, pitch) -> PlanarLeg:
                       (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
 
 
-def search_of(ready, leg, pitch) -> SearchResult | None:
+def search_of(ready: PreparedLeg, leg: WheelLeg, pitch: float) -> SearchResult | None:
     """Return what the search finds, None with too few fixes; arguments as of planar_of."""
     a, wheels = ready.alignment, ready.config.wheels
     course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too

@@ -1,5 +1,6 @@
 """From screened inputs to a leg that methods can be run on: placed, faced, aligned, reckoned."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,25 +8,30 @@ import numpy as np
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
-from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults
+from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults, WheelSlips
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, medians
 from odocal_ros.data.samples import let_go
-from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.pipeline.align import align
 from odocal_ros.pipeline.coarse_odometer import coarse_reasons
 from odocal_ros.pipeline.prepared import attitude_of, PreparedLeg
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.facing import axes_reasons, facing
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import imu_gap
+from odocal_ros.screening.facing import axes_reasons, Facing, facing
+from odocal_ros.screening.placed import place, Placed
+from odocal_ros.screening.screen import imu_gap, Inputs
+from odocal_ros.settings.config import Config
 
 FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
 
-def prepare(leg, inputs, config, reasons=(), alignment=None, holdout=False):
+def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] = (),
+            alignment: Alignment | None = None,
+            holdout: bool = False) -> tuple[PreparedLeg | None, tuple[Reason, ...]]:
     """
     Prepare a leg for the methods.
 
@@ -63,11 +69,13 @@ def prepare(leg, inputs, config, reasons=(), alignment=None, holdout=False):
     return prepared, prepared.reasons
 
 
-def _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout):
+def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: Facing | None,
+              reasons: Sequence[Reason], alignment: Alignment | None,
+              holdout: bool) -> PreparedLeg:
     """Return the leg aligned, dead reckoned, and the drive judged."""
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                         config.leg.standstill)
-    about = ()
+    about: tuple[Reason, ...] = ()
     if alignment is None:
         alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,
                                  config)
@@ -90,7 +98,7 @@ def _reckoned(leg, inputs, config, placed, faces, reasons, alignment, holdout):
                  *(r for r in judged if r not in of_ends)), of_ends=of_ends)
 
 
-def judged_by(prepared: PreparedLeg, scale) -> PreparedLeg:
+def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg whose way and speed are judged by a scale known better than the rough one."""
     distance, judged = judge_drive(prepared.track, prepared.inputs.t_stop, scale,
                                    prepared.config.leg)
@@ -99,7 +107,7 @@ def judged_by(prepared: PreparedLeg, scale) -> PreparedLeg:
         *(r for r in judged if r.code in BY_SCALE)))
 
 
-def _standing(inputs, placed):
+def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     """Return why there is no drive to speak of, None where there is one."""
     still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
                        inputs.t_stop)
@@ -111,7 +119,7 @@ def _standing(inputs, placed):
     return None
 
 
-def _turning(inputs, config, placed):
+def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
     """Return how the gyro turns, where it does not turn with the course of the fixes."""
     up_b = medians(inputs.f_b)
     up_b /= np.linalg.norm(up_b)
@@ -120,19 +128,19 @@ def _turning(inputs, config, placed):
     return gyro_reasons(ratio, config.imu.gyro_scale)
 
 
-def _wheels_beside(inputs, config, placed, track, reasons):
+def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
+                   reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
     """Return what is wrong with two wheels beside each other, and where one slipped."""
-    odometer = config.odometer
-    unseen = inputs.travel_right is None or not inputs.felt
-    if unseen or BROKEN & {r.code for r in reasons}:
+    odometer, left, right = config.odometer, inputs.travel_left, inputs.travel_right
+    if left is None or right is None or not inputs.felt or BROKEN & {r.code for r in reasons}:
         return (), NO_SLIPS
     return wheel_faults(
-        inputs.travel_left, inputs.travel_right, (inputs.t_imu, inputs.w_b, inputs.f_b),
+        left, right, (inputs.t_imu, inputs.w_b, inputs.f_b),
         (0.0, inputs.t_stop), track, placed.origin.latitude, placed.rough,
         odometer.track_width, inputs.doubt_t, odometer.max_scale_deviation)
 
 
-def _four_fifths(track, t_stop):
+def _four_fifths(track: Track, t_stop: float) -> float:
     """Return when four fifths of the distance are driven, s."""
     inside = (track.t >= 0) & (track.t <= t_stop)
     s = track.s[inside]

@@ -7,11 +7,14 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
 from odocal_ros.calib.wheels.slips import WheelSlips
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
+from odocal_ros.pipeline.method_run import Path
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.facing import Facing
 from odocal_ros.screening.placed import Placed
@@ -55,16 +58,16 @@ class PreparedLeg(Placed):
     reasons: tuple[Reason, ...]
     of_ends: tuple[Reason, ...]
 
-    def path(self, f, track=None):
+    def path(self, f: Floats, track: Track | None = None) -> Path:
         """Return the path of the antenna, t (n,) to (n, 3) m but for a constant, for f = K d."""
         track = self.track if track is None else track
 
-        def at(t):
+        def at(t: Floats) -> Floats:
             path = track.at(t) @ f
             return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
         return at
 
-    def mark(self, t, path, name=''):
+    def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """
         Return the antenna's position at t, None without any.
 
@@ -82,26 +85,29 @@ class PreparedLeg(Placed):
                       lambda times: path(times) - here,
                       self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
 
-    def _surveyed(self, name, t):
+    def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
         """Return the reference point at a mark, () where the way does not begin or end there."""
         if not name:
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
         if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
-            return getattr(self.config.reference, name)
+            point: tuple[float, ...] = getattr(self.config.reference, name)
+            return point
         return ()
 
-    def reckon(self, travel):
+    def reckon(self, travel: Travel) -> Track:
         """Return the track of a travel (of the mean of the wheels, or of one) as aligned."""
         return dead_reckon(*self.epochs, travel)
 
-    def attitude_from(self, t_begin, q_nb, gyro_bias):
+    def attitude_from(self, t_begin: float, q_nb: Floats,
+                      gyro_bias: Floats) -> tuple[Floats, Floats]:
         """Return the attitude from a time, s, on: t (m,) s, q_nb (m, 4); bias in b, rad/s."""
         return attitude_of(self.inputs, self.origin.latitude, t_begin, q_nb, gyro_bias)
 
 
-def attitude_of(inputs, latitude, t_begin, q_nb, gyro_bias):
+def attitude_of(inputs: Inputs, latitude: float, t_begin: float, q_nb: Floats,
+                gyro_bias: Floats) -> tuple[Floats, Floats]:
     """Return the attitude of inputs from a time, s, on: t (m,) s, q_nb (m, 4)."""
     rows = slice(np.searchsorted(inputs.t_imu, t_begin - 1e-9),
                  np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))

@@ -1,23 +1,29 @@
 """The smoother on one leg: all samples at once, no outside heading."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import count
+from typing import Any
 
 import numpy as np
 
+from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.calib.smoother.outcome import refused
-from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Path, Paths
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
 ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
 
 
-def smoother(ready, passed) -> MethodRun:
+def smoother(ready: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
     """
     Run the smoother on a leg.
 
@@ -48,7 +54,7 @@ def smoother(ready, passed) -> MethodRun:
                      delays=seen)
 
 
-def _attitude(ready, details):
+def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:
     """
     Return the smoother's attitude at the Imu's rate: t (m,) s, q_nb (m, 4).
 
@@ -60,23 +66,25 @@ def _attitude(ready, details):
     return t, quat_multiply(quat_at(t, t_key, off), q_nb)
 
 
-def _late_path(track, f, lever_b, late):
+def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
     """Return the path by stamps that are so many s late; beyond the track's ends it runs on."""
-    def path(t):
+    def path(t: Floats) -> Floats:
         t = t - late
         inside = np.clip(t, track.t[0], track.t[-1])
         beyond = np.clip(t - inside, -abs(late), abs(late))
         P = track.at(inside)
         before = track.at(inside - np.copysign(ONWARD, beyond))
         P = P + (P - before) * (np.abs(beyond) / ONWARD)[..., None, None]
-        return P @ f + track.C_nb_at(inside) @ lever_b
+        at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
+        return at
     return path
 
 
-def _lever(estimates, config):
+def _lever(estimates: Mapping[str, Estimate], config: Config) -> Floats:
     """Return the antenna from the odometer's point as found, else as set: (3,) m, in b."""
     antenna, odometer = (
         np.array([given if (e := estimates[f'{name}_lever_arm_{axis}']).value is None else e.value
                   for axis, given in zip('xyz', section.lever_arm, strict=True)])
         for name, section in (('antenna', config.gnss), ('odometer', config.odometer)))
-    return antenna - odometer
+    arm: Floats = antenna - odometer
+    return arm

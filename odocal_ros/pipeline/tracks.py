@@ -1,19 +1,26 @@
 """The tracks of a leg, as configured and as calibrated, and how far they stray from the fixes."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.calib.check import stray, track_check
 from odocal_ros.calib.evidence import evidence
+from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.per_distance import check_worse, per_distance
+from odocal_ros.calib.result import Estimate, TRACK_ROWS
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
+from odocal_ros.pipeline.method_run import Path, Paths
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
-FEWEST_FIXES = 3        # for a check of the track
-FAR = 20.0              # times the usual distance from the track: an outlier beyond doubt
-TRACK_ROWS = 5000       # of a track kept in a result
+FEWEST_TRACK_FIXES = 3    # for a check of the track
+TRACK_OUTLIER = 20.0      # times the usual distance from the track: an outlier beyond doubt
 
 
-def as_configured(ready, f, estimates):
+def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:
     """
     Return f = K0 d0 of the settings, (3,) m per unit of travel.
 
@@ -26,7 +33,8 @@ def as_configured(ready, f, estimates):
     return (ready.nominal or ready.rough) * forward_b(*angles)
 
 
-def near(ready, path, pin, between):
+def near(ready: PreparedLeg, path: Path, pin: MarkFix,
+         between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
     """
     Tell which fixes do not lie absurdly far from a path that fits.
 
@@ -39,14 +47,14 @@ def near(ready, path, pin, between):
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
     usual = max(float(np.median(off[between])), ready.fix_sigma)
-    far = off > FAR * usual
+    far = off > TRACK_OUTLIER * usual
     found = (Reason(
         Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes '
-        f'lie more than {FAR * usual:.0f} m off the track; not used in the check'),)
+        f'lie more than {TRACK_OUTLIER * usual:.0f} m off the track; not used in the check'),)
     return ~far, found if (far & between).any() else ()
 
 
-def tracks(ready, paths) -> tuple[dict, tuple[Reason, ...]]:
+def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reason, ...]]:
     """
     Return the tracks, checks and evidence of a leg as fields of its result, and what they say.
 
@@ -57,12 +65,13 @@ def tracks(ready, paths) -> tuple[dict, tuple[Reason, ...]]:
     if start is None:
         return {}, ()
     t = ready.track.t[::max(1, len(ready.track.t) // TRACK_ROWS)]
-    more = {name: start.position_n + path(t) - path(np.array(start.t))
-            for name, path in (('track_before_n', before), ('track_n', after))}
+    more: dict[str, Any] = {
+        name: start.position_n + path(t) - path(np.array(start.t))
+        for name, path in (('track_before_n', before), ('track_n', after))}
     more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
     pin, between, way, found = _checked(ready, after, start)
     more['reference_n'] = ready.fixes_n[between]
-    if pin is None or between.sum() < FEWEST_FIXES:
+    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return more, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
     more |= {name: track_check(stray(path, pin, fixes), way)
@@ -76,13 +85,13 @@ def tracks(ready, paths) -> tuple[dict, tuple[Reason, ...]]:
                                         start, paths, ready.config, ready.t_fit)}, found
 
 
-def check_of(ready, path) -> tuple[dict, tuple[Reason, ...]]:
+def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reason, ...]]:
     """Return the check of a method's own path as an entry of its details, and what it says."""
     start = _start(ready, path)
     if start is None:
         return {}, ()
     pin, between, way, found = _checked(ready, path, start)
-    if pin is None or between.sum() < FEWEST_FIXES:
+    if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
     check = track_check(stray(path, pin, fixes), way)
@@ -90,14 +99,17 @@ def check_of(ready, path) -> tuple[dict, tuple[Reason, ...]]:
         'rms', 'max', 'mean', 'end', 'percent_of_distance')}}, found
 
 
-def _start(ready, path):
+def _start(ready: PreparedLeg, path: Path) -> MarkFix | None:
     begin = max(0.0, float(ready.track.t[0]), float(ready.inputs.travel.t[0]))
     return ready.mark(begin, path, 'start')
 
 
-def _checked(ready, path, start):
+def _checked(ready: PreparedLeg, path: Path,
+             start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
     """Return where the path is pinned, which fixes it is held against, the way in m; reasons."""
-    pin, begin, end, found = start, start.t, ready.t_fit, ()
+    pin: MarkFix | None = start
+    begin, end = start.t, ready.t_fit
+    found: tuple[Reason, ...] = ()
     if ready.holdout:
         pin, begin, end = ready.mark(ready.t_fit, path), ready.t_fit, ready.inputs.t_stop
     between = (ready.inputs.t_fix >= begin) & (ready.inputs.t_fix <= end)
@@ -108,7 +120,7 @@ def _checked(ready, path, start):
     return pin, between, b - a, found
 
 
-def driven(ready):
+def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
     """Return times of the track, s, and the way driven until then, m."""
     way = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
     return ready.track.t, way * ready.metres_per_unit

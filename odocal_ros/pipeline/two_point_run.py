@@ -1,5 +1,6 @@
 """The two-point method on one leg: its marks, its chord, and the checks of its track."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,14 @@ from odocal_ros.calib.check import (
     track_check,
 )
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.slip import find_slips, rounding, slip_reason, WINDOW
+from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.slip import find_slips, rounding, slip_reason, SPIN_WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, near
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import toward
@@ -27,7 +31,7 @@ from odocal_ros.screening.facing import toward
 NAMES = ('start', 'end')
 
 
-def two_point(ready, passed=None) -> MethodRun:
+def two_point(ready: PreparedLeg, passed: Callable[[int], None] | None = None) -> MethodRun:
     """
     Run the two-point method on a leg.
 
@@ -39,16 +43,17 @@ def two_point(ready, passed=None) -> MethodRun:
 class TwoPointRun:
     """The method on its way over one leg."""
 
-    def __init__(self, ready):
+    def __init__(self, ready: PreparedLeg) -> None:
         self.ready, self.inputs = ready, ready.inputs
         self.config, self.track = ready.config, ready.track
-        self.reasons, self.found = [], []       # of the method, and of the data
+        self.reasons: list[Reason] = []     # of the method
+        self.found: list[Reason] = []       # of the data
 
-    def result(self):
+    def result(self) -> MethodRun:
         """Return the method's result and the path."""
         chord = self._chord()
         refused = tuple(self.reasons) if chord is None else refusal(chord, self.ready.rough)
-        if refused:
+        if chord is None or refused:
             return MethodRun(unsolved(refused, self.inputs.scale_unit), found=tuple(self.found))
         f, _ = solve(chord, np.inf)
         t_fix = self.inputs.t_fix
@@ -69,7 +74,7 @@ class TwoPointRun:
         paths = Paths(*map(self.ready.path, (as_configured(self.ready, f, method.estimates), f)))
         return MethodRun(method, paths, tuple(self.found))
 
-    def _slips(self, chord, f):
+    def _slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
         """Return slips of the mean between the marks, s and m; name those not named already."""
         if not self.inputs.felt:
             return np.empty(0), np.empty(0)
@@ -77,35 +82,35 @@ class TwoPointRun:
                              toward(self.ready.facing, f), self.ready.origin.latitude,
                              rounding(self.inputs.travel))
         one = self.ready.wheel_slips      # of one wheel: half of it goes into the mean
-        known = (np.abs(t[:, None] - one.t) < WINDOW).any(axis=1)
+        known = (np.abs(t[:, None] - one.t) < SPIN_WINDOW).any(axis=1)
         held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
         self.found += slip_reason(t[held], size[held])
         inside = (one.t >= chord.start.t) & (one.t <= chord.end.t)
         return np.append(t[held], one.t[inside]), np.append(size[held], one.size[inside] / 2)
 
-    def _chord(self):
+    def _chord(self) -> Chord | None:
         """Return the chord between the marks, or None and say why."""
         ready, track, travel = self.ready, self.track, self.inputs.travel
         ends = (max(0.0, float(track.t[0]), float(travel.t[0])),
                 min(ready.t_fit, float(track.t[-1]), float(travel.t[-1])))
         path = ready.path(np.array([ready.rough, 0.0, 0.0]))
-        marks = [ready.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True)]
-        for mark, name in zip(marks, NAMES, strict=True):
+        start, end = (ready.mark(t, path, name) for t, name in zip(ends, NAMES, strict=True))
+        for mark, name in zip((start, end), NAMES, strict=True):
             if mark is None:
                 self.reasons.append(Reason(Code.NO_FIX, f'no usable fix at the {name} mark'))
-        if None in marks:
+        if start is None or end is None:
             return None
-        chord = Chord(track, ready.origin, *marks, ready.lever_b, self._velocity_change(marks),
-                      ready.alignment, (self.inputs.doubt_t, self.inputs.doubt_sigma))
-        if not all(m.standing or m.surveyed for m in marks):     # the fit moves with the solution
-            if refusal(chord, ready.rough):
-                return chord
-            path = ready.path(solve(chord, np.inf)[0])
-            marks = [ready.mark(m.t, path, name) for m, name in zip(marks, NAMES, strict=True)]
-            chord = replace(chord, start=marks[0], end=marks[1])
-        return chord
+        chord = Chord(track, ready.origin, start, end, ready.lever_b,
+                      self._velocity_change((start, end)), ready.alignment,
+                      (self.inputs.doubt_t, self.inputs.doubt_sigma))
+        still = all(m.standing or m.surveyed for m in (start, end))
+        if still or refusal(chord, ready.rough):
+            return chord
+        path = ready.path(solve(chord, np.inf)[0])      # marks in motion move with the solution
+        return replace(chord, start=ready.mark(start.t, path, 'start') or start,
+                       end=ready.mark(end.t, path, 'end') or end)
 
-    def _velocity_change(self, marks):
+    def _velocity_change(self, marks: Sequence[MarkFix]) -> Floats:
         """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
         change = np.zeros((3, 3))
         for mark, sign in zip(marks, (-1.0, 1.0), strict=True):
@@ -116,7 +121,7 @@ class TwoPointRun:
                     high - low, 1e-6)
         return change
 
-    def _judged(self, chord, f, between):
+    def _judged(self, chord: Chord, f: Floats, between: Bools) -> tuple[Chord, Floats]:
         """Return the chord with honest marks, the factor on fix sigmas; judge the track."""
         ready = self.ready
         fixes = self.inputs.t_fix[between], ready.fixes_n[between]
@@ -136,7 +141,7 @@ class TwoPointRun:
         self._judge_track(chord, f, fixes, residual, drift)
         return chord, factor
 
-    def _drift(self, chord, f):
+    def _drift(self, chord: Chord, f: Floats) -> Floats:
         """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
         keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
         D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
@@ -145,7 +150,8 @@ class TwoPointRun:
         # the bow of a pinned track is a quarter of what its free end would stray
         return np.concatenate(list(sources.values()), axis=1) / 4
 
-    def _noise_factor(self, residual, covariance, drift, chord):
+    def _noise_factor(self, residual: Floats, covariance: Floats, drift: float,
+                      chord: Chord) -> Floats:
         factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
             self.reasons.append(Reason(
@@ -154,7 +160,8 @@ class TwoPointRun:
                 'covariance says'))
         return factor
 
-    def _judge_track(self, chord, f, fixes, residual, drift):
+    def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
+                     drift: float) -> None:
         """Compare the corrected track with the fixes: reversing, sanity."""
         ready, (t, p) = self.ready, fixes
         track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
@@ -166,7 +173,7 @@ class TwoPointRun:
             check = track_check(stray(ready.path(f), chord.start, fixes), ready.distance)
             self.reasons += mismatch(check, ready.fix_sigma, drift, ready.distance)
 
-    def _reversed(self, chord):
+    def _reversed(self, chord: Chord) -> None:
         """Say that the odometer counts down where nothing tells how the Imu is pushed."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
         if backwards and self.ready.facing is None and not chord.alignment.heading_separable:

@@ -1,19 +1,23 @@
 """The method ``wheels`` on one leg: the estimate and, where asked for, the patent's search."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.wheels.leg import positions, WheelLeg
 from odocal_ros.calib.wheels.result import fit_wheels, refused
 from odocal_ros.calib.wheels.unseen import drawn_out
 from odocal_ros.nav.angles import arctan2
-from odocal_ros.nav.dead_reckoning import dead_reckon
+from odocal_ros.nav.dead_reckoning import dead_reckon, Track
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
 from odocal_ros.pipeline.method_run import MethodRun, Paths
 from odocal_ros.pipeline.patent_run import search_of
+from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
 
@@ -23,7 +27,7 @@ OF_TWO = {Code.WHEELS_NOT_SEPARABLE, Code.TRACK_WIDTH_NOT_DETERMINED}
 UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
-def wheels(ready, passed=None) -> MethodRun:
+def wheels(ready: PreparedLeg, passed: Callable[[int], None] | None = None) -> MethodRun:
     """
     Run the method on a leg.
 
@@ -55,12 +59,10 @@ def wheels(ready, passed=None) -> MethodRun:
         slips=method.details['slips'])
 
 
-def wheel_leg(ready) -> WheelLeg | None:
+def wheel_leg(ready: PreparedLeg) -> WheelLeg | None:
     """Return a prepared leg as two wheels see it, None without a fix at its start."""
     inputs = ready.inputs
-    left = right = inputs.travel
-    if inputs.travel_right is not None:
-        left, right = inputs.travel_left, inputs.travel_right
+    left, right = inputs.travel_left or inputs.travel, inputs.travel_right or inputs.travel
     ends = (max(0.0, float(ready.track.t[0]), float(left.t[0]), float(right.t[0])),
             min(ready.t_fit, float(ready.track.t[-1]), float(left.t[-1]), float(right.t[-1])))
     start = ready.mark(ends[0], ready.path(np.array([ready.rough, 0.0, 0.0])), 'start')
@@ -79,39 +81,40 @@ def wheel_leg(ready) -> WheelLeg | None:
         uneven=bool(slips.change) or _uneven(ready))
 
 
-def _of_one(method):
+def _of_one(method: MethodResult) -> MethodResult:
     """Return what the method says of one counter, that stood for both: nothing of two wheels."""
     width = Estimate(None, None, 'm')       # left and right are not stated without their turn
     return replace(method, estimates=method.estimates | {'track_width': width}, reasons=tuple(
         r for r in method.reasons if r.code not in OF_TWO))
 
 
-def _uneven(ready) -> bool:
+def _uneven(ready: PreparedLeg) -> bool:
     return bool(UNEVEN & {r.code for r in ready.reasons})
 
 
-def _paths(ready, leg, method):
+def _paths(ready: PreparedLeg, leg: WheelLeg, method: MethodResult) -> Paths:
     """Return the paths that wheels dead reckon with the corrected heading and gyro."""
     e, f = method.estimates, method.details['f']
-    if e['scale_factor_left'].value is None:
+    k_left, k_right = (e[f'scale_factor_{side}'].value for side in ('left', 'right'))
+    if k_left is None or k_right is None:
         return Paths(*map(ready.path, (as_configured(ready, f, e), f)))
     drift = 0.0 if e['gyro_bias_z'].value is None else (
         e['gyro_bias_z'].value - ready.alignment.gyro_bias[2])
     error = method.details['gyro_scale_seen']['value']      # 0 where the leg tells nothing of it
     if drift or error:
         since = leg.start.t if ready.alignment.heading_source == 'fixed' else ready.alignment.t
-        leg = replace(leg, **{side: _straightened(ready, travel, drift, error, since)
-                              for side, travel in (('left', ready.inputs.travel_left),
-                                                   ('right', ready.inputs.travel_right))})
+        left, right = (_straightened(ready, travel or ready.inputs.travel, drift, error, since)
+                       for travel in (ready.inputs.travel_left, ready.inputs.travel_right))
+        leg = replace(leg, left=left, right=right)
     # heading and mounting error are one: they hold for both
-    angles = e['heading_error'].value, method.details['pitch']['value']
-    both = (ready.nominal or ready.rough,) * 2, tuple(
-        e[f'scale_factor_{side}'].value for side in ('left', 'right'))
-    return Paths(*(lambda t, scales=scales: positions(leg, t, *scales, *angles)
-                   for scales in both))
+    angles = {'heading_error': e['heading_error'].value, 'pitch': method.details['pitch']['value']}
+    nominal = ready.nominal or ready.rough
+    return Paths(partial(positions, leg, k_left=nominal, k_right=nominal, **angles),
+                 partial(positions, leg, k_left=k_left, k_right=k_right, **angles))
 
 
-def _straightened(ready, travel, drift, error, since):
+def _straightened(ready: PreparedLeg, travel: Travel, drift: float, error: float,
+                  since: float) -> Track:
     """Return the track of a wheel without drift, rad/s, and scale error of the gyro."""
     t, q_nb = ready.epochs
     x = matrix_from_quat(q_nb)[..., 0]

@@ -8,15 +8,17 @@ from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_step, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
+from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
 
-LIMIT = 0.5          # s, between topics
-REACH = 1.0          # s, what a time_offset setting holds
-SET = 0.02           # s, a clock set by more than this is named
-NEIGHBOURS = 50      # rows each side that tell the lag there
-GAP = 5.0            # median intervals: a step of the stamps worth a look
+CLOCK_APART = 0.5      # s, between topics
+OFFSET_REACH = 1.0     # s, what a time_offset setting holds
+CLOCK_SET = 0.02       # s, a clock set by more than this is named
+LAG_NEIGHBOURS = 50    # rows each side that tell the lag there
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
+TOO_FAR = ('Stamp all sensors with one clock: no time_offset reaches so far. Of a bag that is '
+           'played: ros2 bag play --clock, and the node with use_sim_time:=true.')
 
 
 def judge_clocks(leg: Leg, offsets: Mapping[str, float],
@@ -43,11 +45,16 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
             continue
         ahead = float(np.median(_lag_at(samples.received_ns, imu) - _lag(samples)))
         ahead += offsets[slot]
-        if abs(ahead) > LIMIT:
+        if abs(ahead) > CLOCK_APART:
             found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '
                                 's against the Imu stamps of the same moment'
-                                f'{_cure(slot, ahead)}'))
+                                f'{_cure(slot, ahead)}', remedy(ahead)))
     return found
+
+
+def remedy(ahead: float) -> str:
+    """Return what to do about a clock so many s ahead of the Imu's."""
+    return TOO_FAR if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
 
 def _stamped(samples: SomeSamples) -> SomeSamples:
@@ -85,14 +92,14 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
 
 def _cure(slot: str, ahead: float) -> str:
     """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
-    if slot not in GROUP or abs(ahead) > REACH:
+    if slot not in GROUP or abs(ahead) > OFFSET_REACH:
         return ''
     return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
 
 
 def _may_be_odd(stamp_ns: Ints) -> Bools:
     step: Floats = np.diff(stamp_ns) * 1e-9
-    return (step <= 0) | (step > SET)
+    return (step <= 0) | (step > CLOCK_SET)
 
 
 def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
@@ -107,15 +114,16 @@ def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
     step = np.diff(samples.stamp_ns) * 1e-9
     if len(step) < 3:
         return []
-    odd = np.flatnonzero((step <= 0) | (step > max(GAP * np.median(step), SET)))
+    odd = np.flatnonzero((step <= 0) | (step > max(GAP_INTERVALS * np.median(step), CLOCK_SET)))
     if not len(odd):
         return []
     first, last = int(odd[0]), int(odd[-1])
     lag = _lag(samples)
-    before, after = lag[max(0, first + 1 - NEIGHBOURS):first + 1], lag[last + 1:][:NEIGHBOURS]
+    before = lag[max(0, first + 1 - LAG_NEIGHBOURS):first + 1]
+    after = lag[last + 1:][:LAG_NEIGHBOURS]
     moved = float(np.median(before) - np.median(after))      # of the stamps, against arrival
     at = int(odd[np.argmin(np.abs(step[odd] - moved))])
-    if abs(moved) < SET or abs(step[at] - moved) > 0.3 * abs(moved) + np.median(step):
+    if abs(moved) < CLOCK_SET or abs(step[at] - moved) > 0.3 * abs(moved) + np.median(step):
         return []
     return [Reason(Code.CLOCKS_DIFFER, f'the {label} clock was set by {moved:+.3f} s during the '
                    f'leg, at t = {(samples.stamp_ns[at] - start_ns) * 1e-9:.2f} s: its stamps '

@@ -18,21 +18,21 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 
-BIN = 1.0                      # s, accelerations are compared as means over it
-LEAST = 20                     # bins
-SOME = 64                      # bins worked on at a time
-SURE = np.deg2rad(10.0)        # 1 sigma of where the Imu faces, to speak of it
-GAIN = 0.5, 2.0                # of the push by what the wheels say: else it is something else
-FAR = np.deg2rad(75.0)         # off the nominal: no mounting is meant so
-NEAR = np.deg2rad(10.0)        # off what a method takes for forward: no matter for slips
-BACKWARDS = np.deg2rad(150.0)  # an odometer that runs the other way looks so too
+BIN_S = 1.0                        # s, accelerations are compared as means over it
+FEWEST_BINS_FACING = 20                # bins
+BINS_AT_A_TIME = 64                    # bins worked on at a time
+FACING_SIGMA = np.deg2rad(10.0)        # 1 sigma of where the Imu faces, to speak of it
+PUSH_GAIN = 0.5, 2.0    # of the push by what the wheels say: else it is something else
+FAR_FACING = np.deg2rad(75.0)          # off the nominal: no mounting is meant so
+NEAR_FACING = np.deg2rad(10.0)         # off what a method takes for forward: no matter for slips
+OTHER_WAY_ROUND = np.deg2rad(150.0)    # an odometer that runs the other way looks so too
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
     """
-    What pushes the Imu in the level plane, by bins of BIN seconds, complex: e1 + i e2.
+    What pushes the Imu in the level plane, by bins of BIN_S seconds, complex: e1 + i e2.
 
     e1, e2 : (3,) level axes, in the frame of the Imu's data.   force : (m,) m/s^2.
     onward, inward : (m,) of the vehicle, real m/s^2: speeding up; to the left in turns.
@@ -72,14 +72,14 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
         Its rough scale.
 
     """
-    t0, t1 = max(t[0], travel.t[0]) + BIN, min(t[-1], travel.t[-1]) - BIN
-    if t1 - t0 < LEAST * BIN:
+    t0, t1 = max(t[0], travel.t[0]) + BIN_S, min(t[-1], travel.t[-1]) - BIN_S
+    if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
         return None
-    edges = np.arange(t0, t1, BIN)
+    edges = np.arange(t0, t1, BIN_S)
     first = np.searchsorted(t, edges, side='right')
     count = np.diff(first)
     means = np.empty((len(count), 4))
-    for bins in (slice(k, k + SOME) for k in range(0, len(count), SOME)):
+    for bins in (slice(k, k + BINS_AT_A_TIME) for k in range(0, len(count), BINS_AT_A_TIME)):
         rows = slice(first[bins.start], first[bins.start + len(count[bins])])
         cell = np.repeat(np.arange(len(count[bins])), count[bins])
         for k, column in enumerate((*f[rows].T, w[rows] @ up)):
@@ -87,10 +87,10 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
         let_go(f, w)
     means /= np.maximum(count, 1)[:, None]
     f, turn_rate = means[:, :3].copy(), means[:, 3].copy()
-    speed = np.diff(travel.at(edges)) * metres_per_unit / BIN
+    speed = np.diff(travel.at(edges)) * metres_per_unit / BIN_S
     middle = (edges[:-1] + edges[1:]) / 2
-    onward = (travel.at(middle + BIN) - 2 * travel.at(middle) + travel.at(middle - BIN)) \
-        * metres_per_unit / BIN**2
+    onward = (travel.at(middle + BIN_S) - 2 * travel.at(middle) + travel.at(middle - BIN_S)) \
+        * metres_per_unit / BIN_S**2
     e1 = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(up, e1)
@@ -124,7 +124,7 @@ def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
                              for x in (found.force, found.onward, found.inward))
     A = np.stack([onward, 1j * inward], -1)
     normal = A.conj().T @ A
-    if len(A) < LEAST or np.linalg.cond(normal) > 1e9:
+    if len(A) < FEWEST_BINS_FACING or np.linalg.cond(normal) > 1e9:
         return None
     inverse = np.linalg.inv(normal)
     gain = inverse @ (A.conj().T @ force)
@@ -132,7 +132,7 @@ def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
     # only half of the residual lies across, only every other change (they share bins) is a draw
     variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
     sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
-    if sigma > SURE or not GAIN[0] < abs(gain[0]) < GAIN[1]:
+    if sigma > FACING_SIGMA or not PUSH_GAIN[0] < abs(gain[0]) < PUSH_GAIN[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
     return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
@@ -141,7 +141,7 @@ def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
 def toward(found: Facing | None, f: Floats) -> Floats:
     """Return scale times forward axis, (3,), turned to where the Imu faces if that is far off."""
     yaw, pitch = mounting_from_forward(f)
-    if found is None or abs(float(wrap(found.yaw - yaw))) < max(NEAR, 3 * found.sigma):
+    if found is None or abs(float(wrap(found.yaw - yaw))) < max(NEAR_FACING, 3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
@@ -156,11 +156,11 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
     seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
         seen += f', nominal {np.rad2deg(nominal):+.0f}'
-    if off > BACKWARDS:
+    if off > OTHER_WAY_ROUND:
         return (Reason(Code.ODOMETER_REVERSED, f'speeding up pushes the Imu {way} (yaw mounting '
                        f'{seen}): positive counts mean backwards, the Imu faces the other way, or '
                        'all was driven in reverse and the counter does not tell'),)
-    if off < FAR + 3 * found.sigma:
+    if off < FAR_FACING + 3 * found.sigma:
         return ()
     return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu {way} (yaw mounting {seen}): the '
                    'body frame is not forward-left-up'),)

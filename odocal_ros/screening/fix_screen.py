@@ -9,13 +9,13 @@ from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import GnssConfig
 
-HEIGHT = 1e5         # m, beyond it a fix is at no real position
-ALIKE = 1e-3         # correlations above and below the diagonal
-ABOUT_START = 11     # fixes about the start mark that the origin is amid
-AWAY = 1e6           # m from where most fixes are, the same
-SMALLEST = 1e-6      # m, a sigma below it, and
-LARGEST = 1e8        # m, beyond it, says nothing
-INDEPENDENT = 1e-6   # least eigenvalue of the correlations: below it an axis adds nothing
+MOST_HEIGHT = 1e5          # m, beyond it a fix is at no real position
+ASYMMETRY = 1e-3           # correlations above and below the diagonal
+ABOUT_START = 11           # fixes about the start mark that the origin is amid
+AWAY_FROM_MOST = 1e6       # m from where most fixes are, the same
+SMALLEST_SIGMA = 1e-6      # m, a sigma below it, and
+LARGEST_SIGMA = 1e8        # m, beyond it, says nothing
+LEAST_EIGENVALUE = 1e-6    # least eigenvalue of the correlations: below it an axis adds nothing
 
 
 def usable_fixes(fix: FixSamples, sent: int,
@@ -38,7 +38,7 @@ def usable_fixes(fix: FixSamples, sent: int,
 
     """
     no_fix = fix.status < gnss.min_status
-    lost = ~placed(fix) | (abs(fix.height) > HEIGHT)
+    lost = ~placed(fix) | (abs(fix.height) > MOST_HEIGHT)
     lost = lost | _away(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
@@ -76,7 +76,7 @@ def _away(fix: FixSamples, good: Bools) -> Bools:
     away = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
-        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > AWAY
+        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > AWAY_FROM_MOST
     return away
 
 
@@ -101,16 +101,16 @@ def _proper(matrices: Floats) -> Bools:
     """Tell which matrices are covariances that can be inverted: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
     # products and roots of what is beyond any receiver would overflow
-    small = np.abs(matrices) < LARGEST**2
+    small = np.abs(matrices) < LARGEST_SIGMA**2
     sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
-    sane &= (variance > SMALLEST**2).all(axis=1)
+    sane &= (variance > SMALLEST_SIGMA**2).all(axis=1)
     with np.errstate(all='ignore'):
         sigma = np.sqrt(variance)
         unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
     unit[~sane] = np.eye(matrices.shape[1])
     # one that is not symmetric is damaged: which half holds, nobody knows
-    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ALIKE).all(axis=(1, 2))
-    sane &= np.linalg.eigvalsh(unit)[:, 0] > INDEPENDENT
+    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ASYMMETRY).all(axis=(1, 2))
+    sane &= np.linalg.eigvalsh(unit)[:, 0] > LEAST_EIGENVALUE
     return sane
 
 

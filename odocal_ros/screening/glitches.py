@@ -14,29 +14,30 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
-BEYOND = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
-LARGEST = 1e300      # of any other value: sums and products with it stay finite
-UNIT = 2.0           # times one, either way: a quaternion of another length is no attitude
-WIDEST = 1e12        # rad^2, no driver's way of saying unknown is beyond it
-TINY = 1e-100        # nor does any sensor mean this, but zero
-CLUMP = 5            # rows beyond any sensor, each within NEAR rows of the one before, are a clump
-NEAR = 50            # rows: a page or a packed block of a recording is about so many
-DAMAGED = 0.01       # of the rows beyond any sensor: so many are a damaged recording, or
-SEVERAL = 4          # rows, wherever: about as many are wrong beside them and do not show
-TURN_STEP = 0.8      # rad/s, least bound from row to row that may be a glitch
-FORCE_STEP = 50.0    # m/s^2, the same: potholes stay
-SPEED_STEP = 0.3     # of the top speed, the same
-CLEAR = 20.0         # times the usual step from row to row
-CLOSE = 0.4          # s within which a glitch is over: longer, and motion itself may do it
-HOME = 0.5           # of the bound: nearer to the row before it, the glitch is over
-BESIDE = 5           # rows to either side that are still where a single row is false
-SINGLE = 10.0        # times as far from its neighbours as any of those beside it is from theirs
-ALIKE = 0.3          # of that: so near to each other are the neighbours of a false row
-SINGLE_TURN = 0.03   # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
-SINGLE_FORCE = 2.0   # m/s^2, the same
-RARE = 0.002         # of the rows: more of them are no glitches
-ROLLS = 0.1          # of the top speed: slower on the mean, a vehicle may as well stand
-MOST = 2000          # bounds looked at
+BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
+LARGEST_VALUE = 1e300     # of any other value: sums and products with it stay finite
+UNIT_LENGTH = 2.0         # times one, either way: a quaternion of another length is no attitude
+WIDEST_VARIANCE = 1e12    # rad^2, no driver's way of saying unknown is beyond it
+LEAST_VALUE = 1e-100      # nor does any sensor mean this, but zero
+# rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
+CLUMP_ROWS = 5
+CLUMP_REACH = 50          # rows: a page or a packed block of a recording is about so many
+DAMAGED_SHARE = 0.01      # of the rows beyond any sensor: so many are a damaged recording, or
+SEVERAL_ROWS = 4          # rows, wherever: about as many are wrong beside them and do not show
+TURN_STEP = 0.8           # rad/s, least bound from row to row that may be a glitch
+FORCE_STEP = 50.0         # m/s^2, the same: potholes stay
+SPEED_STEP = 0.3          # of the top speed, the same
+USUAL_STEPS = 20.0        # times the usual step from row to row
+GLITCH_TIME = 0.4         # s within which a glitch is over: longer, and motion itself may do it
+BACK_SHARE = 0.5          # of the bound: nearer to the row before it, the glitch is over
+ROWS_BESIDE = 5          # rows to either side that are still where a single row is false
+SINGLE_TIMES = 10.0    # times as far from its neighbours as any of those beside it is from theirs
+NEIGHBOURS_ALIKE = 0.3    # of that: so near to each other are the neighbours of a false row
+SINGLE_TURN = 0.03        # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
+SINGLE_FORCE = 2.0        # m/s^2, the same
+GLITCH_SHARE = 0.002      # of the rows: more of them are no glitches
+ROLLS = 0.1               # of the top speed: slower on the mean, a vehicle may as well stand
+MOST_BOUNDS = 2000        # bounds looked at
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -45,11 +46,11 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
-    most = BEYOND.get(name, LARGEST)
+    most = BEYOND_SENSOR.get(name, LARGEST_VALUE)
 
     def odd(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
-        usable = (size <= most) & ((size >= TINY) | (size == 0))
+        usable = (size <= most) & ((size >= LEAST_VALUE) | (size == 0))
         odd: Bools = ~usable.all(axis=tuple(range(1, x.ndim)))
         return odd
     with np.errstate(invalid='ignore'):
@@ -60,7 +61,8 @@ def oriented(samples: Oriented) -> Oriented:
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = np.linalg.norm(np.where(wild[:, None], 0.0, q_ni), axis=1)
-        none: Bools = (length < 1 / UNIT) | (length > UNIT) | (np.abs(variance) > WIDEST)
+        none: Bools = ((length < 1 / UNIT_LENGTH) | (length > UNIT_LENGTH)
+                       | (np.abs(variance) > WIDEST_VARIANCE))
         return none
 
     wild = beyond('q_ni', samples.q_ni)
@@ -83,8 +85,8 @@ def about_clumps(wild: Bools) -> Bools:
     """
     suspect = np.zeros(len(wild), bool)
     at = np.flatnonzero(wild)
-    for group in np.split(at, np.flatnonzero(np.diff(at) > NEAR) + 1):
-        if len(group) >= CLUMP:
+    for group in np.split(at, np.flatnonzero(np.diff(at) > CLUMP_REACH) + 1):
+        if len(group) >= CLUMP_ROWS:
             wide = 2 * int(np.diff(group).max())
             suspect[max(group[0] - wide, 0):group[-1] + wide + 1] = True
     return suspect
@@ -114,17 +116,17 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     if not len(far):
         return found
     size = bound[far]
-    clear = size > CLEAR * float(np.median(bound, overwrite_input=True))
+    clear = size > USUAL_STEPS * float(np.median(bound, overwrite_input=True))
     done = -1
-    for i, bound in zip(far[clear][:MOST], size[clear], strict=False):
+    for i, bound in zip(far[clear][:MOST_BOUNDS], size[clear], strict=False):
         if i < done:
             continue
-        within = np.searchsorted(t, t[i] + CLOSE, side='right')
-        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= HOME * bound
+        within = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
+        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= BACK_SHARE * bound
         if home.any():
             done = i + 2 + int(np.argmax(home))
             found[i + 1:done] = True
-    return found if found.mean() <= RARE else np.zeros(len(x), bool)
+    return found if found.mean() <= GLITCH_SHARE else np.zeros(len(x), bool)
 
 
 def single(x: Floats, least: float) -> Bools:
@@ -134,23 +136,25 @@ def single(x: Floats, least: float) -> Bools:
     x : (n, k).   least : off by less, a row is let be.   Returns (n,) bool, all false where so
     many rows are that it is the sensor's nature.
     """
-    edge = BESIDE + 1
+    edge = ROWS_BESIDE + 1
 
     def off(x: Floats) -> Bools:
         m = len(x) - 2 * edge
         far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
         # a false row shows in those at it, too
-        beside = np.max([far[BESIDE + k:][:m] for d in range(2, edge) for k in (-d, d)], axis=0)
-        at = far[BESIDE:][:m]
-        apart = np.abs(x[edge + 1:][:m] - x[BESIDE:][:m])
-        is_off: Bools = (at > np.maximum(least, SINGLE * beside)) & (apart < ALIKE * at)
+        beside = np.max([far[ROWS_BESIDE + k:][:m] for d in range(2, edge) for k in (-d, d)],
+                        axis=0)
+        at = far[ROWS_BESIDE:][:m]
+        apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
+        is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
+                         & (apart < NEIGHBOURS_ALIKE * at))
         alone: Bools = np.any(is_off, axis=1)
         return alone
 
     found = np.zeros(len(x), bool)
     if len(x) > 2 * edge:
         found[edge:-edge] = by_step(off, x, steps=2 * edge)
-    found &= found.sum() <= max(RARE * len(x), CLUMP)
+    found &= found.sum() <= max(GLITCH_SHARE * len(x), CLUMP_ROWS)
     return found
 
 

@@ -14,19 +14,19 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
 
-WINDOW = 5.0        # s, within which some row comes on time
-LEAST = 0.004       # s of lateness, and
-SHARE = 0.1         # of an interval, that matter
-NAMED = 0.02        # s, and
-NAMED_SHARE = 0.3   # of an interval, that are worth a word
-SPAN = 5.0          # s over which the interval is taken
-STEADY = 0.005      # by which it is another than the median: rows are lost
-EVEN = 0.3          # share of the intervals that are within a quarter of the median
-BESIDE = 5          # rows to either side that tell where a row should be
-FITS = 0.4          # of what rows are off as sent
-COUNTS = 2.5        # by which a row may be off: rounding
-SHORT = 1.0         # s within which travel is as good as even
-FAST = 3.0          # times the speed beside: no wheel, so rows that catch up
+ON_TIME_WINDOW = 5.0      # s, within which some row comes on time
+LEAST_LATE = 0.004        # s of lateness, and
+LATE_SHARE = 0.1          # of an interval, that matter
+NAMED_LATE = 0.02         # s, and
+NAMED_LATE_SHARE = 0.3    # of an interval, that are worth a word
+INTERVAL_SPAN = 5.0       # s over which the interval is taken
+STEADY_SHARE = 0.005      # by which it is another than the median: rows are lost
+EVEN_SHARE = 0.3          # share of the intervals that are within a quarter of the median
+EVEN_BESIDE = 5           # rows to either side that tell where a row should be
+FITTING_SHARE = 0.4       # of what rows are off as sent
+ROUNDING_COUNTS = 2.5     # by which a row may be off: rounding
+EVEN_TRAVEL = 1.0         # s within which travel is as good as even
+CATCHING_UP = 3.0         # times the speed beside: no wheel, so rows that catch up
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -36,18 +36,18 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 
     samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list that findings join.
     """
-    if form.quantity == 'rate' or len(t) < 4 * BESIDE:
+    if form.quantity == 'rate' or len(t) < 4 * EVEN_BESIDE:
         return t       # what a late speed adds comes out right by itself
     step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
             else samples.value[1:].astype(float))
     travel = np.concatenate([[0.0], np.cumsum(step)])
     whole = np.issubdtype(samples.value.dtype, np.integer)
     usual = interval(t)
-    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < EVEN:
+    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < EVEN_SHARE:
         return t
-    true = _put_back(t, travel, usual, COUNTS if whole else 0.0)
+    true = _put_back(t, travel, usual, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
-    named = late > max(NAMED, NAMED_SHARE * usual)
+    named = late > max(NAMED_LATE, NAMED_LATE_SHARE * usual)
     if named.any():
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
         found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
@@ -60,26 +60,26 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 def interval(t: Floats) -> float:
     """Return the sender's interval, s, lost and late rows notwithstanding."""
     usual = float(np.median(np.diff(t)))
-    n = min(max(int(SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
+    n = min(max(int(INTERVAL_SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
     mean = float(np.median(t[n:] - t[:-n])) / n
-    return mean if abs(mean - usual) < STEADY * usual else usual
+    return mean if abs(mean - usual) < STEADY_SHARE * usual else usual
 
 
 def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     """Return times with late rows put back."""
-    from scipy.ndimage import minimum_filter1d
     rows = usual * np.arange(len(t))
-    ahead = int(WINDOW / usual) + 1
+    ahead = int(ON_TIME_WINDOW / usual) + 1
     # those to come, not those before: a lost row sets the rhythm back
-    even = rows + minimum_filter1d(t - rows, ahead, origin=-(ahead // 2), mode='nearest')
-    late = t - even > max(LEAST, SHARE * usual)
+    even = rows + _least_of_next(t - rows, ahead)
+    late = t - even > max(LEAST_LATE, LATE_SHARE * usual)
     off_sent, off_even = _off(t, travel), _off(even, travel)
     true = t.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        about = slice(max(begin - BESIDE, 0), end + BESIDE)
+        about = slice(max(begin - EVEN_BESIDE, 0), end + EVEN_BESIDE)
         sent, put = off_sent[about], off_even[about]
-        if np.abs(put).max() <= least or np.linalg.norm(put) < FITS * np.linalg.norm(sent):
+        fits = np.linalg.norm(put) < FITTING_SHARE * np.linalg.norm(sent)
+        if np.abs(put).max() <= least or fits:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
             true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
@@ -87,10 +87,19 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     return np.where((true > floor) | ~late, true, np.minimum(floor, t))
 
 
+def _least_of_next(x: Floats, count: int) -> Floats:
+    """Return the least of each value and those after it, so many in all."""
+    n, count = len(x), min(count, len(x))       # a wild interval asks for any number
+    blocks = np.append(x, np.full(count - n % count + count, np.inf)).reshape(-1, count)
+    since = np.minimum.accumulate(blocks, axis=1).ravel()       # from its block's first
+    until = np.minimum.accumulate(blocks[:, ::-1], axis=1)[:, ::-1].ravel()   # to its last
+    return np.minimum(until[:n], since[count - 1:count - 1 + n])
+
+
 def _off(t: Floats, travel: Floats) -> Floats:
     """Return by how much each row's travel is off that of the rows some way before and after."""
     k = np.arange(len(t))
-    before, after = np.maximum(k - BESIDE, 0), np.minimum(k + BESIDE, len(t) - 1)
+    before, after = np.maximum(k - EVEN_BESIDE, 0), np.minimum(k + EVEN_BESIDE, len(t) - 1)
     share = (t - t[before]) / np.maximum(t[after] - t[before], 1e-9)
     return travel - travel[before] - share * (travel[after] - travel[before])
 
@@ -104,8 +113,8 @@ def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Float
         size: float = abs(travel[last] - travel[first]) / max(t[last] - t[first], usual / 10)
         return size
 
-    beside = max(speed(a - BESIDE, a), speed(b, b + BESIDE))
-    if t[b] - t[a] > SHORT or not beside or speed(a + 1, b) < FAST * beside:
+    beside = max(speed(a - EVEN_BESIDE, a), speed(b, b + EVEN_BESIDE))
+    if t[b] - t[a] > EVEN_TRAVEL or not beside or speed(a + 1, b) < CATCHING_UP * beside:
         return t[rows]
     # some rows of the burst are lost, so that its rhythm tells nothing
     by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])

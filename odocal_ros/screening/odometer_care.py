@@ -13,18 +13,16 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples, take
-from odocal_ros.nav.odometer import Travel
+from odocal_ros.nav.gaps import MISSING_INTERVALS
+from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import speed_glitches
 
-ENOUGH = 20          # steps below which nothing is judged
-JUMP = 5.0           # times the 95th percentile of the moving rate: no motion
-EXCURSION = 30.0     # s after which a counter that comes back is no longer taken for the same
-MOST_JUMPS = 200     # beyond it the counter is not mended, but judged by the check
-GAP = 2.5            # median intervals: a message or more is missing
-BESIDE = 5           # steps beside a jump or a gap that tell the speed there
-MORE = 1.5           # times what rows tell: as long a way at speeds sent as zero is a dead band's
-LOOSE = 0.5          # of the travel expected by the speed beside: what still goes on
+EXCURSION_TIME = 30.0     # s after which a counter that comes back is no longer taken for the same
+MOST_JUMPS = 200          # beyond it the counter is not mended, but judged by the check
+STEPS_BESIDE = 5    # steps beside a jump or a gap that tell the speed there
+DEAD_BAND_WAY = 1.5   # times what rows tell: as long a way at speeds sent as zero is a dead band's
+GOES_ON_SHARE = 0.5       # of the travel expected by the speed beside: what still goes on
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -66,13 +64,13 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
     false = np.zeros(len(t), bool)
     step = counter_steps(value, modulus)
-    if len(step) < ENOUGH or not step.any():
+    if len(step) < FEWEST_STEPS or not step.any():
         return false
     dt = np.diff(t)
     rate = step / np.maximum(dt, np.median(dt))
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
-    jumps = np.flatnonzero(size > max(JUMP * top, 3 / np.median(dt))).tolist()
+    jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
     if len(jumps) > MOST_JUMPS:
         return false
     done = -1
@@ -80,7 +78,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
         if j <= done:
             continue
         stall = _stall(step, j)
-        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= EXCURSION]
+        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= EXCURSION_TIME]
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
             if _goes_on(t, net, rate, a, b) or a == j and _comes_back(t, net, step, a, b, top):
@@ -93,8 +91,9 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
 def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     """Tell whether the counter after step b goes on from before step a at speeds as beside."""
     length = t[b + 1] - t[a]
-    ways = [_usual(r) * length for r in (rate[max(0, a - BESIDE):a], rate[b + 1:b + 1 + BESIDE])]
-    slack = LOOSE * max(abs(w) for w in ways) + 3
+    ways = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
+                                         rate[b + 1:b + 1 + STEPS_BESIDE])]
+    slack = GOES_ON_SHARE * max(abs(w) for w in ways) + 3
     return bool(min(ways) - slack <= net <= max(ways) + slack)
 
 
@@ -107,7 +106,7 @@ def _comes_back(t: Floats, net: float, step: Floats, a: int, b: int, top: float)
 def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Floats, Floats]:
     """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
     none = np.empty(0)
-    if len(way.t) < ENOUGH:
+    if len(way.t) < FEWEST_STEPS:
         return way, none, none
     dt, step = np.diff(way.t), np.diff(way.s)
     usual = np.median(dt)
@@ -117,12 +116,13 @@ def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Flo
         odd = np.flatnonzero(np.abs(np.abs(step) - np.abs(sent)) > 1e-6 * np.abs(sent) + 1e-9)
         # a reset: of the travel since the last count nothing is known but the speeds beside
         stall = [_stall(step, k) for k in odd.tolist()]
-        most = [max(abs(_usual(rate[max(0, a - BESIDE):a])), abs(_usual(rate[k + 1:][:BESIDE])))
+        most = [max(abs(_usual(rate[max(0, a - STEPS_BESIDE):a])),
+                    abs(_usual(rate[k + 1:][:STEPS_BESIDE])))
                 * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
         return way, way.t[odd], np.array(most) / np.sqrt(3)
-    odd = np.flatnonzero(dt > max(GAP * usual, 0.2))
-    before = np.array([_usual(rate[max(0, k - BESIDE):k]) for k in odd])
-    after = np.array([_usual(rate[k + 1:k + 1 + BESIDE]) for k in odd])
+    odd = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
+    before = np.array([_usual(rate[max(0, k - STEPS_BESIDE):k]) for k in odd])
+    after = np.array([_usual(rate[k + 1:k + 1 + STEPS_BESIDE]) for k in odd])
     missing = dt[odd] - (usual if form.quantity == 'increment' else 0.0)
     if form.quantity == 'increment' and len(odd):
         step = step.copy()
@@ -152,15 +152,15 @@ def _hidden(way: Travel, value: Values) -> Floats:
     least = 2 * way.coarse.step if way.coarse else 0.0
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
-        rows = np.arange(edge, edge - BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
-                                                                          + BESIDE)
+        rows = np.arange(edge, edge - STEPS_BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
+                                                                          + STEPS_BESIDE)
         rows = rows[(rows >= 0) & (rows < len(size))]
         v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
         took = abs(way.t[rows[-1]] - way.t[rows[0]])
         if v > least and change > 0 and took > 0:
             told = v * (way.t[edge + 1] - way.t[edge]) / 2
             whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
-            hidden[edge] = whole - told if whole > MORE * told else 0.0
+            hidden[edge] = whole - told if whole > DEAD_BAND_WAY * told else 0.0
     return hidden
 
 

@@ -5,7 +5,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 
-STILL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}  # counts, rad, m: less is not called motion
+# counts, rad, m: less is not called motion
+STILL_TRAVEL = {'m/pulse': 2.0, 'm/rad': 0.02, '1': 0.02}
 
 
 class Steps:
@@ -18,7 +19,7 @@ class Steps:
     @property
     def still(self) -> float:
         """Return the travel up to which one that stands may seem to move."""
-        return STILL.get(self.form.scale_unit, 0.02)
+        return STILL_TRAVEL.get(self.form.scale_unit, 0.02)
 
     def of(self, block: OdometerSamples) -> tuple[Floats, Ints, Floats]:
         """Return the step of each row since the row before, its stamp, ns, and its duration, s."""

@@ -16,20 +16,20 @@ from odocal_ros.nav.integral import integral_at, twice_integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
-STEP = 0.1          # s, grid
-HALF = 0.6          # s each side that accelerations are taken over
-LONGEST = 12.0      # s after a stop that are looked at: longer, and the tilt wanders
-BEFORE = 1.0        # s of the stop that belong to it
-STANDS = 0.02       # of the top speed: below it is a stop
-COUNTS = 20.0       # counts a second at top speed, below which a counter shows no acceleration
-SURE = 5.0          # sigmas
-LEAST = 1.0         # m of way
-TWICE = (0.8, 1.2)  # of twice the way, that a stretch slips by
+REVERSING_STEP = 0.1          # s, grid
+PUSH_TIME = 0.6            # s each side that accelerations are taken over
+LONGEST_START = 12.0          # s after a stop that are looked at: longer, and the tilt wanders
+STOP_BEFORE = 1.0             # s of the stop that belong to it
+STANDS_OF_TOP = 0.02          # of the top speed: below it is a stop
+COUNTS_AT_TOP = 20.0    # counts a second at top speed, below which a counter shows no acceleration
+LEAST_BACKWARDS = 1.0         # m of way
+TWICE_THE_WAY = (0.8, 1.2)    # of twice the way, that a stretch slips by
 BY_IMU = 'the Imu is pushed the other way than at the other starts'
 BY_FIT = 'Imu and fixes go back'
-SHOWN = 3           # stretches told in the sentence
-ALIKE = (0.5, 2.0)  # of the usual ratio: a start that is like the others
+MOST_TOLD = 3         # stretches told in the sentence
+USUAL_RATIO = (0.5, 2.0)    # of the usual ratio: a start that is like the others
 
 
 def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
@@ -55,8 +55,9 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     none = np.empty((0, 2))
     if len(travel.t) < 3 or len(t_imu) < 3:
         return none
-    t = np.arange(max(travel.t[0], t_imu[0]) + HALF, min(travel.t[-1], t_imu[-1]) - HALF, STEP)
-    if len(t) < 2 * (BEFORE + HALF) / STEP:
+    t = np.arange(max(travel.t[0], t_imu[0]) + PUSH_TIME,
+                  min(travel.t[-1], t_imu[-1]) - PUSH_TIME, REVERSING_STEP)
+    if len(t) < 2 * (STOP_BEFORE + PUSH_TIME) / REVERSING_STEP:
         return none
     begins, ends = _stretches(t, travel)
     if len(begins) < 2:
@@ -66,17 +67,17 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     ratio, sigma = np.array([_ratio(t, push, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
     way = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
-    clear = np.abs(ratio) > SURE * sigma
+    clear = np.abs(ratio) > FAULT_SIGMAS * sigma
     onward = np.sign((way * np.sign(ratio))[clear].sum())
     usual = clear & (np.sign(ratio) == onward)
     if not onward or not usual.any():
         return none
     level = np.median(np.abs(ratio[usual]))
-    back = clear & ~usual & (np.abs(ratio) > ALIKE[0] * level) & (
-        np.abs(ratio) < ALIKE[1] * level)
+    back = clear & ~usual & (np.abs(ratio) > USUAL_RATIO[0] * level) & (
+        np.abs(ratio) < USUAL_RATIO[1] * level)
     back &= (t[ends] > between[0]) & (t[begins] < between[1])
     # the grid's last step still moves
-    return np.stack([t[begins[back]] - HALF, t[ends[back]] + HALF], -1)
+    return np.stack([t[begins[back]] - PUSH_TIME, t[ends[back]] + PUSH_TIME], -1)
 
 
 def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: float) -> Floats:
@@ -86,15 +87,15 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
     slips : of the smoother, dicts of t and duration, s, and metres that the wheel turned beyond
     the ground.   A wheel that spins on the spot slips by its way once.
     """
-    t = np.arange(travel.t[0] + HALF, travel.t[-1] - HALF, STEP)
+    t = np.arange(travel.t[0] + PUSH_TIME, travel.t[-1] - PUSH_TIME, REVERSING_STEP)
     begins, ends = _stretches(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
-    spans = np.stack([t[begins] - HALF, t[ends] + HALF], -1)
+    spans = np.stack([t[begins] - PUSH_TIME, t[ends] + PUSH_TIME], -1)
     way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
     slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
-    twice = slipped / np.maximum(2 * way, LEAST)
-    return spans[(way > LEAST) & (twice > TWICE[0]) & (twice < TWICE[1])]
+    twice = slipped / np.maximum(2 * way, LEAST_BACKWARDS)
+    return spans[(way > LEAST_BACKWARDS) & (twice > TWICE_THE_WAY[0]) & (twice < TWICE_THE_WAY[1])]
 
 
 def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
@@ -111,57 +112,57 @@ def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: 
     way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
     each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
             for (a, b), m in zip(spans.tolist(), way.tolist(), strict=True)]
-    more = f' and {len(each) - SHOWN} more' if len(each) > SHOWN else ''
+    more = f' and {len(each) - MOST_TOLD} more' if len(each) > MOST_TOLD else ''
     times = f'{len(each)} time{"s" * (len(each) > 1)}'
     return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen}, and the odometer counts on: the '
-                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:SHOWN])}'
+                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:MOST_TOLD])}'
                    f'{more}'),)
 
 
 def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     """Return the first and the last step of each stretch between stops that begins with one."""
-    speed = np.abs(travel.at(t + HALF / 2) - travel.at(t - HALF / 2)) / HALF
+    speed = np.abs(travel.at(t + PUSH_TIME / 2) - travel.at(t - PUSH_TIME / 2)) / PUSH_TIME
     top = np.percentile(speed, 95)
-    if top == 0.0 or top < COUNTS * travel.quantum:
+    if top == 0.0 or top < COUNTS_AT_TOP * travel.quantum:
         return np.empty(0, int), np.empty(0, int)
-    stands = speed <= max(1.01 * travel.quantum / HALF, STANDS * top)
+    stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, STANDS_OF_TOP * top)
     edge = np.flatnonzero(np.diff(stands.astype(int)))
     begins = edge[stands[edge]] + 1
     ends = np.append(edge[~stands[edge]], len(t) - 1)
     ends = ends[np.searchsorted(ends, begins)]
-    long = (ends - begins) * STEP > 2 * HALF
+    long = (ends - begins) * REVERSING_STEP > 2 * PUSH_TIME
     return begins[long], ends[long]
 
 
 def _second(t: Floats, t_in: Floats, s: Floats) -> Floats:
-    """Return the second difference of s over HALF each side, per s^2."""
-    before, here, after = (np.interp(t + d, t_in, s) for d in (-HALF, 0.0, HALF))
-    return (before - 2 * here + after) / HALF**2
+    """Return the second difference of s over PUSH_TIME each side, per s^2."""
+    before, here, after = (np.interp(t + d, t_in, s) for d in (-PUSH_TIME, 0.0, PUSH_TIME))
+    return (before - 2 * here + after) / PUSH_TIME**2
 
 
 class _Forces:
     """
     Integrals of the Imu's rows at the steps of a grid t: (m,).
 
-    turned, speed : (m, 3) of w and f.   speed_before : (m, 3), HALF before.   push : (m,) second
-    difference of the way that f_x makes.
+    turned, speed : (m, 3) of w and f.   speed_before : (m, 3), PUSH_TIME before.
+    push : (m,) second difference of the way that f_x makes.
     """
 
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
         self.turned = integral_at(t, t_imu, w_b)
-        self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-HALF, 0.0))
+        self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-PUSH_TIME, 0.0))
         before, here, after = (twice_integral_at(t + d, t_imu, f_b[:, 0])
-                               for d in (-HALF, 0.0, HALF))
-        self.push = (before - 2 * here + after) / HALF**2
+                               for d in (-PUSH_TIME, 0.0, PUSH_TIME))
+        self.push = (before - 2 * here + after) / PUSH_TIME**2
 
 
 def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
     """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
-    low = max(0, a - round((BEFORE + HALF) / STEP))
-    high = min(len(t), b + 1, a + round(LONGEST / STEP))
+    low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
+    high = min(len(t), b + 1, a + round(LONGEST_START / REVERSING_STEP))
     span = t[low:high]
     # which way is up, at rest: as the vehicle pitches, gravity goes into x or out of it
-    rest = force.speed_before[low], force.speed[max(a - round(HALF / STEP), 0)]
+    rest = force.speed_before[low], force.speed[max(a - round(PUSH_TIME / REVERSING_STEP), 0)]
     up = (rest[1] - rest[0]) / max(np.linalg.norm(rest[1] - rest[0]), 1e-9)
     turn = force.turned[low:high] - force.turned[low]
     tilt = turn[:, 2] * up[1] - turn[:, 1] * up[2]
@@ -170,5 +171,5 @@ def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[flo
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     spread = np.linalg.inv(A.T @ A + 1e-12 * np.eye(3))[0, 0]
     left = float(np.sqrt(np.mean((y - A @ x)**2)))
-    alike = 2 * HALF / STEP          # neighbours share their samples
+    alike = 2 * PUSH_TIME / REVERSING_STEP          # neighbours share their samples
     return float(x[0]), left * float(np.sqrt(alike * spread)) + 1e-12

@@ -12,9 +12,9 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import (
     about_clumps,
     beyond,
-    DAMAGED,
+    DAMAGED_SHARE,
     imu_glitches,
-    SEVERAL,
+    SEVERAL_ROWS,
     speed_glitches,
 )
 from odocal_ros.settings.config import Config
@@ -91,7 +91,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
                                 f'{LABEL[slot]} messages {what}, first at '
                                 f'{_where(samples, first, leg)}; dropped'))
     good = stamped & finite
-    suspect = _damaged(wild, good, slot, found, min(DAMAGED * len(wild), SEVERAL))
+    suspect = _damaged(wild, good, slot, found, min(DAMAGED_SHARE * len(wild), SEVERAL_ROWS))
     return good & ~suspect, wild
 
 

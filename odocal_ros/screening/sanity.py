@@ -5,17 +5,20 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_row, medians
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
 
 AXES = 'xyz'
+RAD_PER_DEG = float(np.deg2rad(1.0))
 # nothing follows from such an Imu; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
-MAX_RATE = 8.0       # rad/s: no road vehicle turns so fast
-NOTHING = 0.01       # m/s^2, far below what gravity is in any unit
-TILT = np.deg2rad(30.0)   # a body frame more tilted than this is not forward-left-up
+MAX_RATE = 8.0                  # rad/s: no road vehicle turns so fast
+NO_GRAVITY = 0.01               # m/s^2, far below what gravity is in any unit
+MOST_TILT = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
 
 
-def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats) -> tuple[tuple[Reason, ...], bool]:
+def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats,
+               imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
     """
     Judge units and axes of an Imu.
 
@@ -25,6 +28,8 @@ def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats) -> tuple[tuple[Reason, ..
         Specific force, m/s^2, and turn rate, rad/s, in the configured body frame.
     C_bi : (3, 3)
         Nominal rotation configured.
+    imu : ImuConfig
+        Its scales are in the figures already.
 
     Returns
     -------
@@ -40,26 +45,27 @@ def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats) -> tuple[tuple[Reason, ..
     if not by_row(lambda w: w.any(axis=1), w_b).any():       # what messages hold that have none
         reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '
                               'imu.gyro_scale is 0'))
-    if size < NOTHING:
+    if size < NO_GRAVITY:
         reasons.append(Reason(Code.NO_IMU, 'there is no gravity in the acceleration: the Imu '
                               'sends none, or without gravity, or imu.accel_scale is 0'))
         return tuple(reasons), False
     if not 0.85 * G < size < 1.15 * G:
         if 0.85 < size < 1.15:
-            what = f'the Imu shows {size:.3f} at rest, as g would: set imu.accel_scale to 9.80665'
+            what = (f'the Imu shows {size:.3f} at rest, as g would: set imu.accel_scale to '
+                    f'{9.80665 * imu.accel_scale:.10g}')
         else:
             what = f'the Imu shows a gravity of {size:.3g} m/s^2 instead of 9.8'
         reasons.append(Reason(Code.IMU_UNITS, what))
     if fast > MAX_RATE:
         reasons.append(Reason(Code.IMU_UNITS, f'the gyro shows {fast:.3g} rad/s, faster than a '
                               'vehicle turns, as deg/s would: set imu.gyro_scale to '
-                              '0.017453292519943295'))
+                              f'{imu.gyro_scale * RAD_PER_DEG!r}'))
     up = mean / size
-    if up[2] > np.cos(TILT):
+    if up[2] > np.cos(MOST_TILT):
         return tuple(reasons), False
     axis = int(np.argmax(np.abs(up)))
     seen = f'gravity shows on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
-    if up[2] < -np.cos(TILT) and np.allclose(C_bi, np.eye(3)):
+    if up[2] < -np.cos(MOST_TILT) and np.allclose(C_bi, np.eye(3)):
         reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{seen}: taken as forward-right-down'))
         return tuple(reasons), True
     reasons.append(Reason(Code.IMU_AXES, f'{seen}: the body frame is not forward-left-up'))

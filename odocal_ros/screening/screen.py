@@ -151,12 +151,6 @@ def _offsets(config: Config) -> dict[str, float]:
             'fix_velocity': gnss, 'heading': -imu}
 
 
-
-
-
-
-
-
 def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
     """Name the longest gap of odometer or fixes where it is far beyond their own rhythm."""
     gaps = gaps_in_rhythm(t)

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.samples import OdometerSamples
+from odocal_ros.nav.odometer import FEWEST_STEPS
 from odocal_ros.reasons import Code, Reason
 
-REACH = 7              # steps each side of the running median that tells the step a jump replaced
-LEAST = 8.0            # counts, smallest jump against the way
-ENOUGH = 20            # steps below which nothing is judged
-FEW = 3                # jumps of one size that make a span which is no power of two
-SURE = 0.01            # of the span, slack up to which one jump makes a power of two
-ALIKE = 0.8            # share of the jumps that must agree
+MEDIAN_REACH = 7    # steps each side of the running median that tells the step a jump replaced
+LEAST_JUMP = 8.0         # counts, smallest jump against the way
+FEWEST_JUMPS = 3         # jumps of one size that make a span which is no power of two
+POWER_SLACK = 0.01       # of the span, slack up to which one jump makes a power of two
+SAME_SPAN_SHARE = 0.8    # share of the jumps that must agree
 SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
-NAMED = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
+NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +41,13 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
 
     value : (n,) as sent.   step : (n - 1,) its steps, known rollovers undone.
     """
-    if len(step) < ENOUGH or not step.any():
+    if len(step) < FEWEST_STEPS or not step.any():
         return None
     usual = _running_median(step)
     whole = np.issubdtype(value.dtype, np.integer)
     off = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
-    far = np.abs(off) > np.maximum(2 * np.abs(usual) + LEAST * whole, 1.5 * top)
+    far = np.abs(off) > np.maximum(2 * np.abs(usual) + LEAST_JUMP * whole, 1.5 * top)
     rows = np.flatnonzero(far & (off * usual <= 0))      # a hung counter catches up along the way
     if not len(rows):
         return None
@@ -58,23 +58,24 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     known = float(spans[np.argmin(np.abs(spans - middle))])
     typical = float(np.median(slack))
     sigma = 0.0
-    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < SURE * known):
+    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < POWER_SLACK * known):
         span = known
-    elif len(rows) >= FEW:
+    elif len(rows) >= FEWEST_JUMPS:
         span, sigma = _measured(value, rows, middle, typical) if whole else (
             middle, typical / np.sqrt(3 * len(rows)))
     else:
         return None
     agree = np.abs(size - span) <= 2 * slack
-    if agree.mean() < ALIKE:
+    if agree.mean() < SAME_SPAN_SHARE:
         return None
     rows = rows[agree]
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
 
 
 def _running_median(step: Floats) -> Floats:
-    padded = np.pad(step, REACH, mode='edge')
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1), axis=-1)
+    padded = np.pad(step, MEDIAN_REACH, mode='edge')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_REACH + 1)
+    return np.median(windows, axis=-1)
 
 
 def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[float, float]:
@@ -117,7 +118,7 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     size = round(span.size) if np.issubdtype(samples.value.dtype, np.integer) else span.size
     value: NDArray[Any] = samples.value + size * np.cumsum(turns)
     times = len(span.rows)
-    about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED.get(
+    about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
     found = Reason(Code.WHEEL_COUNTERS_DIFFER, f"the {side} wheel's count rolls over at {about}, "
                    f'which its message type does not tell: {times} jump{"s" * (times > 1)} of '

@@ -11,16 +11,16 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.glitches import ROLLS
 from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, runs, TUKEY
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
-CELL = 0.5            # s
-STILL = 0.02          # of the other wheel's way: what still counts as not moving
-ROLLS = 0.1           # of the top speed, from where on a wheel rolls for certain
-HANG = 2.0            # s without a count while the other wheel rolls; shorter is slip
-COUNTS = 8            # the other wheel makes meanwhile, at least
-AGAINST = 1.5         # s of counting against the other wheel
-SURE = 5.0            # sigmas
-BIAS = 0.02           # of the top speed: what a gyro bias times the track width may be, 1 sigma
+FAULT_GRID = 0.5          # s
+STILL_SHARE = 0.02        # of the other wheel's way: what still counts as not moving
+HANG_TIME = 2.0           # s without a count while the other wheel rolls; shorter is slip
+OTHER_WHEEL_COUNTS = 8    # the other wheel makes meanwhile, at least
+AGAINST_TIME = 1.5        # s of counting against the other wheel
+BIAS_OF_TOP = 0.02    # of the top speed: what a gyro bias times the track width may be, 1 sigma
 SIDES = ('left', 'right')
 
 
@@ -43,15 +43,15 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
     Reasons, at most one of each code.
 
     """
-    two = pair(left, right, imu, between, CELL)
+    two = pair(left, right, imu, between, FAULT_GRID)
     if two is None:
         return ()
     steps = np.diff([two.left, two.right])          # (2, n)
     way = np.abs(steps).sum(axis=1)
     weak = int(np.argmin(way))
-    if way.max() <= COUNTS * two.quantum or way.max() == 0.0:
+    if way.max() <= OTHER_WHEEL_COUNTS * two.quantum or way.max() == 0.0:
         return ()                                   # neither moves: the odometer is still
-    if way[weak] <= STILL * way.max():
+    if way[weak] <= STILL_SHARE * way.max():
         return (Reason(Code.WHEEL_DEAD, f'the {SIDES[weak]} wheel does not count '
                        f'({way[weak]:.6g} against {way.max():.6g} of the '
                        f'{SIDES[1 - weak]} one): the mean of both is no travel'),)
@@ -64,7 +64,7 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
     keep = two.known & ~hung & _rolling(steps, two.quantum).any(axis=0)
     if keep.sum() < 10:
         return _dead(two, steps, held)
-    A = np.stack([steps[0], turn, np.full(len(turn), CELL)], -1)
+    A = np.stack([steps[0], turn, np.full(len(turn), FAULT_GRID)], -1)
     x, covariance = _line(A[keep], steps[1][keep], _floor(two, steps))
     held = [_not_pivoting(held[k], steps, A, x, k) for k in (0, 1)]
     return _dead(two, steps, held) + _reversed(two, steps, A @ x, x[0], covariance[0, 0],
@@ -80,7 +80,7 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     rolls = A[:, 0] != 0
     usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
-    drift = BIAS * float(np.percentile(np.abs(y), 95)) / CELL
+    drift = BIAS_OF_TOP * float(np.percentile(np.abs(y), 95)) / FAULT_GRID
     fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
     scale = TUKEY * min(sigma for _, _, sigma in fits)
@@ -100,11 +100,11 @@ def _rolling(steps: Floats, quantum: float) -> Bools:
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
-    """Tell in which cells wheel k stands, for HANG or longer, while the other one rolls."""
+    """Tell in which cells wheel k stands, for HANG_TIME or longer, while the other one rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
-    still: Bools = two.known & (own <= STILL * other) & _rolling(steps, two.quantum)[1 - k]
+    still: Bools = two.known & (own <= STILL_SHARE * other) & _rolling(steps, two.quantum)[1 - k]
     for a, b in runs(still):
-        if (b - a) * CELL < HANG or other[a:b].sum() < COUNTS * two.quantum:
+        if (b - a) * FAULT_GRID < HANG_TIME or other[a:b].sum() < OTHER_WHEEL_COUNTS * two.quantum:
             still[a:b] = False
     return still
 
@@ -132,14 +132,14 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
     first, last = spans[0][0], spans[-1][1]
     other = np.abs(steps[1 - k])
     lost = other[held[k]].sum()
-    after = np.abs(steps[k][last:]).sum() <= STILL * other[last:].sum() + two.quantum
-    within = np.abs(steps[k][first:]).sum() <= STILL * other[first:].sum() + two.quantum
+    after = np.abs(steps[k][last:]).sum() <= STILL_SHARE * other[last:].sum() + two.quantum
+    within = np.abs(steps[k][first:]).sum() <= STILL_SHARE * other[first:].sum() + two.quantum
     begin = two.t[first]
     if within:
         where = f'from t = {begin:.1f} s on'
     else:
         where = f'{len(spans)} time{"s" * (len(spans) > 1)}, first from t = {begin:.1f} s for ' \
-                f'{(spans[0][1] - first) * CELL:.1f} s'
+                f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
         where += f', at last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
             after and len(spans) > 1)
     return (Reason(Code.WHEEL_DEAD, f'the {SIDES[k]} wheel does not count {where} while the '
@@ -149,7 +149,7 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
 def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,
               imu: Imu) -> tuple[Reason, ...]:
     """Return WHEEL_REVERSED where the right wheel goes against what left wheel and gyro say."""
-    if ratio < -SURE * np.sqrt(variance) and ratio < -0.1:
+    if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
         k = _against_imu(two, steps, imu)
         which = (f'the {SIDES[k]} wheel counts down when the vehicle drives forward, the '
                  f'{SIDES[1 - k]} one up' if k is not None else
@@ -158,16 +158,16 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
         return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is no travel'),)
     rolling = _rolling(np.stack([expected, steps[1]]), two.quantum).all(axis=0)
     against = two.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
-    spans = [(a, b) for a, b in runs(against) if (b - a) * CELL >= AGAINST]
+    spans = [(a, b) for a, b in runs(against) if (b - a) * FAULT_GRID >= AGAINST_TIME]
     if ratio <= 0 or not spans:
         return ()
     back = [-step[step < 0].sum() for step in steps]
-    unsigned = [k for k in (0, 1) if back[k] <= 3 * two.quantum + STILL * back[1 - k]]
+    unsigned = [k for k in (0, 1) if back[k] <= 3 * two.quantum + STILL_SHARE * back[1 - k]]
     which = (f'the {SIDES[unsigned[0]]} wheel counts up in reverse gear too' if len(unsigned) == 1
              else 'one wheel counts up while the other counts down')
     a, b = spans[0]
     return (Reason(Code.WHEEL_REVERSED, f'{which}: {len(spans)} time{"s" * (len(spans) > 1)}, '
-                   f'first at t = {two.t[a]:.1f} s for {(b - a) * CELL:.1f} s'),)
+                   f'first at t = {two.t[a]:.1f} s for {(b - a) * FAULT_GRID:.1f} s'),)
 
 
 def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
@@ -176,7 +176,7 @@ def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
     push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
     push = push - np.median(push)
     score = [_correlation(np.diff(step), push) for step in steps]
-    if score[0] * score[1] < 0 and min(np.abs(score)) > SURE:
+    if score[0] * score[1] < 0 and min(np.abs(score)) > FAULT_SIGMAS:
         return int(np.argmin(score))
     return None
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.pieces import medians
+from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
-TUKEY = 4.685        # robust sigmas beyond which a row has no weight
-PASSES = 20
-GAP = 5.0            # median intervals: what lies within is not known
+TUKEY = 4.685    # robust sigmas beyond which a row has no weight
+TUKEY_PASSES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def pair(left: Travel, right: Travel, imu: Imu, between: tuple[float, float], st
     known = np.ones(len(t) - 1, bool)
     for times in (left.t, right.t, t_imu):
         gap = np.diff(times)
-        for k in np.flatnonzero(gap > max(GAP * np.median(gap), 0.2)):
+        for k in np.flatnonzero(gap > max(GAP_INTERVALS * np.median(gap), 0.2)):
             known &= (t[1:] < times[k]) | (t[:-1] > times[k + 1])
     for at in doubt_t:
         known &= (t[1:] < at - step) | (t[:-1] > at + step)
@@ -95,13 +95,13 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     weak = np.zeros(A.shape[1]) if prior is None else 1 / (np.asarray(prior) * size)**2
     weight, sigma = np.ones(len(y)), 0.0
     x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * size
-    for turn in range(PASSES):
+    for turn in range(TUKEY_PASSES):
         if turn or start is not None:
             residual = y - A @ x
             sigma = max(float(np.median(np.abs(residual))) / 0.6745, floor)
             u = residual / (TUKEY * sigma)
             # absolute values first (Huber): without a start Tukey's weights may settle anywhere
-            huber = start is None and turn < PASSES // 2
+            huber = start is None and turn < TUKEY_PASSES // 2
             weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
                 np.abs(u) < 1, (1 - u**2)**2, 0.0)
         H = (A * weight[:, None]).T @ A + np.diag(weak * max(sigma, floor)**2 + 1e-12 * len(y))

@@ -1,7 +1,7 @@
 """
 Settings: each one written once with its default, unit, range and meaning.
 
-ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and the README's table are all
+ROS parameters, ``config/calibrator.yaml``, ``--config``, ``--set`` and docs/settings.md are all
 made from these dataclasses. A setting's name is ``group.field``, as its ROS parameter's.
 """
 
@@ -9,6 +9,14 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+from odocal_ros.errors import BadConfig
+from odocal_ros.settings.output_config import (
+    FramesConfig,
+    JournalConfig,
+    OutputConfig,
+    PublishConfig,
+    UpdaterConfig,
+)
 from odocal_ros.settings.setting import (
     setting,
     settings_of as settings_of,  # for others too: they are its other half
@@ -17,8 +25,8 @@ from odocal_ros.settings.setting import (
 
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 HEADING_SOURCES = ('auto', 'gyrocompass', 'imu_orientation', 'heading_topic', 'course', 'fixed')
-FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
-           'report')
+# results that limits may be set for
+ACCEPTED = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
 NAN = math.nan
 
 
@@ -164,7 +172,7 @@ class WheelsConfig:
     radius: float = setting(0.0, 'm', 0.0, 10.0, about='Nominal wheel radius; 0: unknown.')
     pulses_per_revolution: float = setting(0.0, 'pulses', 0.0, 1e9, about='Pulses per turn of the '
                                            'wheel; with the radius it gives the nominal scale.')
-    radius_range: float = setting(0.0, '1', 0.0, 0.9, about="Half of the range searched about "
+    radius_range: float = setting(0.0, '1', 0.0, 0.9, about='Half of the range searched about '
                                   "each wheel's nominal factor, relative: twice the stated error; "
                                   '0: 0.05.')
     heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half of the range searched about '
@@ -199,45 +207,37 @@ class VerdictConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutputConfig:
-    directory: str = setting('', about='Where results go; empty: odocal/ and the full name of '
-                             'the node in $ROS_HOME (~/.ros/odocal/calibrator)'
-                             '.')
-    autosave: bool = setting(True, about='Write the result files after every leg that is not '
-                             'rejected.')
-    automatic_kept: int = setting(100, '', 0, 10**6, about='Result folders that are kept of those '
-                                  'written with leg.automatic; the oldest go first, but never '
-                                  'what latest shows and the newest good one. 0: all.')
-    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
-                                       'calibration.json.')
+class AcceptConfig:
+    scale_factor_min: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
+        'Least scale factor that passes: value minus 2 sigma must not lie below. NaN: not asked.'))
+    scale_factor_max: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
+        'Greatest one: value plus 2 sigma must not lie above.'))
+    scale_ratio_min: float = setting(NAN, '1', about='The same of the scale factor over the '
+                                     'nominal one.')
+    scale_ratio_max: float = setting(NAN, '1', about='The same.')
+    yaw_mounting_angle_min: float = setting(NAN, 'rad', about='The same of the yaw mounting '
+                                            'angle.')
+    yaw_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
+    pitch_mounting_angle_min: float = setting(NAN, 'rad', about='The same of the pitch mounting '
+                                              'angle.')
+    pitch_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
+    strict: bool = setting(False, about='A result with a caution does not pass: it is undecided.')
 
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.limits.items():
+            if not low < high:
+                raise BadConfig(f'accept.{name}_min = {low:g} is not below accept.{name}_max = '
+                                f'{high:g}')
 
-@dataclass(frozen=True, kw_only=True)
-class JournalConfig:
-    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk for the journals of legs '
-                             '(journal/ under output.directory); the oldest go first. 0: no '
-                             'journal.')
-
-
-@dataclass(frozen=True, kw_only=True)
-class PublishConfig:
-    rate: float = setting(2.0, 'Hz', 0.1, 20.0, ro=True, about='Rate of the status message.')
-
-
-@dataclass(frozen=True, kw_only=True)
-class FramesConfig:
-    base: str = setting('base_link', ro=True, frame=True,
-                        about='Vehicle frame in the files written.')
-    imu: str = setting('', ro=True, frame=True,
-                       about='Imu frame; empty: that of the Imu messages.')
-    local: str = setting('odocal_enu', ro=True, frame=True,
-                         about='Frame of the published paths.')
-
-
-@dataclass(frozen=True, kw_only=True)
-class UpdaterConfig:
-    period: float = setting(1.0, 's', 0.1, 60.0, ro=True, about='Period of /diagnostics.')
-    use_fqn: bool = setting(False, ro=True, about='Full node name in /diagnostics.')
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Return lower and upper limit by result, of those that have one; the other is inf."""
+        pairs = {name: (getattr(self, f'{name}_min'), getattr(self, f'{name}_max'))
+                 for name in ACCEPTED}
+        return {name: (-math.inf if math.isnan(low) else low,
+                       math.inf if math.isnan(high) else high)
+                for name, (low, high) in pairs.items()
+                if not (math.isnan(low) and math.isnan(high))}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,6 +261,7 @@ class Config:
     wheels: WheelsConfig = WheelsConfig()
     projection: ProjectionConfig = ProjectionConfig()
     verdict: VerdictConfig = VerdictConfig()
+    accept: AcceptConfig = AcceptConfig()
     output: OutputConfig = OutputConfig()
     journal: JournalConfig = JournalConfig()
     publish: PublishConfig = PublishConfig()

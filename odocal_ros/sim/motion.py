@@ -99,7 +99,7 @@ class Motion:
         return float(self._travel(self.duration))
 
     def at(self, t) -> State:
-        """Return the state at (n,) times, s."""
+        """Return the state at times t, (n,) s."""
         t = np.asarray(t, dtype=float)
         node = np.clip(np.searchsorted(self._nodes, t, side='right') - 1, 0, None)
         east, north, up, turned = self._stretch(self._nodes[node], t - self._nodes[node])

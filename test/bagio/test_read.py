@@ -468,3 +468,18 @@ def _unindexed(folder):
     at = data.index(b'index_pos=') + len(b'index_pos=')
     path.write_bytes(data[:at] + bytes(8) + data[at + 8:])
     return path
+
+
+def test_the_frame_is_that_of_the_first_message_that_can_be_read(tmp_path):
+    """Big endian too, which has no layout; frames that are no text are no frames."""
+    little, odd = (bytearray(make.cdr(make.imu(T0, frame=frame))) for frame in ('a é', 'axx'))
+    odd[17] = 0xff
+    for first, wanted in ((little[:40], 'b'), (odd, 'b'), (little, 'a é'),
+                          (make.cdr(make.imu(T0, frame='big'), False), 'big'),
+                          (make.cdr(make.imu(T0, frame='')), '')):
+        path = ros_bags.write(tmp_path / wanted / f'{len(first)}', [
+            ('/imu', T0, bytes(first)), ('/imu', T0 + 1, make.imu(T0 + 1, frame='b'))],
+            types={'/imu': 'sensor_msgs/msg/Imu'})
+        with open_bag(path) as bag:
+            assert bag.frame('/imu') == wanted
+            assert next(m for _, m in bag.messages('/imu')).header.frame_id == wanted

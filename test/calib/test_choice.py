@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from odocal_ros.calib.agreement import disagreements, LOOSE
+from odocal_ros.calib.agreement import disagreements
 from odocal_ros.calib.choice import choose, deciding, passed_over, worth_saying
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 NO_YAW = Reason(Code.YAW_NOT_DETERMINED, 'no turns')
 ALL = with_settings(Config(), {'method': 'all'})
@@ -102,7 +103,7 @@ def test_a_rejected_method_is_named_where_one_behind_it_gives():
 
 
 def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
-    limit = LOOSE * 2**0.5 * 1e-3
+    limit = REMARK_SIGMAS * 2**0.5 * 1e-3
     near = several(method('smoother'), method('two_point', 2.0 + 0.99 * limit))
     far = several(method('smoother'), method('two_point', 2.0 + 1.01 * limit))
     assert disagreements(near) == []

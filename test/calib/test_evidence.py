@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from odocal_ros.calib.evidence import evidence, ROWS
+from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.sections import sections
 from odocal_ros.data.leg import Leg
@@ -74,7 +74,7 @@ def test_way_speed_and_turn_rate():
     np.testing.assert_allclose(found.speed[found.t < 9], 0.0, atol=1e-12)
     assert found.yaw_rate.sum() * 0.02 == pytest.approx(np.pi / 2, rel=0.001)
     np.testing.assert_allclose(found.yaw_rate[steady], 0.0, atol=1e-12)
-    assert len(found.t) <= ROWS
+    assert len(found.t) <= KEPT_ROWS
 
 
 def test_fixes_left_out_are_named_with_the_reason():

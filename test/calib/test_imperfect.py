@@ -8,8 +8,8 @@ import pytest
 from smoother_legs import leg_of, made
 
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.imperfect import believed, weigh_kinds
-from odocal_ros.calib.smoother.state import FAST
+from odocal_ros.calib.smoother.imperfect import mixture_prior, weigh_kinds
+from odocal_ros.calib.smoother.state import FAST_SPEED
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import grade_as_seen, GRADES
@@ -30,7 +30,7 @@ def seen(sigma, error):
 
 def test_weights_are_the_evidence_written_out():
     data, gradient = seen(1e-3, 2e-3)
-    prior, weight = believed(data, np.outer(gradient, gradient), BELIEF)
+    prior, weight = mixture_prior(data, np.outer(gradient, gradient), BELIEF)
     # each error: the value seen is N(0, s^2) where there is none, N(0, s^2 + grade^2) else
     total = 1e-3**2 + GRADE**2
     odds = BELIEF / (1 - BELIEF) * (1e-6 / total * np.exp(4e-6 * (1 / 1e-6 - 1 / total)))
@@ -44,12 +44,12 @@ def test_weights_are_the_evidence_written_out():
 
 def test_a_drive_that_tells_there_is_none_is_believed():
     data, gradient = seen(1e-4, 0.0)
-    prior, weight = believed(data, np.outer(gradient, gradient), BELIEF)
+    prior, weight = mixture_prior(data, np.outer(gradient, gradient), BELIEF)
     assert weight < 0.01
     assert np.sqrt(prior.max()) * GRADE < 2e-5
     # and one that tells nothing is not
     data, gradient = seen(0.1, 0.0)
-    blind, weight = believed(data, np.outer(gradient, gradient), BELIEF)
+    blind, weight = mixture_prior(data, np.outer(gradient, gradient), BELIEF)
     assert weight == pytest.approx(BELIEF, rel=2e-3)
     assert np.sqrt(blind.max()) > 0.8
 
@@ -75,7 +75,7 @@ def test_fixes_that_tell_it_well_are_not_taken_for_telling_that_there_is_none():
     for axis in 'xy':
         found = details[f'accelerometer_scale_{axis}']
         assert abs(found['value'] - error) < 3.0 * found['sigma']
-        # a belief of none that had given way by steps would hold it to less than its grade
+        # a prior of none that had given way by steps would hold it to less than its grade
         assert details['posterior_to_prior'][f'accelerometer_scale_{axis}'] == pytest.approx(
             found['sigma'] / error, rel=0.01)
 
@@ -167,7 +167,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     assert ' 2.0 times as much' in said[Code.FIXES_NOISIER_THAN_SAID]
     assert 'from slow to fast' in said[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']
-    true = 2 * real.speed_law / 36.0**2 * FAST
+    true = 2 * real.speed_law / 36.0**2 * FAST_SPEED
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']
     e = found.estimates['scale_factor']
     assert abs(e.value - drive.truth.scale) < 3.0 * e.sigma

@@ -17,7 +17,7 @@ from odocal_ros.calib.slow_errors import slow_variance
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.reasons import Code
 from odocal_ros.screening.sanity import imu_sanity
-from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config import Config, ImuConfig, with_settings
 from odocal_ros.settings.nominal import nominal_scale
 
 CONFIG = Config()
@@ -58,6 +58,7 @@ def test_a_scale_that_a_mistaken_unit_makes_names_it(kmh, unit, nominal, word, w
              'yaw_mounting_angle': Estimate(None, None, 'rad')}
     (reason,) = judge(found, nominal, CONFIG)
     assert word in reason.text
+    assert ' 1 ' not in reason.text.split(' from')[0]      # a speed's scale has no unit
     if wanted is None:
         assert reason.remedy == Code.SCALE_FAR_FROM_NOMINAL.remedy
     else:
@@ -83,13 +84,13 @@ class TestImu:
     """Gravity and turn rates tell units and axes."""
 
     @staticmethod
-    def say(up, size=9.81, fast=0.1, C_bi=None):
+    def say(up, size=9.81, fast=0.1, C_bi=None, imu=None):
         rng = np.random.default_rng(1)
         f = np.tile(np.asarray(up, float) * size, (2000, 1)) + 0.02 * rng.standard_normal(
             (2000, 3)) * size / 9.81
         w = 0.002 * rng.standard_normal((2000, 3))
         w[500:520, 2] = fast
-        return imu_sanity(f, w, np.eye(3) if C_bi is None else C_bi)
+        return imu_sanity(f, w, np.eye(3) if C_bi is None else C_bi, imu or ImuConfig())
 
     def test_a_sound_imu_says_nothing(self):
         assert self.say([0, 0, 1]) == ((), False)
@@ -106,6 +107,11 @@ class TestImu:
         reasons, _ = self.say([0, 0, 1], fast=20.0)
         assert codes(reasons) == [Code.IMU_UNITS]
         assert '0.017453292519943295' in reasons[0].text
+
+    def test_what_is_set_already_is_in_the_factor(self):
+        imu = ImuConfig(gyro_scale=180 / np.pi, accel_scale=2.0)
+        assert 'set imu.gyro_scale to 1.0' in self.say([0, 0, 1], fast=20.0, imu=imu)[0][0].text
+        assert 'set imu.accel_scale to 19.6133' in self.say([0, 0, 1], 1.0, imu=imu)[0][0].text
 
     def test_z_down_is_turned_over(self):
         reasons, turned = self.say([0, 0, -1])
@@ -124,7 +130,8 @@ class TestImu:
         assert not turned
 
     def test_an_imu_that_shows_nothing_is_no_crash(self):
-        reasons, turned = imu_sanity(np.zeros((50, 3)), np.zeros((50, 3)), np.eye(3))
+        reasons, turned = imu_sanity(np.zeros((50, 3)), np.zeros((50, 3)), np.eye(3),
+                                     ImuConfig())
         assert codes(reasons) == [Code.NO_IMU, Code.NO_IMU]
         assert not turned
 

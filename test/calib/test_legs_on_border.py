@@ -11,8 +11,8 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.joint import joint
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.imperfect import believed_together
-from odocal_ros.calib.smoother.remarks import FLOOR
+from odocal_ros.calib.smoother.imperfect import weighed_together
+from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.calib.smoother.several import combine_legs
 from odocal_ros.calib.wheels.slips import NO_SLIPS
 from odocal_ros.pipeline.combination import combine
@@ -165,7 +165,7 @@ def test_a_leg_without_information_changes_nothing(toy):
     nothing = replace(borders[0], information=np.zeros((5, 5)), pull=np.zeros(5))
     a, b = of(borders), of([nothing, *borders], [0.1, *STEPS])
     assert apart(a.value, b.value, a.covariance) < 1e-9
-    # freedom is a sum of some twenty shares since beliefs are weighed: alike but for rounding
+    # freedom is a sum of some twenty shares since priors are weighed: alike but for rounding
     assert (a.freedom, a.chi2) == (pytest.approx(b.freedom, rel=1e-12),
                                    pytest.approx(b.chi2, rel=1e-6))
 
@@ -181,7 +181,7 @@ def test_chi_square_has_its_mean_and_variance():
     found = [drawn() for _ in range(400)]
     freedom, chi2 = found[0].freedom, np.array([f.chi2 for f in found])
     # ranks 5, 3, 4, 5, 5 and 4 of the walk, less 9 unknowns
-    # (beliefs take up a little of what these are told to)
+    # (priors take up a little of what these are told to)
     assert freedom == pytest.approx(22 + 4 - 9, abs=0.05)
     assert chi2.mean() == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / 400))
     assert chi2.var() == pytest.approx(2 * freedom, rel=0.33)      # 4 sigmas of it
@@ -198,7 +198,7 @@ def test_the_leg_and_the_constant_that_differ_are_named():
     constants = np.tile(TRUTH, (LEGS, 1))
     constants[3, 4] += 5.0
     borders = small.draw(rng, constants).borders()
-    # the belief of that leg has given way, as it does where data gainsay it
+    # the prior of that leg has given way, as it does where data gainsay it
     borders[3] = replace(borders[3], used=np.where(PRIOR == 1.0, 5.0, PRIOR))
     found = of(borders)
     assert list(found.spread) == ['z3']
@@ -275,7 +275,7 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
         for i, name in enumerate((SCALE, YAW, 'pitch_mounting_angle')):
             e = one.estimates[name]
             value, size = (np.log(e.value), e.value) if i == 0 else (e.value, 1.0)
-            sigma = np.hypot(np.sqrt(found.covariance[i, i]), FLOOR[i])
+            sigma = np.hypot(np.sqrt(found.covariance[i, i]), MODEL_FLOOR[i])
             assert sigma == pytest.approx(e.sigma / size, rel=1e-6)
             assert abs(found.value[i] - value) < 1e-3 * sigma
 
@@ -283,12 +283,12 @@ def test_a_leg_of_the_smoother_is_what_its_border_and_its_beliefs_say(legs):
 def test_legs_of_the_smoother_add_up_their_information(legs):
     truth, config, results = legs
     whole = combine_legs(results, [0, 1, 2], config)
-    used = believed_together([r.border for r in results], np.zeros(2))[0].used
+    used = weighed_together([r.border for r in results], np.zeros(2))[0].used
     widest = np.max([r.border.used for r in results], axis=0)
     assert (used < 0.5 * widest).any()       # what one leg alone could not tell from none
     assert (used <= 1.02 * widest).all()
     C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
-    sigma = np.hypot(np.sqrt(np.diag(C))[:3], FLOOR)
+    sigma = np.hypot(np.sqrt(np.diag(C))[:3], MODEL_FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)
     assert whole.estimates[YAW].sigma == pytest.approx(sigma[1], rel=1e-3)
     for name, true in ((SCALE, truth.scale), (YAW, truth.yaw)):
@@ -314,7 +314,7 @@ def test_sources_of_legs_combined_make_their_sigma(legs):
 
 def test_a_shared_source_is_what_an_error_of_that_belief_does(legs):
     _, config, results = legs
-    # as legs that weigh no evidence: it would move with the belief
+    # as legs that weigh no evidence: it would move with the prior
     results = [replace(r, border=replace(r.border, usual=0.0)) for r in results]
 
     def combined(name, sigmas):
@@ -356,7 +356,7 @@ def test_a_slip_that_the_smoother_does_not_hold_is_in_its_border_too(legs):
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
     C = joint([loose.border], []).covariance
-    assert np.hypot(np.sqrt(C[0, 0]), FLOOR[0]) == pytest.approx(scale.sigma / scale.value,
+    assert np.hypot(np.sqrt(C[0, 0]), MODEL_FLOOR[0]) == pytest.approx(scale.sigma / scale.value,
                                                                  rel=1e-6)
 
 

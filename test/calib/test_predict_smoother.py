@@ -10,13 +10,18 @@ from smoother_legs import made, truth
 from odocal_ros.calib.smoother import bound, imperfect, problem, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.remarks import FLOOR
+from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
 from odocal_ros.errors import BadConfig
-from odocal_ros.plan.drive import from_rates
-from odocal_ros.plan.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
-from odocal_ros.plan.predict import Sigmas
-from odocal_ros.plan.samples import ideal
-from odocal_ros.plan.smoother import planned_levels, predict_smoother, spacing_for, WIDEST
+from odocal_ros.planning.drive import from_rates
+from odocal_ros.planning.manoeuvres import TOWN_SIDES, TOWN_SPEED, TOWN_T
+from odocal_ros.planning.predict import Sigmas
+from odocal_ros.planning.samples import ideal
+from odocal_ros.planning.smoother import (
+    planned_levels,
+    predict_smoother,
+    spacing_for,
+    WIDEST_SPACING,
+)
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import GRADES
@@ -56,7 +61,7 @@ def test_the_bound_of_ideal_samples_is_that_of_a_simulated_leg_at_its_truth(opti
     sigmas = figures(drive, config, tau)
     problem = Problem.of(leg, config)
     true = bound(leg, config, truth(drive, config, leg), planned_levels(problem, sigmas))
-    sigma = np.hypot(np.sqrt(np.diag(true))[:3], FLOOR)
+    sigma = np.hypot(np.sqrt(np.diag(true))[:3], MODEL_FLOOR)
     # rests are found to a second or so of the twenty and more that a drive has, keyframes fall
     # elsewhere: 5 % of what rests tell
     np.testing.assert_allclose(sigmas_of(predict_smoother(planned(drive), sigmas)) / sigma, 1.0,
@@ -112,7 +117,7 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(
-            np.hypot(table, 1e6 * FLOOR[0]), rel=0.10)
+            np.hypot(table, 1e6 * MODEL_FLOOR[0]), rel=0.10)
 
 
 @pytest.fixture
@@ -130,13 +135,13 @@ def test_fixes_are_thinned_without_loss(town_sigmas):
 def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     drive = stop_and_go()
     fine, coarse = (sigmas_of(predict_smoother(drive, town_sigmas, spacing))
-                    for spacing in (1.0, WIDEST))
+                    for spacing in (1.0, WIDEST_SPACING))
     # each keeps what a second has, but for what happens within: a tenth or so, to the safe side
     assert (coarse >= fine).all()
     assert (coarse < 1.15 * fine).all()
     assert spacing_for(drive) == 1.0
     assert spacing_for(replace(drive, t=drive.t * 3)) == pytest.approx(3.0, rel=0.01)
-    assert spacing_for(replace(drive, t=drive.t * 10)) == WIDEST
+    assert spacing_for(replace(drive, t=drive.t * 10)) == WIDEST_SPACING
     day = replace(drive, t=drive.t * 60)
     assert day.duration / spacing_for(day) == pytest.approx(1440.0)
 

@@ -10,7 +10,7 @@ from test_legs_on_border import apart, leg_result, Toy, TRUTH
 
 from odocal_ros.calib.carried import carried_from
 from odocal_ros.calib.joint import joint
-from odocal_ros.calib.scale_steps import CHANGED, scale_steps
+from odocal_ros.calib.scale_steps import scale_steps
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.errors import BadUsage
 from odocal_ros.output.files import as_json
@@ -19,6 +19,7 @@ from odocal_ros.pipeline.automatic import fold
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
@@ -58,7 +59,7 @@ def test_a_change_is_found_where_it_was_and_as_large():
         (found,) = drawn(rng, toy, change=-0.9)
         assert found.leg == 3
         assert found.change == pytest.approx(-0.9, abs=4 * 0.06)     # walk and noise of the legs
-        assert found.sigmas < -CHANGED
+        assert found.sigmas < -REMARK_SIGMAS
 
 
 @pytest.fixture(scope='module')

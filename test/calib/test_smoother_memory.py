@@ -36,7 +36,7 @@ def peak_of_a_pass(duration):
 def test_a_longer_leg_costs_a_pass_little(monkeypatch):
     # what is made of a short leg is kept, what is made of a long one is not
     for module in ('motion_rows', 'chain'):
-        monkeypatch.setattr(f'odocal_ros.calib.smoother.{module}.SHORT', 0)
+        monkeypatch.setattr(f'odocal_ros.calib.smoother.{module}.SHORT_LEG', 0)
     (few, small), (many, large) = peak_of_a_pass(400.0), peak_of_a_pass(1200.0)
     assert many - few > 700
     assert (large - small) / (many - few) == pytest.approx(MOST / 2, abs=MOST / 2)

@@ -5,7 +5,7 @@ import pytest
 from smoother_legs import made
 
 from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.noise import AT_REST, rest_noise
+from odocal_ros.calib.smoother.noise import REST_NOISE, rest_noise
 from odocal_ros.calib.smoother.travel_error import once_a_rest
 
 SWAY = {'sway': 0.05, 'odometer': 'speed', 'odometer_rate': 10.0, 'speed_noise': 0.05}
@@ -32,8 +32,8 @@ def test_noise_at_rest_is_measured_where_there_is_rest_to_measure():
     rest = np.arange(200) >= 100
     # 5 sigma of a variance from a hundred draws
     assert rest_noise(way, rest) == pytest.approx(0.0158**2, rel=5 * np.sqrt(2 / 100))
-    assert rest_noise(way, rest & (np.arange(200) < 103)) == AT_REST**2
-    assert rest_noise(np.zeros(200), rest) == AT_REST**2
+    assert rest_noise(way, rest & (np.arange(200) < 103)) == REST_NOISE**2
+    assert rest_noise(np.zeros(200), rest) == REST_NOISE**2
 
 
 def test_rounding_that_stands_counts_once():

@@ -10,7 +10,7 @@ from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slow_error import SlowError, SPREAD, USUAL
+from odocal_ros.calib.smoother.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
@@ -156,7 +156,7 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, na
     part.add(normal)
     rng = np.random.default_rng(2)
     x, c = 1e-4 * rng.standard_normal((len(state.t), N)), 1e-4 * rng.standard_normal(M)
-    x[0, P.start:PHI.stop] = 0.0      # the start is held, that the chain can be solved: no belief
+    x[0, P.start:PHI.stop] = 0.0      # the start is held, that the chain can be solved: no prior
     # H x by blocks of the chain
     Hx = np.einsum('kij,kj->ki', normal.diagonal, x) + normal.border @ c
     Hx[:-1] += np.einsum('kij,kj->ki', normal.beside, x[1:])
@@ -192,7 +192,7 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
     quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
     score = (quadratic - expected) / 2
     if name == 'correlation_time':      # a score as it is, and what is believed of the time
-        score = quadratic - expected + np.log(20.0 / USUAL) / SPREAD**2
+        score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
     h = 1e-2      # at 1e-3 rounding of the cost is 1e-3 of the score
     above, below = (at(levels.but(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
     assert score == pytest.approx((above - below) / (2 * h), rel=1e-3)

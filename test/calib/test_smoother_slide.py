@@ -9,7 +9,14 @@ from smoother_legs import made, truth
 from odocal_ros.calib.smoother import bound, smooth
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slide import HEAVE, least_slide, ROAD, SIDEWAYS, TESTED, turned
+from odocal_ros.calib.smoother.slide import (
+    HEAVE,
+    least_slide,
+    ORDINARY_ROAD,
+    SIDEWAYS,
+    TURN_SLIDE,
+    turned,
+)
 from odocal_ros.reasons import Code
 
 
@@ -45,7 +52,8 @@ def test_a_leg_with_turns_tests_it_itself():
     method = smooth(leg, config)
     assert not said(method)
     # wheels that never slide: far below a road's; up and down springs and road do what they do
-    assert max(method.details['noise'][name] for name in ('side', 'side_turn')) < ROAD / 10
+    noise = method.details['noise']
+    assert max(noise['side'], noise['side_turn']) < ORDINARY_ROAD / 10
     assert method.details['noise']['up'] == pytest.approx(HEAVE)
 
 
@@ -69,7 +77,7 @@ def straight_angle():
 def test_the_least_falls_from_a_road_to_what_turns_can_test_without_a_step():
     angles = np.deg2rad(np.arange(0.0, 270.0))
     least = np.array([least_slide(a) for a in angles])
-    assert least[:90] == pytest.approx(ROAD)
-    assert least[181:] == pytest.approx(TESTED)
+    assert least[:90] == pytest.approx(ORDINARY_ROAD)
+    assert least[181:] == pytest.approx(TURN_SLIDE)
     # a factor of 80 over 90 deg: 5 % a degree
-    assert np.abs(np.diff(np.log(least))).max() < np.log(ROAD / TESTED) / 90 * 1.001
+    assert np.abs(np.diff(np.log(least))).max() < np.log(ORDINARY_ROAD / TURN_SLIDE) / 90 * 1.001

@@ -14,7 +14,7 @@ from odocal_ros.calib.wheels.judge_noise import (
     evidence,
     inverse_root,
     judge_turns,
-    NOTHING,
+    NOTHING_LASTS_PRIOR,
     sizes_believed,
     slow_means,
 )
@@ -167,7 +167,7 @@ def test_what_is_believed_of_sizes_is_whole_and_least_far_from_the_usual():
     sizes = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
     p = np.exp(sizes_believed(sizes, 3e-3, 1.5))
     assert p.sum() == pytest.approx(1.0, rel=1e-12)
-    assert p[0] == NOTHING
+    assert p[0] == NOTHING_LASTS_PRIOR
     # a log-normal law: a factor e^1.5 off the usual is as likely as e^-1.5, and e^-0.5 of it
     near, low, high = (np.interp(np.log(3e-3) + x, np.log(sizes[1:]), np.log(p[1:]))
                        for x in (0.0, -1.5, 1.5))
@@ -178,7 +178,7 @@ def test_what_is_believed_of_sizes_is_whole_and_least_far_from_the_usual():
 @pytest.mark.parametrize('level', [0.3, 1.0, 4.0, 20.0])
 def test_rounding_is_found_as_large_as_it_is_and_is_no_slip(level):
     found = turns(0.0, 1e-3 * np.sqrt(level))
-    # as above, and half a step of the levels tried, 26 %; the belief, 0.7 wide, draws ln(level) by
+    # as above, and half a step of the levels tried, 26 %; the prior, 0.7 wide, draws ln(level) by
     # (0.14 / 0.7)^2 = 4 % of itself
     assert found.counts == pytest.approx(level, rel=0.43 + 0.26 + 0.04 * abs(np.log(level)))
     # a slip that moves the track from bin to bin by a tenth of the rounding would go unseen
@@ -188,7 +188,7 @@ def test_rounding_is_found_as_large_as_it_is_and_is_no_slip(level):
 def test_rounding_of_which_a_drive_says_nothing_is_that_of_independent_rows():
     n, walk = 100, walk_root(np.full(100, 5.0))
     found = judge_turns(np.zeros(n), np.ones((n, 1)), np.eye(n), 1e-12 * np.eye(n), walk @ walk.T)
-    assert found.counts == pytest.approx(1.0, rel=1e-2)     # mean of the belief on its levels
+    assert found.counts == pytest.approx(1.0, rel=1e-2)     # mean of the prior on its levels
     # floats and speeds do not round: nothing to judge
     none = judge_turns(np.zeros(n), np.ones((n, 1)), np.eye(n), np.zeros((n, n)), walk @ walk.T)
     assert none.counts == pytest.approx(1.0)

@@ -26,8 +26,9 @@ def imu():
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Let rows go to the file from 200 kB on."""
-    for name, size in (('MEMORY', 200_000), ('TAIL', 50_000), ('MERGE', 20_000)):
-        monkeypatch.setattr(spool, name, size, raising=False)
+    for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
+                       ('MERGED_BYTES', 20_000)):
+        monkeypatch.setattr(spool, name, size)
 
 
 def fed(recorder, imu, first, last):

@@ -16,7 +16,7 @@ from odocal_ros.foresee.forecast import as_keys, Forecast, Prospect
 from odocal_ros.foresee.foresight import Abandoned, DriveSoFar, forecast_of
 from odocal_ros.foresee.leg_so_far import faults_in_cells
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.foresee.thinned_leg import MOST, ThinnedLeg
+from odocal_ros.foresee.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.foresee.wheels_so_far import with_wheels
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
@@ -65,7 +65,7 @@ def test_work_does_not_grow_with_the_leg_and_no_turn_is_lost():
     t = np.arange(0.0, 4 * 3600.0, 0.05)          # four hours, the longest leg there may be
     rate = np.where((t % 60) < 3, 0.5, 0.0)       # 3 s turns, one a minute
     leg = fed(None, 'imu', imu_rows(t, rate), 12_000).leg(SECOND)
-    assert MOST / 2 < len(leg.imu.stamp_ns) <= MOST
+    assert MOST_CELLS / 2 < len(leg.imu.stamp_ns) <= MOST_CELLS
     # the cells are 1.6 s wide by then: a trapezoid misses at most a cell at either end
     assert turned(leg) == pytest.approx(1.5 * 240, abs=2 * 0.5 * 1.6)
     assert (np.diff(leg.imu.stamp_ns) > 0).all()
@@ -178,6 +178,26 @@ def test_the_only_heading_is_the_course(drive, config):
     yaw = foreseen(drive, course, 150.0).yaw
     assert (yaw.sigma, yaw.metres) == (None, None)
     assert 'not told from the course over ground' in yaw.why
+
+
+def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
+    """10 s after a mark set in motion; with another 15 s of such driving the smoother tells it."""
+    whole = drive.leg()
+    start_ns = whole.start_ns + 100 * SECOND
+    thinned = ThinnedLeg(whole.form)
+    for slot in ('imu', 'odometer', 'fix'):
+        rows = getattr(whole, slot)
+        thinned.feed(slot, take(rows, np.abs(rows.stamp_ns - start_ns - 4 * SECOND) < 6 * SECOND))
+    config = with_settings(Config(), {'odometer.nominal_scale': drive.truth.scale})
+    leg = thinned.leg(start_ns)
+    told = forecast_of(leg, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    assert told.methods == {}
+    assert 'yaw is not determined yet' in told.words()
+    assert told.lacks == ['drive on with stops, starts and turns']
+    assert not told.complete
+    still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
+    never = forecast_of(still, thinned.fix_rate(), config, smoother=SmootherSoFar())
+    assert 'yaw: not told from the course over ground' in never.words()
 
 
 def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):

@@ -3,12 +3,14 @@
 from dataclasses import replace
 import math
 
+import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.data.samples import HeadingSamples
 from odocal_ros.foresee import ability as ability_module, quantities
 from odocal_ros.foresee.ability import ability, Heard, stated_variance
-from odocal_ros.foresee.forecast import Forecast, Prospect, WheelsForecast
+from odocal_ros.foresee.forecast import better, Forecast, Prospect, WheelsForecast
 from odocal_ros.live import answers
 from odocal_ros.live.guidance import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
 from odocal_ros.live.restored import Restored
@@ -96,6 +98,24 @@ def test_a_configured_track_width_is_not_asked_of_the_drive():
 def test_a_leg_that_is_recorded_is_judged_by_its_forecast(forecast, found):
     assert ok(forecast) == found
     assert set(quantities.of_forecast(None, CONFIG, True).values()) == {'unknown'}
+
+
+def test_of_a_leg_that_is_cut_each_quantity_is_of_the_better_part():
+    begun = Forecast(BAD, NO_YAW, None, until_ns=2, estimates=estimates(scale_factor=None))
+    done = Forecast(GOOD, NO_YAW, 0.002, until_ns=1, estimates=estimates(
+        scale_factor=1e-4, yaw_mounting_angle=0.02))
+    told = better(done, begun)
+    assert ok(told) == 'yes no yes unknown unknown'
+    assert told.scale.metres == 0.0            # enough is enough
+    assert {name: e.sigma for name, e in told.estimates.items()} == {
+        'scale_factor': 1e-4, 'yaw_mounting_angle': 0.02}
+    assert told.until_ns == 2
+    # what is over goes no further: metres are those of the part that goes on
+    coarse = Forecast(Prospect(5e-3, 1e-3, 700.0), YAW, until_ns=3)
+    assert better(begun, coarse).scale == replace(BAD, metres=700.0)
+    assert better(begun, coarse).yaw == YAW
+    assert better(None, begun) is better(begun, None) is begun
+    assert better(None, None) is None
 
 
 def recording(**known):
@@ -218,11 +238,15 @@ def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
 
 
 def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
-    import numpy as np
-    q = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
-    assert stated_variance(q, np.array([0.1, 0.3, 0.2, np.nan])) == pytest.approx(0.2)
-    assert stated_variance(0 * q, np.zeros(4)) == math.inf
-    assert stated_variance(q, np.full(4, np.nan)) == math.inf
+    def sent(x, variance):
+        """Return four orientations, of length x."""
+        rows, q = np.arange(4), np.tile(np.multiply([0.0, 0.0, 0.0, 1.0], x), (4, 1))
+        return HeadingSamples(rows, rows, q, np.array(variance))
+
+    assert stated_variance(sent(1.0, [0.1, 0.3, 0.2, np.nan])) == pytest.approx(0.2)
+    assert stated_variance(sent(0.0, [0.0] * 4)) == math.inf
+    assert stated_variance(sent(1e200, [0.1] * 4)) == math.inf      # whose square is no number
+    assert stated_variance(sent(1.0, [np.nan] * 4)) == math.inf
 
 
 # answers

@@ -10,14 +10,14 @@ import pytest
 
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.warm_start import carried, rows_of
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.foresee import smoother_so_far
 from odocal_ros.foresee.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.foresee.foresight import forecast_of
 from odocal_ros.foresee.smoother_forecast import look, with_running
-from odocal_ros.foresee.smoother_so_far import PASSES, SmootherSoFar
-from odocal_ros.foresee.smoother_warm_start import carried, rows_of
+from odocal_ros.foresee.smoother_so_far import LOOK_PASSES, SmootherSoFar
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.session import Session
@@ -93,9 +93,9 @@ def test_it_is_not_farther_from_the_truth_than_it_says(drive, looks):
 
 def test_a_look_goes_on_from_the_last_and_comes_out_as_one_from_nothing(config, looks):
     passes = [x.running.method.details['iterations'] for x in looks]
-    assert passes[0] > PASSES
+    assert passes[0] > LOOK_PASSES
     # of 7, with driving, stops and turns in between; the others are borne out by one from nothing
-    assert passes.count(PASSES) >= 3
+    assert passes.count(LOOK_PASSES) >= 3
     anew = SmootherSoFar().look(looks[-1].leg, config).method.estimates
     assert anew['scale_factor'].value != looks[-1].running.method.estimates['scale_factor'].value
     for off, ratio in apart(looks[-1].running.method.estimates, anew):
@@ -156,12 +156,12 @@ def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(con
     drive = drive_of(fix_noise='correlated')     # then metres come from the accelerometer
     graded = with_settings(config, {'imu.accel_scale_sigma': math.nan})
     first, later, last = (x.running for x in looked(drive, graded, (100.0, 112.0, 165.0)))
-    # the same beliefs and a tenth more to see: by the way squared 1.2 times smaller at most
+    # the same priors and a tenth more to see: by the way squared 1.2 times smaller at most
     assert 1 / 1.2 < later.sigmas[0] / first.sigmas[0] < 1.02
     assert later.method.details['posterior_to_prior']['accelerometer_scale_x'] < 1.0
     leg = looked(drive, graded, (165.0,))[0].running
     # both stop within 0.1 sigma, so the log odds z^2 / 2 of scale errors 1 to 2 sigmas off differ
-    # by 0.2 at most, the mean square of both beliefs by a tenth; noise levels by another tenth
+    # by 0.2 at most, the mean square of both priors by a tenth; noise levels by another tenth
     assert last.sigmas[0] == pytest.approx(leg.sigmas[0], rel=0.15)
     blind = looked(drive, config, (165.0,))[0].running
     assert last.sigmas[0] > 1.5 * blind.sigmas[0]      # it does decide

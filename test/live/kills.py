@@ -11,8 +11,8 @@ from bench import Client, NodeProcess, wait_for
 from player import messages_of, part, Player
 
 from odocal_ros.bagio.read import open_bag
+from odocal_ros.library.legs import marked_legs
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.legs import marked_legs
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SCALE = 1.02      # true

@@ -13,6 +13,7 @@ from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import get_parameter_value
 
+from odocal_ros import __version__
 from odocal_ros.bagio import encode
 from odocal_ros.settings.config import SETTINGS
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -55,6 +56,7 @@ def test_a_signal_before_anything_ran_is_clean_too(start, connect):
 @pytest.mark.parametrize(('arguments', 'code', 'words'), [
     (['--help'], 0, 'usage: calibrator [--ros-args'), (['-h'], 0, '~/start_leg'),
     (['--help', '--ros-args', '-p', 'imu.grade:=tactical'], 0, 'config/calibrator.yaml'),
+    (['--version'], 0, f'odocal_ros {__version__}\n'),
     (['--config', 'x.yaml'], 1, 'calibrator: --config means nothing here: settings are ROS')])
 def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments, code, words):
     ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=PATIENCE,
@@ -326,7 +328,9 @@ def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
         answer = client.call('start_leg')
     assert not answer.success
     assert 'CLOCKS_DIFFER' in answer.message
-    assert 'odometer.time_offset' in answer.message
+    assert 'days ahead of' in answer.message       # no setting reaches so far
+    assert 'no time_offset reaches so far' in answer.message
+    assert 'use_sim_time' in answer.message
 
 
 @pytest.mark.parametrize('reliable', [True, False])

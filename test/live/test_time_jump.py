@@ -9,8 +9,8 @@ from player import messages_of, part, Player
 import pytest
 
 from odocal_ros.bagio.read import open_bag
+from odocal_ros.library.legs import parse_leg
 from odocal_ros.live.journal_text import replay_command
-from odocal_ros.offline.legs import parse_leg
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 SPEED = 30.0
@@ -62,7 +62,8 @@ def test_a_leg_lost_to_a_jump_of_time_is_said_and_computed_from_its_journal(
         assert code == 0, said
         one, = result['legs']
         assert abs(one['start_ns'] - mark_ns) < 1000
-        assert one['stop_ns'] - mark_ns == pytest.approx(55e9, abs=1e9)
+        # 54 s of 55 were heard before the jump, and a journal may lack the last second
+        assert 53e9 < one['stop_ns'] - mark_ns < 56e9
         scale = result['result']['scale_factor']
         assert abs(scale['value'] - drive.truth.scale) < 5 * scale['sigma']
     assert f'{answer.message}' in node.text

@@ -49,7 +49,7 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no Imu on /imu/data', 'way', 'asked 1e+03'):
+    for words in ('/calibrator', 'waiting', 'no Imu on /imu/data', 'way', 'asked 1000 ppm'):
         assert words in ended.stdout
 
 
@@ -61,5 +61,12 @@ def test_the_bars_are_shares_of_what_is_asked():
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
         'way': 0.75, 'standing': 0.6, 'scale': 0.25, 'yaw': 0.0}
+    # after a leg it is the result that is held against what is asked
+    done = {'state': 'calibrated', 'asked_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
+            'scale_factor_sigma': '0.00004', 'asked_yaw_sigma_deg': '0.5',
+            'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
+    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, asked 1000 ppm')
+    assert shares(done)['yaw'] == (1.0, '0.25 deg, asked 0.5 deg')
+    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, asked 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {
         'computing': (0.4, '40 %')}

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.alignment import complete, EDGE, gyrocompass, level_at_rest, level_frame
+from odocal_ros.nav.alignment import complete, gyrocompass, level_at_rest, level_frame, REST_EDGE
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_rpy, rpy_from_matrix
@@ -55,7 +55,7 @@ def variance_is_one(z):
 def test_attitude_and_bias_at_rest_are_found_exactly(rpy):
     C_nb, bias = matrix_from_rpy(rpy), np.array([1e-4, -2e-4, 3e-4])
     level = levelled(rest(C_nb, gyro_bias=bias))
-    assert level.t == pytest.approx(SECONDS - EDGE, abs=1 / RATE)
+    assert level.t == pytest.approx(SECONDS - REST_EDGE, abs=1 / RATE)
     assert_allclose(level.C_Lb @ C_nb.T @ [0, 0, 1], [0, 0, 1], atol=1e-14)
     a = finished(level, rpy[2])
     assert_allclose(a.C_nb, C_nb, atol=1e-13)       # 9.8 m/s^2 averaged over 301 rows
@@ -67,7 +67,7 @@ def test_the_ends_of_a_standstill_are_left_out_unless_there_is_nothing_else():
     """A slow start leans the specific force before the wheels have counted it."""
     C_nb = matrix_from_rpy(RPY)
     t, w, f = rest(C_nb)
-    f[(t < EDGE) | (t > SECONDS - EDGE)] += [0.5, 0.0, 0.0]
+    f[(t < REST_EDGE) | (t > SECONDS - REST_EDGE)] += [0.5, 0.0, 0.0]
     assert_allclose(levelled((t, w, f)).C_Lb @ C_nb.T @ [0, 0, 1], [0, 0, 1], atol=1e-14)
     ends = [0, -1]
     level = levelled((t[ends], w[ends], f[ends]))

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.receiver_filter import LEAST, smoothing
+from odocal_ros.nav.receiver_filter import LEAST_LAG2, smoothing
 
 
 def swaying(t):
@@ -22,7 +22,7 @@ def test_a_sine_comes_out_as_a_first_order_filter_has_it(tau):
     want = [20.0, 3.0] * sines.imag
     # the bend of a cubic over 0.2 s errs by (0.2 w)^2 / 12
     assert_allclose(late, want, rtol=0, atol=3e-3 * np.abs(want).max())
-    h = 1e-3 * max(tau**2, LEAST)
+    h = 1e-3 * max(tau**2, LEAST_LAG2)
     above, below = (smoothing(t, *swaying(t), at, tau**2 + x)[0] for x in (h, -h))
     # the product's own difference is one-sided, 1e-4 of tau^2 long
     assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())

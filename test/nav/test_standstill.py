@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.nav.standstill import MOVE, standstills
+from odocal_ros.nav.standstill import REST_TRAVEL, standstills
 from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import GRADES
@@ -57,7 +57,7 @@ def test_both_ends_of_a_drive_are_found_inside_the_truth(grade, bias):
 def test_a_slow_start_is_cut_off_before_it_has_moved_far(slope):
     way = ramp(20.0, 90.0, slope=slope)
     b = standstills(T, gyro(T), counts(T, way), K, 2.0)[0, 1]
-    assert np.interp(b, *way) <= MOVE
+    assert np.interp(b, *way) <= REST_TRAVEL
     if slope >= 0.5:                        # 0.5 m/s^2 makes 3 cm within 0.35 s < the window
         assert b <= 20.0
 

@@ -268,7 +268,7 @@ def test_chunks_leave_no_trace(monkeypatch, every, chunk):
     rng = np.random.default_rng(8)
     t, w = stamps(203, rng, 0.9), rng.normal(0, 2, (203, 3))
     whole = attitude(t, w, ONE, STILL, every)[1], rotation_increments(t, w)
-    monkeypatch.setattr(strapdown, 'CHUNK', chunk)
+    monkeypatch.setattr(strapdown, 'SAMPLES_AT_A_TIME', chunk)
     assert_allclose(attitude(t, w, ONE, STILL, every)[1], whole[0], atol=1e-15)
     assert_allclose(rotation_increments(t, w), whole[1], rtol=0, atol=1e-18)
 
@@ -277,5 +277,5 @@ def test_chunks_leave_no_trace(monkeypatch, every, chunk):
 def test_the_length_of_blocks_does_not_matter(monkeypatch, block):
     q = quat_from_rotvec(np.random.default_rng(9).normal(0, 1, (3001, 3)))
     before = prefix_product(q)
-    monkeypatch.setattr(strapdown, 'BLOCK', block)
+    monkeypatch.setattr(strapdown, 'SCAN_BLOCK', block)
     assert_allclose(prefix_product(q), before, atol=2e-14)

@@ -12,6 +12,7 @@ from ros_bags import T0
 import ros_messages as make
 
 from odocal_ros.calib.mounting import mounting
+from odocal_ros.library import legs
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
@@ -230,6 +231,8 @@ def test_units(tmp_path, capsys):
     told, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
     assert told['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
     assert 'IMU_UNITS: the gyro turns 2.' in text
+    told, text = inspect(tmp_path / 'twice', capsys, '--set', f'odometer.nominal_scale={4 * K}')
+    assert 'as a counter of the four edges of a pulse would be' in ' '.join(text.split())
     told, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
     assert 'GYRO_SIGN' in codes(told)
 
@@ -353,3 +356,12 @@ def test_topic_named_by_the_user(tmp_path, capsys):
     assert ' --fix-topic /gps: no such topic' in capsys.readouterr().err
     assert main(['inspect', str(path), '--imu-topic', '/fix']) == 2
     assert 'which cannot be the Imu' in capsys.readouterr().err
+
+
+def test_a_drive_is_screened_once(tmp_path, capsys, monkeypatch):
+    """The legs are found in what was screened for the rest: with nothing to screen, the same."""
+    path = ros_bags.write(tmp_path / 'bag', drive())
+    wanted = inspect(path, capsys)
+    assert wanted[0]['legs']
+    monkeypatch.setattr(legs, 'screen', None)
+    assert inspect(path, capsys) == wanted

@@ -8,7 +8,7 @@ import pytest
 
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.offline.legs import (
+from odocal_ros.library.legs import (
     _marked,
     find_legs,
     LegSpan,

@@ -9,8 +9,8 @@ import ros_bags
 import yaml
 
 from odocal_ros.errors import BadUsage, OdocalError
+from odocal_ros.library.legs import parse_leg
 from odocal_ros.offline.cli import main
-from odocal_ros.offline.legs import parse_leg
 from odocal_ros.settings.config_file import parse_set
 
 ODD = [None, True, -1, 0, 10**400, 2**63, float('inf'), float('nan'), '', 'text', '\0', [], [[]],

@@ -9,13 +9,13 @@ import shlex
 import numpy as np
 import pytest
 
+from odocal_ros.library import planned_drives
 from odocal_ros.nav.dead_reckoning import Origin
-from odocal_ros.offline import profile
 from odocal_ros.offline.cli import main
-from odocal_ros.plan.manoeuvres import stop_and_start
-from odocal_ros.plan.methods import plan_methods
-from odocal_ros.plan.predict import predict, Sigmas
-from odocal_ros.plan.smoother import predict_smoother
+from odocal_ros.planning.manoeuvres import stop_and_start
+from odocal_ros.planning.methods import plan_methods
+from odocal_ros.planning.predict import predict, Sigmas
+from odocal_ros.planning.smoother import predict_smoother
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
 
@@ -120,7 +120,7 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     t = np.arange(0.0, motion.duration, 0.1)
     moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
     stop = t[moving[np.flatnonzero(np.diff(moving) > 100)[0]]]
-    there = profile.from_scenario('out_and_back', None).until(
+    there = planned_drives.from_scenario('out_and_back', None).until(
         stop - t[moving[0]] + 0.1, 30.0)
     expected = predict(there, Sigmas(config=with_settings(Config(), {'imu.grade': 'navigation'})))
     # the stop is 30 s here and there, cut to a tenth of a second
@@ -132,7 +132,7 @@ def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys
                    '--slip-walk', '0.005')
     assert list(answer['methods']) == ['smoother', 'two_point']
     assert answer['verdict'] == 'accepted'      # the two-point method alone gives no yaw
-    drive = profile.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
+    drive = planned_drives.from_figures(15.0, 1000.0, 30.0, 0, 1.0)
     sigmas = Sigmas(config=with_settings(Config(), {
         'imu.grade': 'industrial', 'gnss.correlation_time': 0.0}), quantum=0.02, sway=0.1,
         slip=0.005)
@@ -181,14 +181,14 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
 def test_the_methods_asked_for_are_planned(method, shown, by):
     config = with_settings(Config(), {'method': method, 'alignment.heading_source': 'fixed',
                                       'alignment.heading_sigma': 0.002})
-    plan = plan_methods(profile.from_figures(15.0, 500.0, 10.0, 0, 1.0), Sigmas(config=config))
+    drive = planned_drives.from_figures(15.0, 500.0, 10.0, 0, 1.0)
+    plan = plan_methods(drive, Sigmas(config=config))
     assert list(plan.methods) == shown
     assert {plan.by(name) for name in NAMES[:2]} == {by}
 
 
-def test_the_readme_shows_what_is_printed(capsys):
-    readme = (Path(__file__).parents[2] / 'README.md').read_text(encoding='utf-8')
-    section = readme.partition('## Before driving')[2]
+def test_the_page_shows_what_is_printed(capsys):
+    section = (Path(__file__).parents[2] / 'docs' / 'planning.md').read_text(encoding='utf-8')
     command = next(line for line in section.splitlines() if line.startswith('odocal plan '))
     assert main(shlex.split(command)[1:]) == 0
     shown = section.partition('```text\n')[2].partition('```')[0].split()
@@ -204,7 +204,7 @@ def test_the_readme_shows_what_is_printed(capsys):
 
 
 def test_a_drive_of_figures_has_those_figures():
-    drive = profile.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
+    drive = planned_drives.from_figures(15.0, 3000.0, 20.0, 2, 1.0)
     assert drive.distance == pytest.approx(3000.0, rel=1e-6)
     assert drive.speed.max() == pytest.approx(15.0)
     # 2 * 15 s of ramp, 225 m of way in them
@@ -212,7 +212,7 @@ def test_a_drive_of_figures_has_those_figures():
     assert drive.standstills(2.0)[0][1] == pytest.approx(0.0, abs=0.11)
     assert np.ptp(drive.yaw) == pytest.approx(math.pi / 2, rel=0.02)
     assert drive.yaw[-1] == pytest.approx(drive.yaw[0], abs=1e-6)     # left, then right
-    slow = profile.from_figures(15.0, 100.0, 20.0, 0, 1.0)
+    slow = planned_drives.from_figures(15.0, 100.0, 20.0, 0, 1.0)
     assert slow.speed.max() == pytest.approx(10.0)         # v^2 = a d: no more in 100 m
     assert slow.distance == pytest.approx(100.0, rel=1e-6)
 
@@ -252,8 +252,8 @@ def test_the_jerks_of_a_gpx_tell_no_heading(tmp_path, scenario, noise):
         complex)[:, 0]
     sigmas = Sigmas()
     own, drawn = (predict_smoother(drive, sigmas).estimates for drive in (
-        profile.from_scenario(scenario, None),
-        profile.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
+        planned_drives.from_scenario(scenario, None),
+        planned_drives.from_gpx(gpx_of(tmp_path / 'a.gpx', t[::20], place.real, place.imag))))
     # points 5 m apart hide how a start of 0.5 m/s^2 sets in, 4 s of it: of 25 s, a sixth, and
     # noise adds to it; steps of speed at each point would halve the sigma of the straight drive
     for name in NAMES[:2]:
@@ -261,7 +261,7 @@ def test_the_jerks_of_a_gpx_tell_no_heading(tmp_path, scenario, noise):
 
 
 def test_a_gpx_track_is_driven_as_it_was(tmp_path, capsys):
-    drive = profile.from_gpx(gpx(tmp_path / 'a.gpx'))
+    drive = planned_drives.from_gpx(gpx(tmp_path / 'a.gpx'))
     assert drive.distance == pytest.approx(4000.0, rel=2e-3)       # the corner is cut by a point
     assert np.median(drive.speed[drive.speed > 0]) == pytest.approx(10.0, rel=1e-3)
     rest = drive.standstills(2.0)

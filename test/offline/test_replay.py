@@ -3,8 +3,11 @@
 from dataclasses import replace
 import json
 import math
+import os
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from odocal_ros.bagio.write import drive_topics, write_bag
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.offline.cli import main
+from odocal_ros.output import files
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.config_file import parse_set
@@ -33,6 +37,16 @@ def bag(drive, tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('replay') / 'drive', drive_topics(drive))
 
 
+@pytest.fixture(scope='module')
+def bag_result(drive, bag, tmp_path_factory):
+    return result_of(bag, drive, tmp_path_factory.mktemp('replay') / 'result')
+
+
+def result_of(bag, drive, folder):
+    assert replay(bag, *known(drive), '--quiet', '--output', folder) == 0
+    return json.loads((folder / 'calibration.json').read_text(encoding='utf-8'))['result']
+
+
 def known(drive):
     """Return the settings of an operator who knows grade and heading."""
     return ['--set', f'odometer.nominal_scale={drive.options.nominal_scale!r}',
@@ -41,8 +55,42 @@ def known(drive):
             '--set', 'alignment.heading_sigma=0.001']
 
 
-def replay(*argv):
-    return main(['replay', *map(str, argv)])
+def replay(*argv, files='params'):
+    """Replay with so few files beside calibration.json; the report takes half of a replay."""
+    return main(['replay', '--set', f'output.formats=[{files}]', *map(str, argv)])
+
+
+def test_the_two_point_method_waits_for_nothing_it_does_not_use(bag, tmp_path):
+    """Neither scipy nor the message types of rosbags, which take longer than a short bag."""
+    probe = ('import sys; from odocal_ros.offline.cli import main\n'
+             f'main(["replay", {str(bag)!r}, "--method", "two_point", "--quiet", "--output", '
+             f'{str(tmp_path / "out")!r}, "--set", "output.formats=[params, transform]"])\n'
+             'print([m for m in ("scipy", "rosbags", "matplotlib", "tqdm") if m in sys.modules])')
+    out = subprocess.check_output([sys.executable, '-c', probe], text=True)
+    assert out.strip() == '[]'
+    assert (tmp_path / 'out' / 'calibration.yaml').exists()
+
+
+def test_the_verdict_does_not_wait_for_the_report(drive, bag, tmp_path, monkeypatch, capsys):
+    said = []
+    given = files.report_or_why
+    monkeypatch.setattr(files, 'report_or_why',
+                        lambda *args: said.append(capsys.readouterr().out) or given(*args))
+    assert replay(bag, *known(drive), '--method', 'two_point', '--output', tmp_path / 'out',
+                  '--set', 'output.formats=[params, report]') == 0
+    assert 'scale factor' in said[0]
+    assert 'written' not in said[0]
+    assert 'written: ' in capsys.readouterr().out
+
+
+def test_a_reader_that_goes_away_takes_no_file_with_it(drive, bag, tmp_path):
+    command = [sys.executable, '-m', 'odocal_ros.offline.cli', 'replay', str(bag), '--method',
+               'two_point', '--output', str(tmp_path / 'out'), *known(drive)]
+    gone, pipe = os.pipe()
+    os.close(gone)
+    assert subprocess.run(command, stdout=pipe, check=False).returncode == 0
+    os.close(pipe)
+    assert (tmp_path / 'out' / 'report.html').exists()
 
 
 def test_result_meets_the_truth_within_its_sigma(drive, bag, tmp_path, capsys):
@@ -89,13 +137,9 @@ def test_replay_of_a_bag_is_the_pipeline_on_the_samples(drive, bag, tmp_path, ca
 @pytest.mark.parametrize(('storage', 'compression'), [
     ('sqlite3', 'none'), ('mcap', 'storage'), ('sqlite3', 'message'), ('sqlite3', 'file'),
     ('rosbag1', 'none')])
-def test_every_storage_gives_the_same_result(drive, bag, storage, compression, tmp_path, capsys):
+def test_every_storage_gives_the_same_result(drive, bag_result, storage, compression, tmp_path):
     other = write_bag(tmp_path / 'other', drive_topics(drive), storage, compression)
-    results = []
-    for number, path in enumerate((bag, other)):
-        assert replay(path, *known(drive), '--json', '--output', tmp_path / f'{number}') == 0
-        results.append(json.loads(capsys.readouterr().out)['result'])
-    assert results[0] == results[1]
+    assert result_of(other, drive, tmp_path / 'result') == bag_result
 
 
 def test_several_bags_are_legs_of_one_vehicle(tmp_path, capsys):

@@ -5,7 +5,8 @@ import json
 import pytest
 
 from odocal_ros.bagio.write import drive_topics, write_bag
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib import result
+from odocal_ros.library.calibration import Calibration
 from odocal_ros.offline import replay
 from odocal_ros.offline.cli import main
 from odocal_ros.output.files import write_results
@@ -32,12 +33,12 @@ class Args:
 
 @pytest.mark.parametrize('quiet', [False, True])
 def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
-    write_results(Calibration((), {}, {}, ()), Config(), tmp_path, [], CREATED)
+    write_results(result.Calibration((), {}, {}, ()), Config(), tmp_path, [], CREATED)
     args = Args()
     args.quiet = quiet
-    worse = Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
+    worse = result.Calibration((Reason(Code.NO_FIX, 'no fix came'),), {}, {}, ())
     for said in (not quiet, False):      # the second time a rejected one goes: nothing is lost
-        assert replay._report(worse, Config(), [], tmp_path, args) == 1
+        assert replay._report(Calibration(worse), tmp_path, args) == 1
         err = capsys.readouterr().err
         assert ('a better calibration was replaced, as --force asks: the new one is rejected '
                 '(NO_FIX), the old one is accepted' in err) == said
@@ -53,7 +54,8 @@ def interrupted(*_, **__):
     ('odocal_ros.pipeline.calibrate.combine', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.folder._which', 'odocal: interrupted, nothing written\n'),
     ('odocal_ros.output.files.report_or_why', 'the results are in {out}/, report.html is not\n'),
-    ('odocal_ros.output.summary.screen', 'the results are in {out}/\n')])
+    ('odocal_ros.output.summary.screen', 'the results are in {out}/, report.html is not\n'),
+    ('odocal_ros.output.summary.sentence', 'the results are in {out}/\n')])
 def test_ctrl_c_is_answered_with_what_happened(bag, tmp_path, capsys, monkeypatch, where, said):
     monkeypatch.setattr(where, interrupted)
     assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 130

@@ -4,7 +4,7 @@ import pytest
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
-from odocal_ros.offline.topics import choose_topics
+from odocal_ros.library.topics import choose_topics
 from odocal_ros.settings.config import Config, with_settings
 
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from odocal_ros.data.samples import OdometerForm
-from odocal_ros.pipeline.automatic import BEFORE_NS, LegSearch, PARKED_NS, REST_NS
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
+from odocal_ros.pipeline.automatic import LEG_END_REST_NS, LegSearch, PARKED_NS, STOOD_NS
 from odocal_ros.settings.config import Config, with_settings
 
 SECOND = 10**9
@@ -17,7 +17,10 @@ CONFIG = with_settings(Config(), {'leg.automatic': True, 'leg.automatic_minutes'
 
 
 def rows(stamp_ns, value=None):
-    return SimpleNamespace(stamp_ns=np.asarray(stamp_ns), value=value)
+    """Return rows of an odometer; without values of a sensor of which only stamps are read."""
+    if value is None:
+        return SimpleNamespace(stamp_ns=np.asarray(stamp_ns), value=None)
+    return OdometerSamples(stamp_ns, stamp_ns, value)
 
 
 def sent(drive, form=COUNTER, imu_gap=(0, 0), only_counts=False):
@@ -55,7 +58,7 @@ def in_seconds(search):
 
 # at 60 s off, a red light at 120, a stop at 260 that is long enough, then ten minutes on end
 TOWN = [(60, 0), (60, 10), (20, 0), (120, 10), (30, 0), (600, 10), (30, 0)]
-BEFORE, REST, PARKED = (x / SECOND for x in (BEFORE_NS, REST_NS, PARKED_NS))
+BEFORE, REST, PARKED = (x / SECOND for x in (STOOD_NS, LEG_END_REST_NS, PARKED_NS))
 
 
 @pytest.mark.parametrize(('form', 'only_counts'), [(COUNTER, False), (SPEED, False),

@@ -34,7 +34,7 @@ def test_late_and_early_fixes_are_said(method, late):
     made = drive(**ROUTE, fix_delay=late)
     what, size, sigma, name, offset = said(made, method)
     assert (what, name) == ('fixes', 'gnss')
-    # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / belief)^2 of itself
+    # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / prior)^2 of itself
     pull = abs(late) * (sigma / 0.05)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001
     assert offset == pytest.approx(-size, abs=0.001)

@@ -9,7 +9,8 @@ import pytest
 from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
-from odocal_ros.screening.late_rows import COUNTS
+from odocal_ros.screening import late_rows
+from odocal_ros.screening.late_rows import ROUNDING_COUNTS
 from odocal_ros.screening.screen import screen
 
 SLIP_M, SLIP_S = 0.5, 200.0
@@ -107,5 +108,13 @@ def test_fresh_counts_at_odd_times_stay_where_they_are(made):
     sent = (odd.stamp_ns - made.leg().start_ns) * 1e-9
     truth, _ = screen(made.leg(), settings(made))
     off = np.abs(inputs.travel.s - truth.travel.at(inputs.travel.t))
-    assert off.max() <= COUNTS + 0.5
+    assert off.max() <= ROUNDING_COUNTS + 0.5
     assert (inputs.travel.t <= sent).all()
+
+
+@pytest.mark.parametrize('count', [1, 2, 7, 100, 101, 5000])
+@pytest.mark.parametrize('n', [1, 100, 1003])
+def test_the_least_of_the_next_values(count, n):
+    x = np.random.default_rng(count).normal(size=n)
+    wanted = [x[i:i + count].min() for i in range(n)]
+    assert late_rows._least_of_next(x, count).tolist() == wanted

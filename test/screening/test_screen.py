@@ -144,9 +144,11 @@ def test_clocks_that_differ_refuse_the_leg_until_an_offset_is_set(leg, slot, set
 
 def test_a_clock_an_hour_off_names_no_offset_that_cannot_be_set(leg):
     far = changed(leg.fix, stamp_ns=lambda a: a - 3600 * 10**9)
-    _, codes, _ = said(replace(leg, fix=far))
-    assert '-3600.0' in codes[Code.CLOCKS_DIFFER]
-    assert 'time_offset' not in codes[Code.CLOCKS_DIFFER]
+    _, found = screen(replace(leg, fix=far), Config())
+    reason, = (r for r in found if r.code is Code.CLOCKS_DIFFER)
+    assert '-3600.0' in reason.text
+    assert 'gnss.time_offset' not in reason.text + reason.remedy
+    assert 'use_sim_time' in reason.remedy
 
 
 def test_the_imus_own_offset_moves_the_others_since_marks_are_imu_stamps(leg):

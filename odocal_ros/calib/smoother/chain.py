@@ -1,5 +1,5 @@
 """
-Least squares on a chain: blocks that touch their neighbours only, and a border that touches all.
+Least squares on a chain, (S12): blocks that touch their neighbours, a border that touches all.
 
 The normal matrix is block tridiagonal with a border of constants. Blocks are eliminated one after
 the other by Cholesky; the way back gives the step, and the covariance of each pair of neighbours
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
-BLOCK = 64        # intervals worked on at a time: their matrices stay in the cache
-SHORT = 1200      # intervals of a leg so short that what is made of them may be kept
+INTERVALS_AT_A_TIME = 64    # intervals worked on at a time: their matrices stay in the cache
+SHORT_LEG = 1200            # intervals of a leg so short that what is made of them may be kept
 
 
 class NotPositive(OdocalError):
@@ -111,7 +111,7 @@ class Neighbours:
 
     def of(self, rows) -> Floats:
         """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
-        return self._made(rows) if len(self) > SHORT else self._whole[rows]
+        return self._made(rows) if len(self) > SHORT_LEG else self._whole[rows]
 
     @cached_property
     def _whole(self):
@@ -135,7 +135,7 @@ class Neighbours:
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
         """Yield all of them, some intervals at a time."""
         for rows in blocks(len(self)):
-            at = np.arange(rows.start, rows.stop) if len(self) > SHORT else rows
+            at = np.arange(rows.start, rows.stop) if len(self) > SHORT_LEG else rows
             yield rows, self.of(at)
 
     def entries(self, i, j) -> Floats:
@@ -153,7 +153,7 @@ def blocks(n: int) -> Iterator[slice]:
     None of one row, where there are more: numpy multiplies a single matrix by another way than
     those of a stack, and results are to be the same whatever the chunks.
     """
-    edges = np.linspace(0, n, max(1, -(-n // BLOCK)) + 1).astype(int)
+    edges = np.linspace(0, n, max(1, -(-n // INTERVALS_AT_A_TIME)) + 1).astype(int)
     for first, last in pairwise(edges.tolist()):
         yield slice(first, last)
 

@@ -1,7 +1,7 @@
 """
 The least squares of a leg at one state: the parts, their normal equations, cost and components.
 
-A sensor, or a belief, that is to be heard is one more class here (``part.Part``).
+A sensor, or a prior, that is to be heard is one more class here (``part.Part``).
 """
 
 from typing import TypeVar

@@ -1,9 +1,9 @@
 """
 Iterate: linearise, solve, estimate the noise, until nothing moves.
 
-The noise levels go to the maximum of the restricted likelihood (the fixed point of Harville 1977:
+The noise levels go to the maximum of the restricted likelihood ((S13), as Harville 1977 has it:
 quadratic sum over its expectation). What lies far outside its distribution is taken to have a
-heavy tail: fixes, slips of an interval, and beliefs (a lever arm, a delay, a turn-on bias) that
+heavy tail: fixes, slips of an interval, and priors (a lever arm, a delay, a turn-on bias) that
 the data gainsay.
 """
 
@@ -27,32 +27,32 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 
-MOST = 40            # iterations
+MOST_PASSES = 40    # iterations
 # sigmas of a step from which residuals are noise, and are no more; the first step with derivatives
 # by the fitted signal takes back what those with noise in them made of it, however much
-NEAR, FAR = 1.0, 4.0
-SETTLED = 0.03       # sigmas that the constants may still move
-CREEPS = 0.5         # the same: values that are worth having, with wider sigmas
-NEARLY = 0.1         # the same of scale and mounting at the end, if but a delay goes to and fro
-SHARPLY = np.where(np.arange(M) < 3, 1.0, 0.3)     # how sharply each constant is held to that
+FITTED_BELOW, MEASURED_ABOVE = 1.0, 4.0
+SETTLED_SIGMAS = 0.03    # sigmas that the constants may still move
+CREEPING_SIGMAS = 0.5    # the same: values that are worth having, with wider sigmas
+NEARLY_SIGMAS = 0.1    # the same of scale and mounting at the end, if but a delay goes to and fro
+SETTLED_WEIGHT = np.where(np.arange(M) < 3, 1.0, 0.3)# how sharply each constant is held to that
 # rad: an angle known no better drifts where the cost is flat, and is refused (lever arms: m)
-UNKNOWN = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
-FIRST_TAILS, LAST_TAILS = 3, 15     # iterations in which heavy tails are looked for
-QUIET = 0.01         # relative change of the sigmas of scale and mounting, the same
+FLAT_ANGLE = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
+FIRST_TAILS, LAST_TAILS = 3, 15    # iterations in which heavy tails are looked for
+QUIET_SIGMAS = 0.01                # relative change of the sigmas of scale and mounting, the same
 # pseudo-observations that a level is as first believed (Imu), or as it is (the others: more of
 # them end the way to a small noise too early)
 SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
-INERTIA = 1.0
+LEVEL_INERTIA = 1.0
 # power on the steps of a level: at first (the fixed point is slow where a noise is small), more
 # with each step the same way, less with each that turns back
-HASTE, SPEED_UP, SLOW_DOWN, MOST_HASTE = 1.6, 1.25, 0.5, 3.0
+RELAXATION, SPEED_UP, SLOW_DOWN, MOST_RELAXATION = 1.6, 1.25, 0.5, 3.0
 ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
-STIRS = 0.05         # relative change of a slip's variance from which it moves
-OUTLIER = 3.0        # sigmas beyond which an interval of the odometer is a slip
-GAINSAID = 2.0       # sigmas of a belief beyond which it gives way
-MOST_WIDE = 30.0     # times its own sigma
+SLIP_STIRS = 0.05    # relative change of a slip's variance from which it moves
+SLIP_SIGMAS = 3.0    # sigmas beyond which an interval of the odometer is a slip
+PRIOR_GIVES_WAY = 2.0    # sigmas of a prior beyond which it gives way
+MOST_WIDENED = 30.0                                            # times its own sigma
 SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there or is not
-KNOWN = 0.5          # of the prior's variance: what is left where the data know as much
+KNOWN_SHARE = 0.5    # of the prior's variance: what is left where the data know as much
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Fit(Outline):
         return solve(self.weighted.normal()).neighbours()
 
 
-def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=False,
+def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, frozen=False,
         about: WarmStart | None = None, trace=None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
@@ -111,7 +111,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
     frozen : bool
         Leave the noise levels alone.
     about : WarmStart, optional
-        Of an earlier fit, whose slips and beliefs are taken over.
+        Of an earlier fit, whose slips and priors are taken over.
     trace : callable, optional
         Called with each pass, for benchmarks.
 
@@ -129,34 +129,35 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST, *, frozen=Fal
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
         sigma = np.sqrt(np.diag(solved.covariance))
-        move = np.abs(solved.step_border / sigma * np.where(sigma < UNKNOWN, SHARPLY, 0.0)).max()
+        weight = np.where(sigma < FLAT_ANGLE, SETTLED_WEIGHT, 0.0)
+        move = np.abs(solved.step_border / sigma * weight).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(fitted and not slipping and move < SETTLED
-                       and (frozen or change < QUIET and count > tails + 2))
+        settled = bool(fitted and not slipping and move < SETTLED_SIGMAS
+                       and (frozen or change < QUIET_SIGMAS and count > tails + 2))
         first_fitted, was_fitted = fitted and not was_fitted, fitted
-        fitted = bool(first_fitted or move < (FAR if fitted else NEAR))
+        fitted = bool(first_fitted or move < (MEASURED_ABOVE if fitted else FITTED_BELOW))
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved)
         if settled or count >= most:
             still = np.abs(solved.step_border / sigma)[:3].max()
-            settled = settled or bool(max(still, change) < NEARLY)
+            settled = settled or bool(max(still, change) < NEARLY_SIGMAS)
             break
         if not frozen:
             near = solved.neighbours()
             tail = tails <= count <= LAST_TAILS
             # slips and the road's levels are factors on the same rows: never both in one pass
             found = slips(weighted, near, spread) if tail and not slipping else spread
-            slipping = bool(np.abs(np.log(found / spread)).max() > STIRS)
+            slipping = bool(np.abs(np.log(found / spread)).max() > SLIP_STIRS)
             levels = update(weighted, near, levels, problem, pace, slipping)
             spread = found
             if tail:
-                priors = beliefs(first, priors, state, solved, near, fitted)
+                priors = widened(first, priors, state, solved, near, fitted)
             del near
         del sums, weighted, solved      # the most that a long leg takes
-    creeping = not settled and bool(still < CREEPS and change < CREEPS)
+    creeping = not settled and bool(still < CREEPING_SIGMAS and change < CREEPING_SIGMAS)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
                likelihood, weighted, solved)
@@ -173,14 +174,14 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
         if slipping and name in ROAD_NOISE:
             continue
         level = levels[name]
-        belief = SENSOR.get(name, INERTIA)
-        pull = belief * (problem.first_levels[name] / level if name in SENSOR else 1.0)
-        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + belief),
+        pseudo = SENSOR.get(name, LEVEL_INERTIA)
+        pull = pseudo * (problem.first_levels[name] / level if name in SENSOR else 1.0)
+        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
-        first = HASTE if name in ROAD_NOISE or name in SENSOR else 1.0
-        haste, last = pace.get(name, (first, 0.0))
-        haste = haste * (SLOW_DOWN if step * last < 0 else SPEED_UP if last else 1.0)
-        pace[name] = min(haste, MOST_HASTE), step
+        first = RELAXATION if name in ROAD_NOISE or name in SENSOR else 1.0
+        relaxation, last = pace.get(name, (first, 0.0))
+        relaxation = relaxation * (SLOW_DOWN if step * last < 0 else SPEED_UP if last else 1.0)
+        pace[name] = min(relaxation, MOST_RELAXATION), step
         move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
     return levels.but(**new)
@@ -192,10 +193,10 @@ def slips(weighted, neighbours, spread):
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
-    return np.sqrt(spread * np.clip(spread * z2 / OUTLIER**2, 1.0, 1e6))
+    return np.sqrt(spread * np.clip(spread * z2 / SLIP_SIGMAS**2, 1.0, 1e6))
 
 
-def beliefs(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Priors:
+def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Priors:
     """
     Return priors widened where the data are far from their centre.
 
@@ -207,7 +208,7 @@ def beliefs(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Pr
     P0 = np.diagonal(neighbours[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    untold = SMALL & ((variance > KNOWN * now.constants**2) | (not fitted))
+    untold = SMALL & ((variance > KNOWN_SHARE * now.constants**2) | (not fitted))
     constants[untold] = now.constants[untold]
     constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
     return replace(
@@ -218,9 +219,9 @@ def beliefs(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Pr
 
 
 def _wider(first, now, off, variance):
-    """Return sigmas at which ``off`` lies no more than GAINSAID out, none below the first."""
+    """Return sigmas at which ``off`` is no more than PRIOR_GIVES_WAY, none below the first."""
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
     z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)
-    wide = np.clip(now_ * np.sqrt(z2) / GAINSAID, first_, MOST_WIDE * first_)
+    wide = np.clip(now_ * np.sqrt(z2) / PRIOR_GIVES_WAY, first_, MOST_WIDENED * first_)
     return np.where(held, wide, np.inf)

@@ -1,4 +1,4 @@
-"""Fixes as rows: the antenna's place at the time of a fix, from the keyframe before it."""
+"""Fixes as rows, (S8): the antenna's place at the time of a fix, from the keyframe before it."""
 
 import numpy as np
 

@@ -21,14 +21,14 @@ from odocal_ros.calib.smoother.estimate import Fit, fit
 from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR
 from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K
 
-BELIEF = 0.5         # that an imperfection is there
-NONE = 1e-3          # of the usual sigma: as good as no error
-ROUNDS, SAME = 20, 1e-3     # over the kinds; relative change of the sigmas that is none
-STAYS = 0.98         # of the usual variance
-FEW = 6              # passes to take out what is not there
+THERE = 0.5                       # probability that an imperfection is there
+NO_ERROR_SHARE = 1e-3                  # of the usual sigma: as good as no error
+KIND_ROUNDS, SAME_SIGMAS = 20, 1e-3    # over the kinds; relative change of the sigmas that is none
+STAYS_SHARE = 0.98                     # of the usual variance
+REMOVAL_PASSES = 6                     # passes to take out what is not there
 
 
-def believed(data, pull, belief=BELIEF):
+def mixture_prior(data, pull, odds=THERE):
     """
     Return how large errors of one kind are to be taken for.
 
@@ -38,23 +38,23 @@ def believed(data, pull, belief=BELIEF):
         What a drive tells of the errors: information, in units of the usual sigmas.
     pull : (k, k) array
         Outer square of the gradient at no error, of the same; ``data`` where there are none.
-    belief : float
-        How likely they are.
+    odds : float
+        Probability that they are there.
 
     Returns
     -------
-    (k,) array of prior variances, NONE^2 to 1, and the weight of the usual ones.
+    (k,) array of prior variances, NO_ERROR_SHARE^2 to 1, and the weight of the usual ones.
 
     """
     one = np.eye(len(data))
     wide = np.linalg.inv(data + one)
     log = 0.5 * (np.trace(wide @ pull) - np.linalg.slogdet(data + one)[1])
-    weight = 1 / (1 + (1 - belief) / belief * np.exp(-np.clip(log, -500.0, 500.0)))
+    weight = 1 / (1 + (1 - odds) / odds * np.exp(-np.clip(log, -500.0, 500.0)))
     mean_square = np.diag(wide @ pull @ wide)
     square = weight * np.diag(wide) + weight * (1 - weight) * mean_square
     rest = 1 / square - 1 / np.diag(np.linalg.inv(data))     # less what the data tell of each
     taken = np.where(rest > 1.0, 1 / np.maximum(rest, 1e-300), 1.0)
-    return np.clip(taken, NONE**2, 1.0), float(weight)
+    return np.clip(taken, NO_ERROR_SHARE**2, 1.0), float(weight)
 
 
 def weigh_kinds(data, gradient, kinds):
@@ -65,7 +65,7 @@ def weigh_kinds(data, gradient, kinds):
     for errors that are not there.   kinds : slices.
     """
     prior = np.ones(len(data))
-    for _ in range(ROUNDS):
+    for _ in range(KIND_ROUNDS):
         before = prior.copy()
         for kind in kinds:
             own = np.arange(len(data))[kind]
@@ -78,8 +78,8 @@ def weigh_kinds(data, gradient, kinds):
             else:
                 g = gradient[own] - gain @ gradient[rest]
                 pull = np.outer(g, g)
-            prior[own], _ = believed(D, pull)
-        if np.abs(np.log(prior / before)).max() < SAME:
+            prior[own], _ = mixture_prior(D, pull)
+        if np.abs(np.log(prior / before)).max() < SAME_SIGMAS:
             break
     return prior
 
@@ -105,15 +105,15 @@ def judged_priors(now: Fit, grade, found=True):
     prior = weigh_kinds(data, both @ (now.state.constants[pick] / sigma) if found else None,
                         [kind for kind in kinds if kind.any()])
     # what is there may be more than usual: then the prior has given way, and stays so
-    taken = np.where(prior > STAYS, np.maximum(last, sigma), np.sqrt(prior) * sigma)
-    if np.abs(np.log(taken / last)).max() < SAME:
+    taken = np.where(prior > STAYS_SHARE, np.maximum(last, sigma), np.sqrt(prior) * sigma)
+    if np.abs(np.log(taken / last)).max() < SAME_SIGMAS:
         return now.priors
     sigmas = np.full(len(usual), NO_ERROR)
     sigmas[there] = taken
     return with_imperfect(now.priors, sigmas)
 
 
-def believed_together(borders, steps) -> list[Border]:
+def weighed_together(borders, steps) -> list[Border]:
     """
     Return borders of one vehicle with what all of them tell of imperfections believed.
 
@@ -136,7 +136,7 @@ def believed_together(borders, steps) -> list[Border]:
     kind = [np.isin(at, [of.names.index(n) for n in CONSTANTS[IMPERFECT][own]]) for own in KINDS]
     prior = weigh_kinds(data + 1e-3 * np.eye(len(at)), gradient * sigma,
                         [own for own in kind if own.any()])
-    taken = np.where(prior > STAYS, np.maximum(of.used[at], sigma), np.sqrt(prior) * sigma)
+    taken = np.where(prior > STAYS_SHARE, np.maximum(of.used[at], sigma), np.sqrt(prior) * sigma)
     return legs.believing(at, taken)
 
 
@@ -167,6 +167,6 @@ def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
         return now
     outline = about.outline()
     del now, about      # the equations of one fit at a time
-    last = fit(problem, outline.state, outline.levels, FEW, about=outline, frozen=True,
+    last = fit(problem, outline.state, outline.levels, REMOVAL_PASSES, about=outline, frozen=True,
                trace=trace)
     return replace(last, iterations=outline.iterations + last.iterations)

@@ -11,8 +11,8 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
-STEPS = 0.05           # m/s: a speed in finer steps errs as if by chance
-BEFORE_MARK = 30.0     # s: a standstill that ended longer before the start mark is another drive
+COARSE_STEP = 0.05    # m/s: a speed in finer steps errs as if by chance
+BEFORE_MARK = 30.0    # s: a standstill that ended longer before the start mark is another drive
 
 
 def _none(*shape):
@@ -53,7 +53,7 @@ class SmootherLeg:
     def by_steps(self) -> bool:
         """Tell whether the odometer is heard by the steps of its speed, not by its way."""
         coarse = self.travel.coarse
-        return coarse is not None and coarse.step * self.rough_scale > STEPS
+        return coarse is not None and coarse.step * self.rough_scale > COARSE_STEP
 
 
 def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:

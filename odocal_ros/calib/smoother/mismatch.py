@@ -8,12 +8,12 @@ from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
 
-WORSE = 3.0            # times the grade's noise or bias that is another sensor
-ODD_FIXES = 0.15       # share of the fixes with little weight
-ODD_ROAD = 0.15        # share of the intervals in which a wheel slips
-SLIDES = 0.2           # m/sqrt(s) sideways: no vehicle on wheels
-OFF_HEADING = 3.0      # sigmas of the outside heading beyond which it is said to be wrong
-WIDEN = 2.0            # factor on the sigmas where the model does not hold
+WORSE_THAN_GRADE = 3.0      # times the grade's noise or bias that is another sensor
+ODD_FIXES = 0.15            # share of the fixes with little weight
+ODD_ROAD = 0.15             # share of the intervals in which a wheel slips
+SLIDING_NOISE = 0.2         # m/sqrt(s) sideways: no vehicle on wheels
+HEADING_OFF_SIGMAS = 3.0    # sigmas of the outside heading beyond which it is said to be wrong
+MISFIT_WIDENING = 2.0       # factor on the sigmas where the model does not hold
 BY_SHAKING = 'the Imu errs more than its grade, in ways that are not white noise'
 SHAKEN = ('What shakes an Imu is no white noise; the sigmas were widened. Mount it firmly and '
           'away from the engine.')
@@ -29,17 +29,17 @@ def mismatch(problem, fit, config):
     shaken = max(level[name] / own[name] for name in ('gyro', 'accel'))
     worse = [f'{what} {level[name] / told[name]:.1f} times' for name, what in (
         ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
-        if level[name] > WORSE * told[name]]
+        if level[name] > WORSE_THAN_GRADE * told[name]]
     worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, what in (
         (fit.state.gyro_bias, problem.priors.gyro_bias, 'gyro bias'),
         (fit.state.accel_bias, problem.priors.accel_bias, 'accelerometer bias'))
-        if np.max(np.abs(now[0]) / sigma) > 2 * WORSE]
+        if np.max(np.abs(now[0]) / sigma) > 2 * WORSE_THAN_GRADE]
     if worse:
-        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'of the {config.imu.grade} grade '
-                              f'({", ".join(worse)}); estimated from the drive instead',
+        reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
+                              f'{config.imu.grade} grade; estimated from the drive instead',
                               '' if any('gyro' in x for x in worse) else OF_FORCE))
     widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
-    if shaken > WORSE:      # what shakes a vehicle is not white, and its colour is not known
+    if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
         odd.append(BY_SHAKING)
     share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
     if share > ODD_FIXES:
@@ -47,12 +47,12 @@ def mismatch(problem, fit, config):
     share = float((fit.spread[:, 0] > 1.5).mean())
     if share > ODD_ROAD:
         odd.append(f'the wheel slips in {100 * share:.0f} % of the time')
-    if max(level['side'], level['side_turn']) > SLIDES:
+    if max(level['side'], level['side_turn']) > SLIDING_NOISE:
         odd.append(f"the odometer's point moves sideways by "
                    f'{max(level["side"], level["side_turn"]):.2f} m in a second')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
-        widen = WIDEN
+        widen = MISFIT_WIDENING
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
                               SHAKEN if odd == [BY_SHAKING] else ''))
     return widen, reasons
@@ -60,7 +60,7 @@ def mismatch(problem, fit, config):
 
 def _heading(heading, error):
     """Say where the outside heading is farther from that of the drive than its sigma allows."""
-    if not len(heading.t) or abs(error) < OFF_HEADING * heading.sigma:
+    if not len(heading.t) or abs(error) < HEADING_OFF_SIGMAS * heading.sigma:
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
                    f'{np.rad2deg(error):+.2f} deg from that of the drive, '

@@ -1,5 +1,5 @@
 """
-The motion between keyframes: residuals of the Imu and the odometer, their derivatives and noise.
+The motion between keyframes, (S1) to (S5), (S7): residuals, their derivatives and noise.
 
 Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer], each
 the state at its end less what the state at its begin and the preintegrated sums make of it. n
@@ -20,7 +20,7 @@ from odocal_ros.calib.smoother.state import (
     BG,
     C_bv_gradient,
     E,
-    FAST,
+    FAST_SPEED,
     GYRO,
     GYRO_AXIS,
     GYRO_SIGNAL,
@@ -78,7 +78,8 @@ def accelerations(state):
 def varies_with(speed, t, accel):
     """Return what the scale varies with, as TYRES has it: (..., 4)."""
     force = accel + RESISTANCE + AIR * speed**2
-    return np.stack([speed**2 / (2 * FAST), t, np.maximum(force, 0.0), np.minimum(force, 0.0)], -1)
+    return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
+                     np.minimum(force, 0.0)], -1)
 
 
 def means_by_way(sums, state):

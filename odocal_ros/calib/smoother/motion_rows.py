@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks, SHORT
+from odocal_ros.calib.smoother.chain import blocks, SHORT_LEG
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
@@ -73,7 +73,7 @@ class MotionRows(Part):
         if rows.start in self._kept:
             return self._kept[rows.start]
         J = self.whiten[rows] @ np.concatenate(self.motion.take(rows).jacobians(self.n), axis=2)
-        if len(self.r) <= SHORT:
+        if len(self.r) <= SHORT_LEG:
             self._kept[rows.start] = J
         return J
 

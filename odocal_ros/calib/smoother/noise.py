@@ -25,14 +25,14 @@ ROAD = (('along', 0), ('along_hard', 0), ('side', 1), ('side_turn', 1), ('up', 2
 SLOW_LEVELS = ('slow', 'slow_up')
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
-HARD = 0.5          # m/s^2 along: above it, a wheel may slip
-TURNING = 0.05      # rad/s: above it, a vehicle may slide sideways
-AT_REST = 5e-4      # m that an odometer at rest may err by in a second, at least
-FEWEST_RESTS = 5     # seconds to know that by
-SLOWEST = 0.02      # m/s: share of the noise of a wheel that hardly turns
-GAP = 0.06          # s and 3 medians: a longer step of the Imu hides motion
-GAP_RATE, GAP_FORCE = 0.1, 1.5     # rad/s, m/s^2 that may hide in it
-ABSENT = 1e4        # m^2: no odometer
+HARD_FORCE = 0.5                        # m/s^2 along: above it, a wheel may slip
+TURNING_RATE = 0.05                     # rad/s: above it, a vehicle may slide sideways
+REST_NOISE = 5e-4    # m that an odometer at rest may err by in a second, at least
+FEWEST_RESTS = 5                        # seconds to know that by
+CRAWL_SPEED = 0.02                      # m/s: share of the noise of a wheel that hardly turns
+IMU_GAP = 0.06                          # s and 3 medians: a longer step of the Imu hides motion
+HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5    # rad/s, m/s^2 that may hide in it
+ABSENT_VARIANCE = 1e4                   # m^2: no odometer
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.way, axis=1) / T
-    share = np.sqrt(np.clip(speed, SLOWEST, 1.0) * T)
+    share = np.sqrt(np.clip(speed, CRAWL_SPEED, 1.0) * T)
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, 3)) if spread is None else spread
     acting = ~hard, hard, ~turning, turning, np.ones(K, bool)
@@ -166,7 +166,7 @@ def _given(motion, leg, axes, rest):
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
     most = motion.state.scale * leg.travel.coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
-    given[:, D, 0] = along * np.sqrt(ABSENT)
+    given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
     given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]
     return given * ~rest[:, None, None]
 
@@ -174,7 +174,7 @@ def _given(motion, leg, axes, rest):
 def rest_noise(speed, rest):
     """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= FEWEST_RESTS else 0.0
-    return max(measured, AT_REST**2)
+    return max(measured, REST_NOISE**2)
 
 
 def hard_and_turning(motion):
@@ -183,25 +183,25 @@ def hard_and_turning(motion):
     speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
         / motion.state.scale / T
     padded = np.pad(speed, 1, mode='edge')
-    hard = np.abs(padded[2:] - padded[:-2]) > 2 * HARD * T
+    hard = np.abs(padded[2:] - padded[:-2]) > 2 * HARD_FORCE * T
     rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))
-    return hard, rate > TURNING
+    return hard, rate > TURNING_RATE
 
 
 def _extra(motion, leg):
     """Return variances of what gaps hide: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
-    gap = np.where(sums.longest_step > max(GAP, 3 * np.median(sums.longest_step)),
+    gap = np.where(sums.longest_step > max(IMU_GAP, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    extra[:, PHI] = (GAP_RATE * gap[:, None])**2
-    extra[:, V] = (GAP_FORCE * gap[:, None])**2
-    extra[:, P] = (GAP_FORCE * gap * T)[:, None]**2
+    extra[:, PHI] = (HIDDEN_RATE * gap[:, None])**2
+    extra[:, V] = (HIDDEN_FORCE * gap[:, None])**2
+    extra[:, P] = (HIDDEN_FORCE * gap * T)[:, None]**2
     t = motion.state.t
     way = leg.travel
     delay = motion.state.constants[ODO_DELAY]
     outside = (t[:-1] + delay < way.t[0] - 0.1) | (t[1:] + delay > way.t[-1] + 0.1)
-    extra[outside, D] = ABSENT
+    extra[outside, D] = ABSENT_VARIANCE
     for at, sigma in zip(leg.doubt_t, leg.doubt_sigma, strict=True):
         k = np.searchsorted(t, at) - 1
         if 0 <= k < len(T) and sigma > 0:

@@ -4,13 +4,14 @@ import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.judge import judge
-from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.calib.mounting import FAR_YAW
+from odocal_ros.calib.result import Estimate, MethodResult, Source, TRACK_ROWS
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.remarks import beside, FLOOR, level_pitch, remarks
+from odocal_ros.calib.smoother.remarks import beside, level_pitch, MODEL_FLOOR, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
@@ -32,17 +33,15 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
-YAW_LIMIT = np.deg2rad(0.5)     # a mounting angle no better than this and asked is not known
-SCALE_LIMIT = 0.05              # the same of the scale, relative
-INFORMED = 0.5                  # posterior over prior: above it the data say little
-BACKWARDS = np.deg2rad(135.0)   # of yaw from nominal: no mounting, but the other way round
-FAR = np.deg2rad(20.0)
-TRACK_ROWS = 5000
+YAW_LIMIT = np.deg2rad(0.5)          # a mounting angle no better than this and asked is not known
+SCALE_LIMIT = 0.05                   # the same of the scale, relative
+INFORMED = 0.5                       # posterior over prior: above it the data say little
+FIT_BACKWARDS = np.deg2rad(135.0)    # of yaw from nominal: no mounting, but the other way round
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = range(GYRO.start, M)     # errors of Imu, receiver, tyres, body
+SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
@@ -103,7 +102,8 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                               f'{in_words(unsaid)}; what the settings say of it is kept'))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
-    sources = [*(_widened(s, widen) for s in shares(fit, near)), Source('model', np.diag(FLOOR))]
+    sources = [*(_widened(s, widen) for s in shares(fit, near)),
+               Source('model', np.diag(MODEL_FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
                         | {'slips': [vars(s) for s in slips],
@@ -115,7 +115,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
 def floored(covariance):
     """Return the covariance of the constants with what the model does not hold."""
     covariance = covariance.copy()
-    covariance[range(len(FLOOR)), range(len(FLOOR))] += FLOOR**2
+    covariance[range(len(MODEL_FLOOR)), range(len(MODEL_FLOOR))] += MODEL_FLOOR**2
     return covariance
 
 
@@ -192,11 +192,11 @@ def _undetermined(sigma, limit, config, yaw):
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'the drive tells the yaw mounting to '
                               f'{np.rad2deg(sigma[YAW]):.1f} deg only{wanted}: too little '
                               'acceleration and too few turns'))
-    elif off > BACKWARDS:
+    elif off > FIT_BACKWARDS:
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'the odometer runs against the Imu: '
                               'positive counts mean backwards, or the Imu faces backwards (yaw '
                               f'{np.rad2deg(yaw):+.1f} deg)'))
-    elif off > FAR:
+    elif off > FAR_YAW:
         reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'the yaw mounting of '
                               f'{np.rad2deg(yaw):+.1f} deg is {np.rad2deg(off):.1f} deg from the '
                               'nominal one'))
@@ -246,7 +246,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
 def _normalised(weighted):
     """Return how the rows of each sensor lie in their sigmas, before weights take off tails."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
-    white = fixes.r / np.sqrt(fixes.weight / fixes.thin)
+    white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
     return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
                    'beyond_3_sigma': float((np.abs(r) > 3).mean())}
             for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
@@ -258,7 +258,7 @@ def _outside(leg, problem, fit, sigma):
     out = {}
     for name in problem.outside:
         out[name] = {'messages': len(fit.weighted.parts[name].k),
-                     'alike': problem.thin.get(name, 1.0)}
+                     'alike': problem.per_effective.get(name, 1.0)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
                            'error': float(fit.state.constants[HEADING]),

@@ -12,13 +12,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
 
 Floats = NDArray[np.float64]
 VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say
-HEADING_LIMIT = 0.5         # rad: an orientation worse than this is no heading
 HEADING_RATE = 5.0          # Hz, more says nothing new
 GIVEN = 1e-4                # rad, noise of a heading given at the mark, beside its error
 

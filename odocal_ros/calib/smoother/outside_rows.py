@@ -25,7 +25,7 @@ class OutsideRows(PointRows):
     def __init__(self, problem, here):
         self._rows = self.rows(problem, here)
         self.k, self.raw = self._rows.k, self._rows.raw
-        self.thin = problem.thin.get(self.name, 1.0)
+        self.per_effective = problem.per_effective.get(self.name, 1.0)
 
     def rows(self, problem, here) -> Rows:
         """Return the rows at a state."""

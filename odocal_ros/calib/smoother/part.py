@@ -1,5 +1,5 @@
 """
-A part of the equations: what one sensor, or one belief, says of the unknowns.
+A part of the equations: what one sensor, or one prior, says of the unknowns.
 
 Each part is a file: residuals and derivatives at one state, first and least noise levels, and what
 its rows give to normal equations, cost, variance components and the budget of errors. It is made
@@ -16,7 +16,7 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
 
-TOLD = 3        # constants that the budget is of: ln K, yaw, pitch
+WANTED = 3    # constants that the budget is of: ln K, yaw, pitch
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class Part:
 
     def to_told(self, block):
         """Return the covariance of scale, yaw and pitch with the unknowns: (k, 3, 2n + M)."""
-        return block[:, 2 * self.n:2 * self.n + TOLD, :]
+        return block[:, 2 * self.n:2 * self.n + WANTED, :]
 
     def all_told(self, near):
         """Return that of all intervals: (K, 3, 2n + M)."""

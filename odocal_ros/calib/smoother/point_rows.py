@@ -14,26 +14,26 @@ from odocal_ros.calib.smoother.chain import blocks
 from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
 
-FAR = 3.0              # sigmas beyond which a row loses weight as a heavy tail has it
-FEWEST_ROWS = 5        # of which one may be an outlier
-FEWEST_BINS = 12       # to judge by, over how long errors are alike
-CUT = 3.0              # robust sigmas at which a residual is cut for that
+TAIL_SIGMAS = 3.0    # sigmas beyond which a row loses weight as a heavy tail has it
+FEWEST_JUDGED = 5    # of which one may be an outlier
+FEWEST_BINS = 12     # to judge by, over how long errors are alike
+CUT_SIGMAS = 3.0     # robust sigmas at which a residual is cut for that
 
 
 class PointRows(Part):
     """
     Rows of d components each.
 
-    A sensor's own class sets k (m,), the keyframes before; raw (m, d), residuals; thin, of how
-    many neighbours the errors are one: each row counts by so much less; share (m,), of the slow
-    fix error of the keyframe after, that is in a row of three components: None in what knows no
-    such. It has ``jacobians`` and ``stated``. Weighed are r (m, d), J (m, d, n + M), and J_end
+    A sensor's own class sets k (m,), the keyframes before; raw (m, d), residuals; per_effective,
+    of how many neighbours the errors are one: each row counts by so much less; share (m,), of the
+    slow fix error of the keyframe after, that is in a row of three components: None in what knows
+    no such. It has ``jacobians`` and ``stated``. Weighed are r (m, d), J (m, d, n + M), and J_end
     (m, 3, 3) by that slow error, or None.
     """
 
     levels_of: ClassVar[dict[str, slice]]     # columns that a level, factor on variances, is of
     source: ClassVar[str]                     # name in the budget
-    thin = 1.0
+    per_effective = 1.0
     share: np.ndarray | None = None
 
     @classmethod
@@ -61,14 +61,14 @@ class PointRows(Part):
             factor[columns] /= np.sqrt(levels[level])
         white = white * factor
         self.weight = self._weights(white)
-        each = np.sqrt(self.weight / self.thin)
+        each = np.sqrt(self.weight / self.per_effective)
         self.r = each * white
         self._root = (each * factor)[:, :, None]
         self.J_end = None
         if self.n == WITH_SLOW and self.share is not None:
             one = np.broadcast_to(np.eye(3), (len(white), 3, 3))
             self.J_end = -self.stated(one) * self._root * self.share[:, None, None]
-        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.thin
+        self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.per_effective
 
     @cached_property
     def J(self):
@@ -92,18 +92,19 @@ class PointRows(Part):
     def _weights(self, white):
         """Return weights of whitened residuals, (m, d), those of one level together."""
         w = np.ones_like(white)
-        if len(white) >= FEWEST_ROWS:
+        if len(white) >= FEWEST_JUDGED:
             for columns, size in self._sizes(white):
-                w[:, columns] = np.minimum(1.0, FAR / np.maximum(size, 1e-12))[:, None]**2
+                w[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
         return w
 
     def cost(self):
-        """Return the losses that the weights belong to: squares, logarithms beyond FAR."""
+        """Return the losses that the weights belong to: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
-        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.thin)):
-            far = np.maximum(size / FAR, 1.0)
-            total += float((np.minimum(size, FAR)**2 + 2 * FAR**2 * np.log(far)).sum())
-        return total / self.thin
+        for _, size in self._sizes(self.r / np.sqrt(self.weight / self.per_effective)):
+            far = np.maximum(size / TAIL_SIGMAS, 1.0)
+            total += float((np.minimum(size, TAIL_SIGMAS)**2
+                            + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
+        return total / self.per_effective
 
     def after(self, step, constants, reached):
         """Bring the residuals to where the step leads."""
@@ -162,12 +163,12 @@ class PointRows(Part):
 
     def components(self, near):
         """Return for each level its quadratic sum and what is expected of it."""
-        if len(self.k) < FEWEST_ROWS:
+        if len(self.k) < FEWEST_JUDGED:
             return {}
         taken = np.concatenate([self._taken(near.of(present), gather)
                                 for present, gather in self._intervals()])
         known = np.broadcast_to(self.known(), self.r.shape)
-        r2 = np.where(known, self.r, 0.0)**2 * self.thin
+        r2 = np.where(known, self.r, 0.0)**2 * self.per_effective
         return {level: (float(r2[:, columns].sum()),
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
@@ -200,7 +201,7 @@ def alike(rows: PointRows) -> float:
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # the level ones tell scale and yaw
     scale = np.median(np.abs(r), axis=0) / 0.6745
-    r = np.clip(r, -CUT * scale, CUT * scale)
+    r = np.clip(r, -CUT_SIGMAS * scale, CUT_SIGMAS * scale)
     r = r - r.mean(axis=0)
     power = (r**2).mean()
     most, length = 1.0, 2

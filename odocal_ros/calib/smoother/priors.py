@@ -1,8 +1,8 @@
-"""Priors as a part: what is believed of the biases, the constants, and where a leg begins."""
+"""Priors as a part, (S11): what is believed of biases, constants, and where a leg begins."""
 
 import numpy as np
 
-from odocal_ros.calib.smoother.part import hold, Part, TOLD
+from odocal_ros.calib.smoother.part import hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
@@ -85,4 +85,4 @@ class PriorRows(Part):
     def shared_effects(self, covariance):
         """Yield what errors do that are the same in every leg: names, (3, k)."""
         for name, where in self.shared.items():
-            yield name, covariance[:TOLD, where] / self.priors.constants[where]
+            yield name, covariance[:WANTED, where] / self.priors.constants[where]

@@ -38,14 +38,14 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.settings.grades import G, Grade, grade_as_seen
 
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
-# forward axis, times of odometer and of fixes s. NEAR, to do without another pass: first order
-# leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix. LIKE, to
-# keep the derivatives, which cost most: those of an interval are the same to half a per cent
-NEAR = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
-LIKE = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
-SPACING = 1.0        # s between keyframes
-NO_ERROR = 1e-12     # of what there is none of
-WARMING = 600.0      # s
+# forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
+# order leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix.
+# SAME_DERIVATIVES, to keep those, which cost most: an interval's are the same to half a per cent
+SAME_SUMS = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
+SAME_DERIVATIVES = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
+SPACING = 1.0           # s between keyframes
+NO_ERROR = 1e-12        # of what there is none of
+WARMING_TIME = 600.0    # s
 
 
 @dataclass(eq=False)
@@ -65,7 +65,7 @@ class Problem:
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict = field(default_factory=dict)     # levels
     shaken: dict = field(default_factory=dict)    # levels of the Imu to come down from
-    thin: dict = field(default_factory=dict)      # of velocity or heading, errors that are one
+    per_effective: dict = field(default_factory=dict)     # velocity, heading: errors that are one
     kept: 'Sums | None' = None                    # the last, which the next fit may do with
 
     @classmethod
@@ -98,7 +98,7 @@ class Problem:
         if kept is not None and kept.hold_at(state):
             return kept
         derived = None if kept is None else kept.derived_at
-        if derived is not None and not derived.hold_at(state, LIKE):
+        if derived is not None and not derived.hold_at(state, SAME_DERIVATIVES):
             derived = None
         kept = self.kept = None        # two at a time are as much as all else
         self.kept = made = self.sums(state, derived)
@@ -162,7 +162,7 @@ class Sums:
             return self.intervals, self.points, 0.0, *later
         return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, *later
 
-    def hold_at(self, state, limits=NEAR) -> bool:
+    def hold_at(self, state, limits=SAME_SUMS) -> bool:
         """Tell whether a state is near enough: for first order, or within other limits."""
         gyro, accel, c = self._apart(state)
         rate, force = self.intervals.mean_rate, self.intervals.mean_force
@@ -191,7 +191,8 @@ def imperfect_sigmas(grade, duration):
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     return np.repeat([grade.gyro_scale_error, axes, grade.gyro_by_force, grade.accel_scale_error,
-                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING), 4e-3, 3e-3, 5e-3], SIZES)
+                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING_TIME), 4e-3, 3e-3, 5e-3],
+                     SIZES)
 
 
 def _priors(config, grade, leg) -> Priors:

@@ -22,17 +22,17 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G, grade_of
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-SURE = 3.0             # sigmas at which something is there
 AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4
-SCALES_OFF = 4.0       # of the grade's sigma: another Imu
+SCALES_OFF = 4.0    # of the grade's sigma: another Imu
 AXES_OFF = 3.0
-LEAST_CHANGE = 3e-4    # of the scale within the leg, worth a word
-LEAST_ARM = 0.3        # m, the same; that of the wheel up is where a body tilts about
-NOISY = 1.5            # of the sigma that fixes state
-NEXT_DRIVE = 1e-3      # by how much the scale of one vehicle differs from drive to drive
+LEAST_CHANGE = 3e-4        # of the scale within the leg, worth a word
+LEAST_ARM = 0.3            # m, the same; that of the wheel up is where a body tilts about
+NOISIER_THAN_SAID = 1.5    # of the sigma that fixes state
+NEXT_DRIVE = 1e-3          # by how much the scale of one vehicle differs from drive to drive
 # what the model does not hold (docs/conventions.md): relative, rad
-FLOOR = np.array([3e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+MODEL_FLOOR = np.array([3e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
 def beside(value, covariance, grade) -> dict:
@@ -89,7 +89,7 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
     usual = imperfect_sigmas(grade_of(config.imu), leg.t_stop - leg.t_begin)
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
-    off *= np.abs(c) > SURE * sigma
+    off *= np.abs(c) > REMARK_SIGMAS * sigma
     if off[[AXIS_XY, AXIS_ZX]].max() > AXES_OFF:
         worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
         said.append(Reason(Code.IMU_AXES_SKEW, 'the axes of the accelerometer are off a right '
@@ -108,7 +108,7 @@ def _noisy(problem, levels):
     """Say where fixes, white and slow errors together, err by more than they state."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
-    if factor <= NOISY:
+    if factor <= NOISIER_THAN_SAID:
         return []
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'white and slow errors together, the fixes '
                    f'err {factor:.1f} times as much as their covariance says')]
@@ -121,7 +121,7 @@ def _varies(fit, sigma):
     for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from slow to fast'),
                           (BY_TIME, motion.from_mean[:, 1], 'from begin to end')):
         change = c[i] * np.ptp(span)
-        if abs(c[i]) > SURE * sigma[i] and abs(change) > LEAST_CHANGE:
+        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > LEAST_CHANGE:
             said.append(f'{100 * change:+.2f} % {what}')
     if not said:
         return []
@@ -135,7 +135,7 @@ def _arms(c, sigma, leg):
     for name, where, axes in (('odometer.lever_arm', ODO_ARM, 'xy'),
                               ('gnss.lever_arm', GNSS_ARM, 'xyz')):
         for i, axis in zip(range(where.start, where.stop), axes, strict=False):
-            if abs(c[i]) > max(SURE * sigma[i], LEAST_ARM):
+            if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], LEAST_ARM):
                 said.append(f'{name} {axis} by {c[i]:+.2f} m +- {sigma[i]:.2f}')
     if not said:
         return []

@@ -1,4 +1,4 @@
-"""Standstills as a part: no velocity at their keyframes, no turn within their intervals."""
+"""Standstills as a part, (S10): no velocity at their keyframes, no turn in their intervals."""
 
 import numpy as np
 

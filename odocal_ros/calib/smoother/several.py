@@ -8,17 +8,17 @@ from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE, scale_steps
-from odocal_ros.calib.smoother.imperfect import believed_together
+from odocal_ros.calib.smoother.imperfect import weighed_together
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
+from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED
-from odocal_ros.calib.smoother.remarks import beside, FLOOR
+from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
 from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
-P = 3                # parameters: ln K, yaw, pitch, the first of CONSTANTS
 DAY = 86400e9        # ns
-FAR_OFF = 5.0        # sigmas at which a delay or a lever arm that differs is worth saying
 ROUNDING = 1e-9      # of a correlation: there is none
 
 
@@ -51,13 +51,13 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     days = np.diff(np.asarray(times_ns)[order]) / DAY
     borders = [leg.border for leg in legs]
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
-    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P]) \
+    changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE
     found = _joint(borders, steps)
     if not found.spread and found.factor == 1:
         # legs that agree tell together what is imperfect; what they differ in would seem to be it
-        found = _joint(believed_together(borders, steps), steps)
+        found = _joint(weighed_together(borders, steps), steps)
     at = [found.names.index(name) for name in CONSTANTS]
     C = floored(found.covariance[np.ix_(at, at)])
     sigma = np.sqrt(np.diag(C))
@@ -80,7 +80,7 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
 
 
 def _joint(borders, steps) -> Joint:
-    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:P], CONSTANTS[:P])
+    return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED])
 
 
 def _changed(change, times_ns, numbers) -> Reason:
@@ -104,7 +104,7 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
     worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
     for name, z in apart.items():
         k = int(np.argmax(np.abs(z)))
-        if name not in PARAMETERS and abs(z[k]) < max(FAR_OFF, worst):
+        if name not in PARAMETERS and abs(z[k]) < max(FAULT_SIGMAS, worst):
             continue
         # of two each differs from the other alike
         who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
@@ -118,13 +118,13 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
 
 def _sources(used, C) -> tuple[Source, ...]:
     """Return the budget: what is believed of the vehicle, and what is the legs' own."""
-    alike = np.abs(C[:P] / np.sqrt(np.outer(np.diag(C)[:P], np.diag(C)))).max(axis=0)
-    shared = [Source(name, C[:P, i] / used[i], True) for name, i in SHARED.items()
+    alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
+    shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > ROUNDING]
-    apart = np.diag(FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
-    size, V = np.linalg.eigh(C[:P, :P] - apart)
+    apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
     return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
-            Source('model', np.diag(FLOOR)))
+            Source('model', np.diag(MODEL_FLOOR)))
 
 
 def _details(found: Joint, value, C, sources, legs):
@@ -132,7 +132,7 @@ def _details(found: Joint, value, C, sources, legs):
     return {
         'legs_used': legs, 'widened': found.factor,
         'budget': budget_table(sources, PARAMETERS, (float(np.exp(value[LN_K])), 1.0, 1.0)),
-        'correlation': correlations(C[:P, :P], PARAMETERS),
+        'correlation': correlations(C[:WANTED, :WANTED], PARAMETERS),
         'disagreement': {'chi2': found.chi2, 'freedom': found.freedom,
                          'between_legs': found.spread, 'curvature': found.bent.tolist()},
         **{CONSTANTS[i]: {'value': float(value[i]), 'sigma': float(sigma[i])} for i in SCALES}}

@@ -1,9 +1,9 @@
-"""Where the sigma comes from: each kind of error's share of scale, yaw and pitch."""
+"""Where the sigma comes from, (S14): each kind of error's share of scale, yaw and pitch."""
 
 import numpy as np
 
 from odocal_ros.calib.result import Source
-from odocal_ros.calib.smoother.part import TOLD
+from odocal_ros.calib.smoother.part import WANTED
 
 
 def shares(fit, neighbours) -> tuple[Source, ...]:
@@ -18,11 +18,11 @@ def shares(fit, neighbours) -> tuple[Source, ...]:
     covariance: dict[str, np.ndarray] = {}
     for part in parts.values():
         for name, effects in part.effects(neighbours):
-            flat = np.moveaxis(effects, -2, 0).reshape(TOLD, -1)
+            flat = np.moveaxis(effects, -2, 0).reshape(WANTED, -1)
             covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
     shared = [Source(name, effects, True)
               for name, effects in parts['priors'].shared_effects(solved)]
-    rest = solved[:TOLD, :TOLD] - sum(covariance.values()) - sum(
+    rest = solved[:WANTED, :WANTED] - sum(covariance.values()) - sum(
         s.effects @ s.effects.T for s in shared)
     own = [Source(name, _root(value)) for name, value in covariance.items()]
     return (*own, *shared, Source('standstill', _root(rest)))

@@ -1,14 +1,15 @@
-"""Slow errors of fixes as a part: a Gauss-Markov process at the keyframes."""
+"""Slow errors of fixes as a part, (S9): a Gauss-Markov process at the keyframes."""
 
 import numpy as np
 
 from odocal_ros.calib.smoother.part import hold, link, Part
 from odocal_ros.calib.smoother.state import SLOW
 
-LEAST = 0.005     # m
+LEAST_SLOW = 0.005    # m
 # s that errors stay: receivers over open land by a minute to a quarter of an hour; how much about
 # that by e-fold; the least that can be told from white
-USUAL, SPREAD, SHORTEST = 100.0, 0.6, 5.0
+USUAL_TIME, TIME_SPREAD, SHORTEST_TIME = 100.0, 0.6, 5.0
+
 
 class SlowError(Part):
     """
@@ -28,10 +29,10 @@ class SlowError(Part):
     @classmethod
     def first_levels(cls, problem):
         """Return first levels by what the fixes state, and their least."""
-        gain = 2 * problem.fix_sigma**2 / USUAL
+        gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
-            'slow': 2 * LEAST**2 / USUAL, 'slow_up': 2 * LEAST**2 / USUAL,
-            'correlation_time': SHORTEST}
+            'slow': 2 * LEAST_SLOW**2 / USUAL_TIME, 'slow_up': 2 * LEAST_SLOW**2 / USUAL_TIME,
+            'correlation_time': SHORTEST_TIME}
 
     def in_use(self, levels):
         """Tell whether slow errors are estimated."""
@@ -89,8 +90,8 @@ class SlowError(Part):
         da = a * self.T[:, None] / tau                       # by ln tau
         dq = 1 - 2 * a * da / (1 - a**2)                      # of ln drive
         score = float((product * da / self.drive + excess * dq / 2).sum() + begin.sum() / 2
-                      - np.log(tau / USUAL) / SPREAD**2)
-        information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + SPREAD**-2
+                      - np.log(tau / USUAL_TIME) / TIME_SPREAD**2)
+        information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
         return information + score, information
 
     def effects(self, near):

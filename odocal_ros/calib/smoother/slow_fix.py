@@ -13,13 +13,13 @@ import numpy as np
 
 from odocal_ros.calib.smoother.estimate import Fit, fit, Outline
 from odocal_ros.calib.smoother.fixes import Fixes
-from odocal_ros.calib.smoother.slow_error import USUAL
+from odocal_ros.calib.smoother.slow_error import USUAL_TIME
 
-BIN = 2.0                      # s over which residuals are averaged
-ALIKE, SURE = 0.15, 4.0        # correlation of neighbouring bins; its sigmas
-SMOOTHED = 0.2                 # of the stated sigma: a fix so much better was filtered
-TOLD = 90.0                    # s of fixes in which errors that stay for a minute show as alike
-SLOW_SHARE, WHITE_SHARE = 0.9, 0.2    # of the variance, to start from
+RESIDUAL_BIN = 2.0                           # s over which residuals are averaged
+SLOW_CORRELATION, SLOW_SIGMAS = 0.15, 4.0    # correlation of neighbouring bins; its sigmas
+SMOOTHED_SHARE = 0.2    # of the stated sigma: a fix so much better was filtered
+FIXES_S = 90.0    # s of fixes in which errors that stay for a minute show as alike
+SLOW_SHARE, WHITE_SHARE = 0.9, 0.2           # of the variance, to start from
 
 
 def correlation(t, residual):
@@ -30,7 +30,7 @@ def correlation(t, residual):
     """
     if len(t) < 4:
         return 0.0, 1.0
-    cell = np.floor((t - t[0]) / BIN).astype(int)
+    cell = np.floor((t - t[0]) / RESIDUAL_BIN).astype(int)
     at, first = np.unique(cell, return_index=True)
     count = np.diff(np.append(first, len(t)))
     mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
@@ -46,24 +46,24 @@ def are_slow(problem, first: Fit) -> bool:
     """Tell whether the errors of the fixes stay for a while: as told, or by a first fit."""
     if not np.isnan(problem.fix_time):
         return problem.fix_time > 0.0
-    if first.levels['fix'] < SMOOTHED**2:
+    if first.levels['fix'] < SMOOTHED_SHARE**2:
         return True
     t = problem.leg.t_fix[problem.use]
     alike, sigma = correlation(t, first.weighted[Fixes].r[:, :2])
-    return alike > max(ALIKE, SURE * sigma) or _hidden(t, first.levels['fix'])
+    return alike > max(SLOW_CORRELATION, SLOW_SIGMAS * sigma) or _hidden(t, first.levels['fix'])
 
 
 def _hidden(t, level) -> bool:
     """
     Tell whether the fixes of a short leg scatter less than they say.
 
-    In less than TOLD a slow error passes for another scale and heading, and what is left of it
+    In less than FIXES_S a slow error passes for another scale and heading, and what is left of it
     is hardly alike: what a receiver says of its errors and does not show as scatter is slow.
 
     t : (m,) s.   level : variance of the scatter, of the stated; good to 1 / sqrt(m) of itself,
     two components each.
     """
-    return t[-1] - t[0] < TOLD and level < 1 - SURE / np.sqrt(len(t))
+    return t[-1] - t[0] < FIXES_S and level < 1 - SLOW_SIGMAS / np.sqrt(len(t))
 
 
 def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
@@ -80,7 +80,7 @@ def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
         As for ``fit``.
 
     """
-    time = USUAL if np.isnan(problem.fix_time) else problem.fix_time
+    time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
     gain, gain_up = (2 / time * SLOW_SHARE * np.median(problem.leg.covariance_n[:, i, i])
                      for i in (0, 2))
     white, up = first.levels['fix'], first.levels['fix_up']

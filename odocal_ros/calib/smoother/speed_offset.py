@@ -12,10 +12,10 @@ import numpy as np
 from odocal_ros.calib.smoother.estimate import Fit, fit
 from odocal_ros.calib.smoother.state import SPEED_OFFSET
 
-TELLING = 8.0      # sigmas between both
-NEAR = 2.5         # sigmas from one of them
-EXACT = 1e-3       # of a step, sigma of what is known
-FEW = 6            # passes
+TELLING_SIGMAS = 8.0    # sigmas between both
+NEAR_SIGMAS = 2.5       # sigmas from one of them
+EXACT_SHARE = 1e-3      # of a step, sigma of what is known
+OFFSET_PASSES = 6       # passes
 
 
 def judge_offset(problem, now: Fit, trace=None) -> Fit:
@@ -30,17 +30,17 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
     sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     found = float(now.state.constants[SPEED_OFFSET])
     known = coarse.step / 2 if found > coarse.step / 4 else 0.0
-    if TELLING * sigma > coarse.step / 2 or abs(found - known) > NEAR * sigma:
+    if TELLING_SIGMAS * sigma > coarse.step / 2 or abs(found - known) > NEAR_SIGMAS * sigma:
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
     outline = now.outline()
     del now             # the equations of one fit at a time
-    sure = EXACT * coarse.step
+    sure = EXACT_SHARE * coarse.step
     about = replace(outline, priors=_held(outline.priors, known, sure),
                     first=_held(outline.first, known, sure))
-    last = fit(problem, replace(about.state, constants=constants), about.levels, FEW, about=about,
-               frozen=True, trace=trace)
+    last = fit(problem, replace(about.state, constants=constants), about.levels, OFFSET_PASSES,
+               about=about, frozen=True, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 
 

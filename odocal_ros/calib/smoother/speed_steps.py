@@ -28,7 +28,7 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 
-LEAST = 0.25     # of the variance by the grid: no vehicle crosses its edges more evenly
+LEAST_GRID_SHARE = 0.25    # of the variance by the grid: no vehicle crosses its edges more evenly
 
 
 class SpeedSteps(PointRows):
@@ -43,7 +43,7 @@ class SpeedSteps(PointRows):
         self.told, self.k = _within(problem), points.interval
         self.sigma = self.told.sigma * leg.rough_scale
         # at an even acceleration the speed is at the same place of its cell again and again
-        self.thin = problem.thin.get(self.name, 1.0)
+        self.per_effective = problem.per_effective.get(self.name, 1.0)
         C, tau = state.C_nb[self.k], points.tau[:, None]
         self.C, self.C_t = C, C @ points.R
         self.dv = turn(C, points.dv)
@@ -79,7 +79,7 @@ class SpeedSteps(PointRows):
     @classmethod
     def first_levels(cls, problem):
         """Return the first level, a factor on the variances by the grid, and the least."""
-        return {'steps': 1.0}, {'steps': LEAST}
+        return {'steps': 1.0}, {'steps': LEAST_GRID_SHARE}
 
     def stated(self, rows):
         """Return rows in the sigmas that the grid gives."""

@@ -22,10 +22,10 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.rotations import skew
 
-LIVELY = 1.0          # m/s^2 that an acceleration over 1 s may be of
+LIVELY_FORCE = 1.0    # m/s^2 that an acceleration over 1 s may be of
 SPEED_WINDOW = 0.4    # s each side, over which a speed is taken
-UNSURE = 0.2          # of the rotation found from accelerations: more is no heading
-EDGE = 0.5            # s
+UNSURE_SHARE = 0.2    # of the rotation found from accelerations: more is no heading
+START_EDGE = 0.5      # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ def standing(leg, t):
     """Tell which of the times lie well inside a standstill: (N,) bool."""
     inside = np.zeros(len(t), bool)
     for begin, end in leg.standstills:
-        inside |= (t >= begin + EDGE) & (t <= end - EDGE)
+        inside |= (t >= begin + START_EDGE) & (t <= end - START_EDGE)
     return inside
 
 
@@ -95,7 +95,7 @@ def first_state(leg, imu, priors, yaw=None) -> Start:
     chi = track.chi
     if yaw is not None:
         psi = chi + yaw
-    elif yaw_sigma > UNSURE:
+    elif yaw_sigma > UNSURE_SHARE:
         psi = chi
     return Start(_state(leg, t, C_nL(psi) @ C_Lk, bias, track, wrap(psi - chi)),
                  yaw_sigma, track.spread)
@@ -121,7 +121,7 @@ def _level(leg, sums, C_0k, bias_sigma):
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
     up = up / np.linalg.norm(up)
-    weight = np.sqrt(T) / LIVELY
+    weight = np.sqrt(T) / LIVELY_FORCE
     change = np.zeros(3)
     for _ in range(3):
         J = np.concatenate([np.broadcast_to(np.eye(3) * g, (len(T), 3, 3)),

@@ -17,9 +17,9 @@ from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
 
 Floats = NDArray[np.float64]
 P, V, PHI, BG, BA = (slice(3 * i, 3 * i + 3) for i in range(5))
-E = 15                       # travel error
-SLOW = slice(16, 19)         # slow part of the fix error, ENU, where there is one
-BARE, WITH_SLOW = 16, 19     # unknowns of a block
+E = 15                      # travel error
+SLOW = slice(16, 19)        # slow part of the fix error, ENU, where there is one
+BARE, WITH_SLOW = 16, 19    # unknowns of a block
 
 # the border
 CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
@@ -35,9 +35,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
              'scale_by_braking', 'squat', 'sideslip', 'speed_offset')
 LN_K, YAW, PITCH = 0, 1, 2
-ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)      # from the Imu, base_link axes, m
+ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)    # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY = 9, 10
-HEADING = 11                 # error of the outside heading, the same through the leg, rad
+HEADING = 11    # error of the outside heading, the same through the leg, rad
 # Errors of the Imu: of what a signal measures, the part that an axis has too much. Each column:
 # the axis it enters, and the signal, of (w_x, w_y, w_z, f_x, f_y) and of (f_x, f_y, f_z). The
 # others of the 18 are a bias (f_z into x and y), or zero by the definition of the axes (z: about
@@ -48,14 +48,14 @@ GYRO_AXIS = (2, 0, 1, 0, 1, 2, 2, 0, 0, 1, 1, 2, 2)
 GYRO_SIGNAL = (2, 0, 1, 1, 0, 0, 1, 3, 4, 3, 4, 3, 4)
 ACCEL = slice(25, 31)
 ACCEL_AXIS, ACCEL_SIGNAL = (0, 1, 2, 0, 2, 2), (0, 1, 2, 1, 0, 1)
-FIX_LAG2 = 31                # s^2, square of the time constant by which a receiver smooths
-# relative change of the scale with the square of the speed (as its slope at FAST, 1 / (m/s)), with
+FIX_LAG2 = 31    # s^2, square of the time constant by which a receiver smooths
+# relative change of the scale with the square of the speed (its slope at FAST_SPEED, s/m), with
 # time, 1 / s, and with what the tyres pull and brake, 1 / (m/s^2), from their means by travel.
 # Pull and braking are two: a wheel that does not drive brakes only
 TYRES = slice(32, 36)
 BY_SPEED, BY_TIME = 32, 33
-FAST = 20.0                  # m/s
-SQUAT, SIDESLIP = 36, 37     # rad per m/s^2: the forward axis by forward and by left acceleration
+FAST_SPEED = 20.0           # m/s
+SQUAT, SIDESLIP = 36, 37    # rad per m/s^2: the forward axis by forward and by left acceleration
 # what a good vehicle has not: all to here, but for the gyro's scale, which every turn tells
 IMPERFECT = slice(13, 38)
 # kinds of these, each there or not, as ``imperfect_sigmas`` has them: gyro scales, axes and by
@@ -63,7 +63,7 @@ IMPERFECT = slice(13, 38)
 SIZES = (2, 4, 6, 3, 3, 1, 1, 1, 2, 1, 1)
 KINDS = tuple(slice(sum(SIZES[:i]), sum(SIZES[:i + 1])) for i in range(len(SIZES)))
 # of a speed sent in steps, what a value of it lacks: half a step where the sender truncates
-SPEED_OFFSET = 38            # scale units per s
+SPEED_OFFSET = 38    # scale units per s
 M = len(CONSTANTS)
 
 

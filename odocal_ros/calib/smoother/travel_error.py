@@ -1,11 +1,11 @@
-"""The odometer's rounding as a part: how far a reading at a keyframe may be off."""
+"""The odometer's rounding as a part, (S6): how far a reading at a keyframe may be off."""
 
 import numpy as np
 
 from odocal_ros.calib.smoother.part import hold, Part
 from odocal_ros.calib.smoother.state import E
 
-LEAST = 1e-3      # m
+LEAST_TRAVEL_ERROR = 1e-3    # m
 
 
 class TravelError(Part):
@@ -22,7 +22,8 @@ class TravelError(Part):
     def first_levels(cls, problem):
         """Return the level of rounding to a count, which is the least too."""
         leg = problem.leg
-        level = {'travel': max(leg.travel.quantum**2 / 12, (LEAST / leg.rough_scale)**2)}
+        least = LEAST_TRAVEL_ERROR / leg.rough_scale
+        level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
         return level, level
 
     def weigh(self, levels):

@@ -6,17 +6,17 @@ import numpy as np
 
 from odocal_ros.calib.wheels.model import State
 from odocal_ros.nav.dead_reckoning import Track
+from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
-RATE = 20.0          # Hz, of epochs: between them a turn bends the way by a millimetre
-FAR = 5.0            # robust sigmas from the fixes beside: an outlier
-BESIDE = 7           # fixes each side
-HUBER = 1.345        # sigmas beyond which the pull of a fix no longer grows
+EPOCH_RATE_HZ = 20.0        # Hz, of epochs: between them a turn bends the way by a millimetre
+FIXES_BESIDE = 7            # fixes each side
+HUBER = 1.345               # sigmas beyond which the pull of a fix no longer grows
 
 
 def thinned(leg):
-    """Return a leg with no more epochs than RATE asks: its tracks are sums, nothing is lost."""
+    """Return a leg with no more epochs than EPOCH_RATE_HZ asks: of sums, nothing is lost."""
     t = leg.left.t
-    step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / RATE))
+    step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / EPOCH_RATE_HZ))
     pick = np.unique(np.append(np.arange(0, len(t), step), len(t) - 1))
     return replace(leg, **{side: Track(*(getattr(getattr(leg, side), name)[pick] for name in (
         't', 'q_nb', 's', 'P'))) for side in ('left', 'right')})
@@ -49,11 +49,11 @@ def near_neighbours(residual, sigma):
 
     residual : (k, 2) fixes less a track, m, slow errors and all.   sigma : (k,) stated.
     """
-    span = 2 * BESIDE + 1
+    span = 2 * FIXES_BESIDE + 1
     if len(residual) <= span:
         return np.ones(len(residual), bool)
-    padded = np.pad(residual, ((BESIDE, BESIDE), (0, 0)), mode='reflect')
+    padded = np.pad(residual, ((FIXES_BESIDE, FIXES_BESIDE), (0, 0)), mode='reflect')
     windows = np.lib.stride_tricks.sliding_window_view(padded, span, axis=0)
     off = np.hypot(*(residual - np.median(windows, axis=-1)).T)
     usual = max(np.median(off / sigma) / 1.1774, 0.2)       # of a Rayleigh law
-    return off <= FAR * usual * sigma
+    return off <= OUTLIER_SIGMAS * usual * sigma

@@ -15,10 +15,10 @@ from odocal_ros.calib.wheels.judge_noise import slow_means, spread
 from odocal_ros.calib.wheels.model import Bins, Equations, State
 from odocal_ros.calib.wheels.noise import node_covariance
 
-KNOWN = 0.3          # of the prior: a larger sigma of the pitch says nothing
-SLOW_TIME = 60.0     # s: heights are taken as errors that last so long, half of their variance
-OUTLIER = 4.0        # robust sigmas
-GEOID = 30.0         # m: what a start height may be off the mark's own
+KNOWN_PITCH = 0.3       # of the prior: a larger sigma of the pitch says nothing
+SLOW_TIME = 60.0        # s: heights are taken as errors that last so long, half of their variance
+HEIGHT_OUTLIER = 4.0    # robust sigmas
+START_HEIGHT = 30.0     # m: what a start height may be off the mark's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Height:
     """
     What heights say.
 
-    pitch, pitch_sigma : rad, mounting and level together, the belief where not known.
+    pitch, pitch_sigma : rad, mounting and level together, the prior where not known.
     start : m, height of the antenna at the start mark.   phi : (N + 1, 2) rad, tilt about east
     and north.   climb_variance : rad^2, mean over the way of what is not known of its climb.
     tilt_variance : (N + 1,) rad^2, of the level at the nodes, mean of two axes.
@@ -65,13 +65,13 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
         if found is None:
             return unknown
         delta, covariance, phi, P, cross, off = found
-        far = use & (off > OUTLIER)
+        far = use & (off > HEIGHT_OUTLIER)
         if not far.any():
             break
         keep = use & ~far
     sigma = float(np.sqrt(covariance[1, 1]))
     pitch = state.pitch + float(delta[1])
-    if sigma > KNOWN * PITCH_PRIOR or abs(pitch) > PITCH_LIMIT:
+    if sigma > KNOWN_PITCH * PITCH_PRIOR or abs(pitch) > PITCH_LIMIT:
         return unknown
     tilt = np.diag(Q) - np.einsum('ij,ik,kj->j', (L @ Q)[use], P, (L @ Q)[use], optimize=True)
     return Height(pitch, sigma, float(state.start_n[2] + delta[0]), phi.reshape(2, -1).T,
@@ -93,8 +93,8 @@ def _fix_noise(leg, bins, r, use):
 def _solve(V, r, X, use, LQ, state):
     inverse = np.linalg.inv(V[np.ix_(use, use)])
     right = X[use].T @ inverse
-    # the belief of the pitch, weakly of the height
-    weight = np.array([1 / GEOID**2 * 1e-4, 1 / PITCH_PRIOR**2])
+    # the prior of the pitch, weakly of the height
+    weight = np.array([1 / START_HEIGHT**2 * 1e-4, 1 / PITCH_PRIOR**2])
     covariance = np.linalg.inv(right @ X[use] + np.diag(weight))
     delta = covariance @ (right @ r[use] - weight * [0.0, state.pitch])
     if not np.isfinite(delta).all():

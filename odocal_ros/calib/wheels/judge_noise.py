@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.model import Bins
 
-TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])   # s
-SLOW = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
-BELIEF = 0.5          # ln: how far the stated variance may be off, before looking
-SLIPS = np.append(0.0, np.geomspace(1e-5, 0.1, 41))      # m/sqrt(s)
-NOTHING = 0.8         # belief that nothing lasts, no wheel slips
+SLOW_TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])    # s
+SLOW_VARIANCES = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
+STATED_PRIOR = 0.5    # ln: how far the stated variance may be off, before looking
+SLIP_NOISES = np.append(0.0, np.geomspace(1e-5, 0.1, 41))                    # m/sqrt(s)
+NOTHING_LASTS_PRIOR = 0.8    # probability that nothing lasts, no wheel slips
 # where something does: size, and ln by which it may be off
-SLOW_BELIEF = 1.0, 2.0        # of the stated variance
-SLIP_BELIEF = 3e-3, 1.5       # m/sqrt(s)
-LEVELS = 2.0**(np.arange(-4, 8) / 1.5)    # of the variance of rounding in motion
-LEVEL_BELIEF = 0.7    # ln: how far it may be off, before looking
-LEAST_WHITE = 1e-4    # of the stated variance
-FEW = 20              # fixes below which their scatter says nothing
+SLOW_PRIOR = 1.0, 2.0                              # of the stated variance
+SLIP_PRIOR = 3e-3, 1.5                             # m/sqrt(s)
+ROUNDING_LEVELS = 2.0**(np.arange(-4, 8) / 1.5)    # of the variance of rounding in motion
+LEVEL_PRIOR = 0.7                                  # ln: how far it may be off, before looking
+LEAST_WHITE_SHARE = 1e-4                           # of the stated variance
+FEWEST_SCATTERED = 20                              # fixes below which their scatter says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +63,9 @@ def white_share(t_fix, residual, covariance_n, bins: Bins):
     near = np.diff(t_fix[bins.fix]) < 3 * np.median(np.diff(t_fix[bins.fix]))
     stated = np.diagonal(covariance_n[bins.fix][:, :2, :2], axis1=1, axis2=2)
     step = np.diff(residual, axis=0)**2 / (stated[1:] + stated[:-1])
-    if near.sum() < FEW:
+    if near.sum() < FEWEST_SCATTERED:
         return 1.0
-    return max(float(step[near].mean()), LEAST_WHITE)
+    return max(float(step[near].mean()), LEAST_WHITE_SHARE)
 
 
 def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise:
@@ -99,20 +99,21 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
         return FixNoise(white, 0.0, np.nan, W)
     use = np.flatnonzero(np.tile(bins.filled, 2))
     root = np.sqrt(stated).T.ravel()
-    times = TIMES if np.isnan(told) else np.array([told])
+    times = SLOW_TIMES if np.isnan(told) else np.array([told])
     begin, end = spread(bins, t_fix)
     shapes = [root[:, None] * np.kron(np.eye(2), slow_means(begin, end, time)) * root
               for time in times]
-    belief = -0.5 * (np.log(white + SLOW) / BELIEF)**2
-    belief += sizes_believed(SLOW, *SLOW_BELIEF)
+    log_prior = -0.5 * (np.log(white + SLOW_VARIANCES) / STATED_PRIOR)**2
+    log_prior += sizes_believed(SLOW_VARIANCES, *SLOW_PRIOR)
     cut = np.ix_(use, use)
     white_root = inverse_root((known + W)[cut])
-    log = np.array([belief + evidence(r[use], X[use], white_root, S[cut], SLOW) for S in shapes])
+    log = np.array([log_prior + evidence(r[use], X[use], white_root, S[cut], SLOW_VARIANCES)
+                    for S in shapes])
     p = np.exp(log - log.max())
     p /= p.sum()
     best = np.unravel_index(np.argmax(p), p.shape)
-    slow = sum((p[i] @ SLOW) * S for i, S in enumerate(shapes))
-    return FixNoise(white, float((p @ SLOW).sum()),
+    slow = sum((p[i] @ SLOW_VARIANCES) * S for i, S in enumerate(shapes))
+    return FixNoise(white, float((p @ SLOW_VARIANCES).sum()),
                     float(times[best[0]]) if best[1] else np.nan, W + slow)
 
 
@@ -129,21 +130,21 @@ def judge_turns(r, X, known, counts, walk) -> TurnNoise:
         1 m/sqrt(s).
 
     """
-    levels = LEVELS if counts.any() else np.ones(1)
-    belief = -0.5 * ((np.log(levels) + LEVEL_BELIEF**2 / 2) / LEVEL_BELIEF)**2     # mean 1
-    belief = belief[:, None] + sizes_believed(SLIPS, *SLIP_BELIEF)
+    levels = ROUNDING_LEVELS if counts.any() else np.ones(1)
+    log_prior = -0.5 * ((np.log(levels) + LEVEL_PRIOR**2 / 2) / LEVEL_PRIOR)**2     # mean 1
+    log_prior = log_prior[:, None] + sizes_believed(SLIP_NOISES, *SLIP_PRIOR)
     roots = [inverse_root(known + level * counts) for level in levels]
-    log = belief + [evidence(r, X, root, walk, SLIPS**2) + np.log(np.diag(root)).sum()
+    log = log_prior + [evidence(r, X, root, walk, SLIP_NOISES**2) + np.log(np.diag(root)).sum()
                     for root in roots]
     p = np.exp(log - log.max())
     p /= p.sum()
-    return TurnNoise(float((p @ SLIPS**2).sum()), float(levels @ p.sum(axis=1)))
+    return TurnNoise(float((p @ SLIP_NOISES**2).sum()), float(levels @ p.sum(axis=1)))
 
 
 def sizes_believed(sizes, usual, spread):
     """Return the log of what is believed of sizes, the first of them 0, before looking: (n,)."""
-    log = np.append(np.log(NOTHING), -0.5 * (np.log(sizes[1:] / usual) / spread)**2)
-    log[1:] += np.log(1 - NOTHING) - np.log(np.exp(log[1:]).sum())
+    log = np.append(np.log(NOTHING_LASTS_PRIOR), -0.5 * (np.log(sizes[1:] / usual) / spread)**2)
+    log[1:] += np.log(1 - NOTHING_LASTS_PRIOR) - np.log(np.exp(log[1:]).sum())
     return log
 
 

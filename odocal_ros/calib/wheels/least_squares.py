@@ -17,7 +17,7 @@ from odocal_ros.calib.wheels.model import (
     WIDTH,
 )
 
-TINY = 1e-13      # of the largest variance: keeps a covariance solvable
+SOLVABLE_SHARE = 1e-13    # of the largest variance: keeps a covariance solvable
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Drift:
 
 def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
     """
-    Solve r = X step + e, cov e = V, with beliefs; and the drift, whose share of e is L phi.
+    Solve r = X step + e, cov e = V, with priors; and the drift, whose share of e is L phi.
 
     Parameters
     ----------
@@ -73,7 +73,8 @@ def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
 
     """
     V = V[np.ix_(use, use)]
-    root = np.linalg.inv(np.linalg.cholesky(V + TINY * np.diag(V).max() * np.eye(len(V))))
+    least = SOLVABLE_SHARE * np.diag(V).max()
+    root = np.linalg.inv(np.linalg.cholesky(V + least * np.eye(len(V))))
     inverse = root.T @ root
     Xu, ru, LQ = X[use], r[use], drift.L[use] @ drift.Q
     right = Xu.T @ inverse

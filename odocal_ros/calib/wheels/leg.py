@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import MarkFix
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import forward_b, Origin, Track
 
@@ -56,7 +57,8 @@ class WheelLeg:
     uneven: bool = False
 
 
-def positions(leg: WheelLeg, t, k_left, k_right, heading_error, pitch=0.0):
+def positions(leg: WheelLeg, t: Floats, k_left: float, k_right: float, heading_error: float,
+              pitch: float = 0.0) -> Floats:
     """
     Return antenna positions of the corrected track, n, m: (n,) times to (n, 3).
 

@@ -31,8 +31,8 @@ PARAMETERS = ('scale', 'log_ratio', 'heading', 'east', 'north', 'width', 'turn_o
               'gyro_scale', 'fix_lag_square')
 SCALE, RATIO, HEADING, EAST, NORTH, WIDTH, OFFSET, LATENCY, GYRO, FIX_LAG2 = range(
     len(PARAMETERS))
-NUISANCES = [LATENCY, GYRO, FIX_LAG2]      # estimated, believed beforehand, and no result
-HALF = 0.25     # s each side that a velocity is taken over
+NUISANCES = [LATENCY, GYRO, FIX_LAG2]    # estimated, believed beforehand, and no result
+VELOCITY_WINDOW = 0.25                   # s each side that a velocity is taken over
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def equations(leg: WheelLeg, bins: Bins, state: State, since: float) -> Equation
     smoothed, by_lag = _smoothed(leg, state, way, t)
     detail = leg.fixes_n[bins.fix] - (state.start_n + way.at('v', t) + arm @ leg.lever_b
                                       + smoothed)
-    before, after = (np.clip(t + x, *way.t[[0, -1]]) for x in (-HALF, HALF))
+    before, after = (np.clip(t + x, *way.t[[0, -1]]) for x in (-VELOCITY_WINDOW, VELOCITY_WINDOW))
     velocity = (way.at('v', after) - way.at('v', before)) / np.maximum(
         after - before, 1e-6)[:, None]
     by = np.stack([*(way.at(name, t) for name in ('v', 'ratio', 'heading', 'pitch')), -velocity,
@@ -167,7 +167,7 @@ def _arm(leg, state, way, t):
 
 def _smoothed(leg, state, way, t):
     """Return what smoothing adds to places at times, and its derivative: (k, 3) m each."""
-    grid = np.arange(way.t[0], way.t[-1], 2 * HALF)
+    grid = np.arange(way.t[0], way.t[-1], 2 * VELOCITY_WINDOW)
     place = way.at('v', grid) + _arm(leg, state, way, grid) @ leg.lever_b
     return smoothing(grid, place, np.gradient(place, grid, axis=0), t, state.fix_lag_square)
 

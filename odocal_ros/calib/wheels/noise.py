@@ -15,7 +15,7 @@ from odocal_ros.calib.wheels.model import Bins, Equations, State
 
 ANY_WIDTH = 1.6      # m, of a car: where nothing is known yet
 LEAST_WIDTH = 0.1    # m: less is none
-LOOSE = 3.0          # times the gyro's drift: what a width not known makes of turns
+LOOSE_WIDTH = 3.0    # times the gyro's drift: what a width not known makes of turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,5 +184,5 @@ def unknown_width(eq: Equations, drift) -> Part:
     n = len(eq.turn)
     mean = phi_loading(eq, ANY_WIDTH)[2 * n:]
     whole = np.zeros((3 * n, 3 * n))
-    whole[2 * n:, 2 * n:] = LOOSE**2 * mean @ drift @ mean.T
+    whole[2 * n:, 2 * n:] = LOOSE_WIDTH**2 * mean @ drift @ mean.T
     return Part('track_width_unknown', covariance=whole)

@@ -2,25 +2,23 @@
 
 import numpy as np
 
+from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.two_point import PITCH_PRIOR
-from odocal_ros.calib.wheels.beliefs import WIDTH_SIGMA
 from odocal_ros.calib.wheels.model import PARAMETERS
 from odocal_ros.calib.wheels.noise import LEAST_WIDTH
+from odocal_ros.calib.wheels.priors import WIDTH_SIGMA
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
-RANGE = 0.05         # of a wheel's factor, where wheels.radius_range says nothing
-SHARE = 0.5          # of that range: a ratio no better is none
-WIDTH_SHARE = 0.05   # of a track width: a sigma that still says something
-BETTER = 0.5         # of the belief's sigma: what counts as learned
-SCALE_LIMIT = 0.1    # relative sigma beyond which there is no scale
-HEADING_LIMIT = 0.5  # rad
-NOISY = 1.25         # times the stated sigma: worth saying
-WILD, LOST = 5.0, 0.01     # times the stated sigma, and of the way: no track at all
-BACKWARDS = np.deg2rad(160.0)
-FAR = np.deg2rad(20.0)
-NOTHING = 1e-9       # of the other parameters' weight
+RADIUS_RANGE = 0.05    # of a wheel's factor, where wheels.radius_range says nothing
+RATIO_OF_RANGE = 0.5                   # of that range: a ratio no better is none
+WIDTH_SHARE = 0.05                     # of a track width: a sigma that still says something
+LEARNED_SHARE = 0.5                    # of the prior's sigma: what counts as learned
+NO_SCALE_SIGMA = 0.1                   # relative sigma beyond which there is no scale
+NOISIER_WORTH = 1.25                   # times the stated sigma: worth saying
+WILD_TIMES, LOST_OF_WAY = 5.0, 0.01    # times the stated sigma, and of the way: no track at all
+NO_WEIGHT = 1e-9    # of the other parameters' weight
 
 
 def correlation(covariance, names=PARAMETERS):
@@ -55,7 +53,7 @@ def without_turns(solution: Solution):
     size = np.sqrt(np.diag(wheels))
     values = np.linalg.eigvalsh(wheels / np.outer(size, size))
     size = np.sqrt(np.diag(normal))
-    size = np.maximum(size, NOTHING * size.max())       # of one counter for both: no ratio at all
+    size = np.maximum(size, NO_WEIGHT * size.max())     # of one counter for both: no ratio at all
     rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
     variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not told at all
     return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])
@@ -63,7 +61,7 @@ def without_turns(solution: Solution):
 
 def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reason, ...]:
     """Return why left and right cannot be told apart, empty if they can."""
-    limit = SHARE * (config.wheels.radius_range or RANGE)
+    limit = RATIO_OF_RANGE * (config.wheels.radius_range or RADIUS_RANGE)
     if turn_rate and sigma_ratio <= limit:
         return ()
     condition, _ = without_turns(solution)
@@ -85,7 +83,7 @@ def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ..
                               'lay between them'),)
     told = solution.width_told and sigma < WIDTH_SHARE * width
     if told or given:
-        return told and (not given or sigma < BETTER * WIDTH_SIGMA * given), ()
+        return told and (not given or sigma < LEARNED_SHARE * WIDTH_SIGMA * given), ()
     away = solution.eq.yaw
     return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the heading ranges over '
                           f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
@@ -113,11 +111,11 @@ def judge_heading(leg, heading, config) -> tuple[Reason, ...]:
                           'is their sum'),)
     nominal = config.imu.nominal_yaw
     off = abs(float(wrap(-heading - (0.0 if np.isnan(nominal) else nominal))))
-    if off > BACKWARDS:
+    if off > BACKWARDS_YAW:
         reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
                            'counts mean backwards, or the Imu faces backwards (yaw '
                            f'{np.rad2deg(-heading):+.1f} deg)'),)
-    elif off > FAR:
+    elif off > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({a.heading_source}) and course '
                            f'make a yaw mounting of {np.rad2deg(-heading):+.1f} deg, '
                            f'{np.rad2deg(off):.1f} deg from the nominal one'),)
@@ -128,13 +126,13 @@ def judge_fit(solution: Solution) -> tuple[Reason, ...]:
     """Return what is to be said of fixes, heights and convergence."""
     reasons: tuple[Reason, ...] = ()
     noise = np.sqrt(solution.noise.white + solution.noise.slow)
-    if noise > NOISY:
+    if noise > NOISIER_WORTH:
         reasons += (Reason(Code.FIXES_NOISIER_THAN_SAID, f'the fixes stray {noise:.1f} times as '
                            'far from the track as their covariance says'),)
     n = len(solution.eq.turn)
     residual = solution.residual[:2 * n][solution.fit.use[:2 * n]]
     rms, way = np.sqrt(2 * (residual**2).mean()), solution.eq.length.sum()
-    if noise > WILD and rms > LOST * way:
+    if noise > WILD_TIMES and rms > LOST_OF_WAY * way:
         reasons += (Reason(Code.TRACK_MISMATCH, f'with the best factors the track is {rms:.1f} m '
                            f'rms from the fixes on {way:.0f} m, {noise:.1f} times as far as they '
                            'say: the gyro does not turn as the vehicle does, or the fixes are '

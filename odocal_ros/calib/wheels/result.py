@@ -9,17 +9,17 @@ from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
 from odocal_ros.calib.wheels.model import FIX_LAG2, GYRO, HEADING, LATENCY, RATIO, SCALE, WIDTH
 from odocal_ros.calib.wheels.observable import (
     correlation,
-    HEADING_LIMIT,
     judge_fit,
     judge_heading,
     judge_width,
-    SCALE_LIMIT,
+    NO_SCALE_SIGMA,
     separable,
     width_told,
     without_turns,
 )
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.calib.wheels.unseen import solve_with_slips
+from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.earth import A
@@ -29,9 +29,9 @@ PARAMETERS = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mo
               'track_width')       # rows of the sources: relative for scales, rad, m
 NOTE = ('heading_error is how far the heading at the start must be turned, counter-clockwise: its '
         'error less the yaw mounting angle, which a drive cannot tell apart')
-BENDS = 1.5e-6       # of a scale in town, by simulated fixes of 2 cm and better: a bend between
+BEND_SIGMA = 1.5e-6    # of a scale in town, by simulated fixes of 2 cm and better: a bend between
 # epochs of 40 ms is cut; counts and bins add to it
-LEARNED = 0.7        # of the alignment's sigma: a gyro bias that the leg tells better
+LEARNED_BIAS = 0.7    # of the alignment's sigma: a gyro bias that the leg tells better
 
 
 def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
@@ -63,7 +63,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
                                    'than five seconds of them'))
     covariance = np.linalg.inv(solution.fit.normal)
     sigma = np.sqrt(np.diag(covariance))
-    if not (np.isfinite(sigma).all() and sigma[SCALE] < SCALE_LIMIT
+    if not (np.isfinite(sigma).all() and sigma[SCALE] < NO_SCALE_SIGMA
             and sigma[HEADING] < HEADING_LIMIT):
         return refused(leg, Reason(Code.LEG_TOO_SHORT, 'the fixes tell the scale only to '
                                    f'{100 * sigma[SCALE]:.2g} %'))
@@ -112,7 +112,7 @@ def refused(leg, reason) -> MethodResult:
 def _rows(solution):
     """Return the derivatives of PARAMETERS by the solution's own parameters, (5, p)."""
     ratio = np.exp(solution.state.log_ratio)
-    rows = np.zeros((5, len(solution.beliefs)))
+    rows = np.zeros((5, len(solution.priors)))
     rows[:3, SCALE] = 1.0
     rows[1, RATIO], rows[2, RATIO] = -1 / (1 + ratio), ratio / (1 + ratio)
     rows[3, HEADING] = -1.0
@@ -136,13 +136,13 @@ def _sources(leg, solution: Solution):
             effects = _root(effects @ effects.T)
         sources.append(Source(part.name, effects, part.shared))
     # what was believed beforehand is a source too: of the width given, of a surveyed start
-    beliefs = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.beliefs)
-    keep = solution.beliefs > 0
+    priors = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.priors)
+    keep = solution.priors > 0
     for name, column in (('fix_latency', LATENCY), ('gyro_scale', GYRO),
                          ('receiver_smoothing', FIX_LAG2)):
-        sources.append(Source(name, rows @ beliefs[:, [column]], True))
+        sources.append(Source(name, rows @ priors[:, [column]], True))
         keep[column] = False
-    sources.append(Source('beliefs', rows @ beliefs[:, keep]))
+    sources.append(Source('priors', rows @ priors[:, keep]))
     heading = np.zeros((5, 1))
     heading[3] = leg.alignment.heading_sigma
     sources.append(Source('initial_heading', heading, leg.alignment.heading_shared))
@@ -168,7 +168,7 @@ def _second_order(solution):
     share = solution.eq.length / max(solution.eq.length.sum(), 1e-9)
     phi = (solution.fit.phi_sigma[:-1]**2 + solution.fit.phi_sigma[1:]**2) / 2
     unknown = np.sqrt(3) / 2 * np.hypot(solution.height.climb_variance, share @ phi)
-    return float(np.hypot(unknown, BENDS))
+    return float(np.hypot(unknown, BEND_SIGMA))
 
 
 def _gyro_bias(leg, solution):
@@ -177,7 +177,7 @@ def _gyro_bias(leg, solution):
     up = solution.eq.phi_axes[-1, 2]
     up = up / max(np.linalg.norm(up), 1e-9)
     before = float(np.sqrt(up**2 @ a.gyro_bias_sigma**2))
-    if sigma > LEARNED * before:
+    if sigma > LEARNED_BIAS * before:
         return Estimate(None, None, 'rad/s')
     return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
 

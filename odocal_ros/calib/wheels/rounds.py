@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.wheels.beliefs import Beliefs, WIDTH_SIGMA
 from odocal_ros.calib.wheels.height import solve_height
 from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_turns, TurnNoise, white_share
 from odocal_ros.calib.wheels.least_squares import design, Drift, least_squares
@@ -30,13 +29,14 @@ from odocal_ros.calib.wheels.noise import (
     unknown_width,
     walk_root,
 )
+from odocal_ros.calib.wheels.priors import WheelPriors, WIDTH_SIGMA
 from odocal_ros.calib.wheels.solution import Solution
+from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
-ROUNDS = 5           # of relinearisation, at most
-SETTLED = 0.01       # sigmas: smaller steps are none
-LEAST_TURN = 0.05    # rad rms: less is no turn
-TURNED = 10.0        # times what the gyro may have drifted: turns that tell the track width
-FAR_BIN = 5.0        # sigmas of a bin against all others: a run of bad fixes
+LINEARISATIONS = 5          # of relinearisation, at most
+SETTLED_STEP = 0.01         # sigmas: smaller steps are none
+NO_TURN_RMS = 0.05          # rad rms: less is no turn
+TURNED_OVER_DRIFT = 10.0    # times what the gyro may have drifted: turns that tell the track width
 
 
 class Rounds:
@@ -45,7 +45,7 @@ class Rounds:
     def __init__(self, leg, config, bins, turn_rate, width):
         self.leg, self.config, self.turn_rate = leg, config, turn_rate
         self.bins, self.width = bins, width
-        self.beliefs = Beliefs(width, turn_rate, config.gnss.time_sigma,
+        self.priors = WheelPriors(width, turn_rate, config.gnss.time_sigma,
                                leg.alignment.gyro_scale_sigma)
         self.since = leg.start.t if leg.alignment.heading_source == 'fixed' else leg.alignment.t
         n = len(bins.edges) - 1
@@ -55,16 +55,16 @@ class Rounds:
     def run(self, state, fixes):
         """Return the solution from a first state."""
         again, dropped = False, 0
-        for k in range(ROUNDS):
+        for k in range(LINEARISATIONS):
             eq = equations(self.leg, self.bins, state, self.since)
             height = solve_height(self.leg, eq, self.bins, state, self.since)
             solution, step = self._round(eq, state, height, judge=k == 1 or again)
             state, again = solution.state, self.bad.sum() > dropped
             dropped = self.bad.sum()
-            if k > 1 and not again and np.all(np.abs(step) < SETTLED):
+            if k > 1 and not again and np.all(np.abs(step) < SETTLED_STEP):
                 break
         return replace(solution, dropped=fixes - solution.kept,
-                       settled=bool(np.all(np.abs(step) < 10 * SETTLED)))
+                       settled=bool(np.all(np.abs(step) < 10 * SETTLED_STEP)))
 
     def _round(self, eq, state, height, judge):
         leg, n = self.leg, len(eq.turn)
@@ -107,14 +107,14 @@ class Rounds:
         way = np.append(0.0, np.cumsum(eq.length))
         away = eq.yaw - np.polyval(np.polyfit(way, eq.yaw, 1), way)     # a ratio makes a line
         turned = np.sqrt((away**2).mean())
-        if turned > TURNED * np.sqrt(np.diag(self._drift(eq)).mean()):
+        if turned > TURNED_OVER_DRIFT * np.sqrt(np.diag(self._drift(eq)).mean()):
             return True
-        if self.rounds == 0 or turned < LEAST_TURN:
+        if self.rounds == 0 or turned < NO_TURN_RMS:
             return False
         level = self._used(len(eq.turn))        # the fixes alone may hold the drift
         level[2 * len(eq.turn):] = False
         drift = self._fit(V, r, X, level, state, L, eq).phi_sigma
-        return bool(turned > TURNED * np.sqrt((drift**2).mean()))
+        return bool(turned > TURNED_OVER_DRIFT * np.sqrt((drift**2).mean()))
 
     def _drift(self, eq):
         return drift_covariance(self.leg.alignment, self.bins, eq, self.since)
@@ -128,7 +128,7 @@ class Rounds:
         return least_squares(V, r, X, drift, use, *self._steps(state))
 
     def _steps(self, state):
-        return self.beliefs.steps(self.leg, state, self.told, self.rounds)
+        return self.priors.steps(self.leg, state, self.told, self.rounds)
 
     def _bias(self, fit, L, eq):
         """Return the gyro's bias about the vertical beyond that of the alignment, and sigma."""
@@ -143,7 +143,7 @@ class Rounds:
         """Leave out bins that stray from what all others say; tell whether there are new ones."""
         z = np.zeros(3 * n)
         z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
-        far = (np.hypot(z[:n], z[n:2 * n]) > FAR_BIN) & ~self.bad
+        far = (np.hypot(z[:n], z[n:2 * n]) > OUTLIER_SIGMAS) & ~self.bad
         if not far.any() or (self.bad | far).mean() > 0.3:
             return False
         self.bad |= far
@@ -157,9 +157,9 @@ class Rounds:
         known = sum(p.whole()[turn, turn] for p in known_parts(
             self.leg, eq, self.bins, state, self.since, TurnNoise(counts=0.0), self.config))
         walk = walk_root(eq.moving)
-        known = known + self.beliefs.nuisances(X[turn], state)
+        known = known + self.priors.nuisances(X[turn], state)
         columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
-        if self.width:      # given, and so no free column: its belief is part of what is known
+        if self.width:      # given, and so no free column: its prior is part of what is known
             known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
             columns = columns[:, [0, 2]]
         rounding = [quantisation(self.leg, eq, self.bins, state, level)[turn, turn]
@@ -173,7 +173,7 @@ class Rounds:
         k = np.array([SCALE, HEADING, 3, 4])
         white = white_share(leg.t_fix, eq.detail[:, :2], leg.covariance_n, bins)
         good = self._used(n)[level]
-        known = known[level, level] + self.beliefs.nuisances(X[level], state)
+        known = known[level, level] + self.priors.nuisances(X[level], state)
         known += np.diag(np.where(good, 0.0, 1e12))     # dropped bins say nothing
         self.noise = judge_fixes(
             r[level], X[level][:, k], known, bins, leg.t_fix, leg.covariance_n, white,

@@ -11,32 +11,35 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.slip import acceleration, excess_way, PINS, STEP as SLIP_STEP
+from odocal_ros.calib.slip import acceleration, excess_way, PIN_STEPS, SPIN_GRID
 from odocal_ros.calib.wheels.whole_drive import (
     changed,
     fitted,
-    MEAN,
+    MEAN_STEPS,
     signals_of,
-    SURE,
     swapped,
     unlike,
+    WHOLE_DRIVE_SIGMAS,
 )
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.dead_reckoning import Track
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import pair, runs
 
-STEP = 0.1            # s, grid
-GAPS = (10, 30, 80, 200, 500)   # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
-BLUR = 0.005          # m, what two tyres on real ground may do in any window, 1 sigma
-TURN_DOUBT = 0.01     # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
-CHANCE = 5.0          # log of the odds at which a wheel is named
-BEFORE = 1.0          # s each side of a slip that acceleration is looked at
-QUIET = 0.1           # rad, turn within which acceleration tells the wheel
-SLOPE = 200           # steps over which the slope of the difference is taken
-LATE = 2.0            # s each side of a slip that may be part of it
-SHORT = 1 / 16        # of the way: a slip of less is no change of the wheels
-STEEP = 2.0           # times a change of the ratio, from where on a slip beside it stands out
-TOLD = 0.1            # m, least way by which going on would have shown
-SHARE = 4             # of a slip's half, what the mean must at least part from the Imu by
+SLIP_GRID = 0.1                        # s, grid
+SLIP_SPANS = (10, 30, 80, 200, 500)    # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
+TYRE_BLUR = 0.005    # m, what two tyres on real ground may do in any window, 1 sigma
+TURN_DOUBT = 0.01    # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
+WHEEL_ODDS = 5.0                       # log of the odds at which a wheel is named
+SLIP_BESIDE = 1.0                      # s each side of a slip that acceleration is looked at
+QUIET_TURN = 0.1                       # rad, turn within which acceleration tells the wheel
+SLOPE_STEPS = 200                      # steps over which the slope of the difference is taken
+SLIP_AROUND = 2.0                      # s each side of a slip that may be part of it
+SLIP_OF_WAY = 1 / 16                   # of the way: a slip of less is no change of the wheels
+STANDS_OUT = 2.0    # times a change of the ratio, from where on a slip beside it stands out
+TELLING_WAY = 0.1                      # m, least way by which going on would have shown
+PARTED_SHARE = 4    # of a slip's half, what the mean must at least part from the Imu by
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +64,14 @@ class WheelSlips:
         return (self.begin + self.end) / 2
 
 
+NO_TIMES = np.empty(0)
 NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
 
 
-def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, track_width=0.0,
-                 doubt_t=(), max_deviation=0.35):
+def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats],
+                 between: tuple[float, float], track: Track, latitude: float,
+                 metres_per_unit: float, track_width: float = 0.0, doubt_t: Floats = NO_TIMES,
+                 max_deviation: float = 0.35) -> tuple[tuple[Reason, ...], WheelSlips]:
     """
     Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
 
@@ -95,7 +101,7 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     Reasons (WHEELS_SWAPPED, WHEEL_COUNTERS_DIFFER, WHEEL_SLIP), and WheelSlips.
 
     """
-    two = pair(left, right, imu, between, STEP, doubt_t)
+    two = pair(left, right, imu, between, SLIP_GRID, doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
     signals = signals_of(two, metres_per_unit)
@@ -116,7 +122,7 @@ def wheel_faults(left, right, imu, between, track, latitude, metres_per_unit, tr
     # what seemed a change and is none is a slip; beside one only what is far steeper is
     events = sorted(events + lasting)
     if change:
-        steep = STEEP * abs(change) * metres_per_unit
+        steep = STANDS_OUT * abs(change) * metres_per_unit
         events = [e for e in events if abs(_slope(two, e)) > steep]
     if not events:
         return reasons, replace(NO_SLIPS, change=change)
@@ -133,8 +139,8 @@ def _level(two, apart, quantum_m):
     Rounding at a steady speed makes slopes too, of two counts over a window at most: they stay.
     """
     way = _way(two)
-    run, climb = way[SLOPE:] - way[:-SLOPE], apart[SLOPE:] - apart[:-SLOPE]
-    if len(run) < SLOPE:
+    run, climb = way[SLOPE_STEPS:] - way[:-SLOPE_STEPS], apart[SLOPE_STEPS:] - apart[:-SLOPE_STEPS]
+    if len(run) < SLOPE_STEPS:
         return apart
     moves = run > max(np.median(run) / 2, 2 * two.quantum)
     slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
@@ -146,7 +152,7 @@ def _without(two, events):
     """Return the wheels with the cells of slips not known."""
     known = two.known.copy()
     for begin, end, _ in events:
-        known &= (two.t[1:] < begin - LATE) | (two.t[:-1] > end + LATE)
+        known &= (two.t[1:] < begin - SLIP_AROUND) | (two.t[:-1] > end + SLIP_AROUND)
     return replace(two, known=known)
 
 
@@ -159,19 +165,19 @@ def _events(two, apart, quantum_m, width):
     """
     apart = _level(two, apart, quantum_m)
     total = np.append(0.0, np.cumsum(apart))
-    mean = (total[MEAN:] - total[:-MEAN]) / MEAN
+    mean = (total[MEAN_STEPS:] - total[:-MEAN_STEPS]) / MEAN_STEPS
     unknown = np.append(0, np.cumsum(~two.known))
     hits = np.zeros(len(two.t), bool)
     windows = []
-    for span in (gap + MEAN for gap in GAPS):
+    for span in (gap + MEAN_STEPS for gap in SLIP_SPANS):
         jump = mean[span:] - mean[:-span]
         if len(jump) < span:
             continue
         limit = _limit(two, jump, span, quantum_m * (two.quantum > 0), width)
         far = np.abs(jump) > limit
-        far &= unknown[span + MEAN - 1:][:len(jump)] == unknown[:len(jump)]
+        far &= unknown[span + MEAN_STEPS - 1:][:len(jump)] == unknown[:len(jump)]
         for k in np.flatnonzero(far):
-            hits[k + MEAN:k + span] = True
+            hits[k + MEAN_STEPS:k + span] = True
         windows.append((span, jump, limit, far))
     over, lasting = [], []
     for a, b in runs(hits):
@@ -184,12 +190,12 @@ def _ends(two, apart, event):
     """Tell whether a slip is over: short, or the wheels go on after it as they did before it."""
     way = _way(two)
     begin, end = np.interp(event[:2], two.t, way)
-    if end - begin < SHORT * way[-1]:
+    if end - begin < SLIP_OF_WAY * way[-1]:
         return True
     at = np.searchsorted(two.t, event[:2]).clip(0, len(way) - 1)
     for a, b in ((0, at[0]), (at[1], len(way) - 1)):
         would, does = _slope(two, event) * (way[b] - way[a]), apart[b] - apart[a]
-        if abs(would) < TOLD or abs(does) > abs(would) / 2:
+        if abs(would) < TELLING_WAY or abs(does) > abs(would) / 2:
             return False
     return True
 
@@ -206,7 +212,7 @@ def _way(two):
 
 def _limit(two, jump, span, quantum_m, width):
     """Return how far each jump between two means may go by chance, m."""
-    n, ends = len(jump), span + MEAN - 1
+    n, ends = len(jump), span + MEAN_STEPS - 1
     way = _way(two)
     turned = np.append(0.0, np.cumsum(np.abs(np.diff(two.turn))))
     run = way[ends:][:n] - way[:n]
@@ -215,31 +221,33 @@ def _limit(two, jump, span, quantum_m, width):
         usual = np.median(np.abs(jump[run > 0])) / 0.6745
         spread = usual * np.maximum(1.0, run / np.median(run[run > 0]))
     turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
-    counts = (way[MEAN - 1:] - way[:len(way) - MEAN + 1]) / max(two.quantum, 1e-9)
-    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN)
+    counts = (way[MEAN_STEPS - 1:] - way[:len(way) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
+    rounding = quantum_m**2 / 6 / np.clip(counts, 1.0, MEAN_STEPS)
     # rounding is bounded: both ends of both wheels are off by a count at most
-    rounding = np.minimum(SURE**2 * (rounding[span:] + rounding[:-span]), (2 * quantum_m)**2)
-    return np.sqrt(SURE**2 * (spread**2 + BLUR**2 + turn**2) + rounding)
+    rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
+                          (2 * quantum_m)**2)
+    return np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (spread**2 + TYRE_BLUR**2 + turn**2) + rounding)
 
 
 def _measured(two, apart, windows, a, b):
     """Return (begin, end, size) of the jump within steps a to b: the window that shows it best."""
     found = (0.0, 0.0, 0, 0)
     for span, jump, limit, far in windows:
-        low, high = max(0, a - MEAN), max(0, b - span + 1)
+        low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
         k = low + np.flatnonzero(far[low:high])
         if len(k):
             k = int(k[np.argmax(np.abs(jump[k]))])
             # a longer window must show more than its own noise, or it only adds that
-            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / SURE:
+            if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / WHOLE_DRIVE_SIGMAS:
                 found = (float(jump[k]), float(limit[k]), k, span)
     size, _, k, span = found
-    inner = apart[k:k + span + MEAN]
-    base = inner[:MEAN].mean()
+    inner = apart[k:k + span + MEAN_STEPS]
+    base = inner[:MEAN_STEPS].mean()
     share = (inner - base) / size if size else inner
     begin = int(np.flatnonzero(share <= 0.1)[-1]) if (share <= 0.1).any() else 0
     late = np.flatnonzero(share >= 0.9)
-    end = int(late[late >= MEAN // 2][0]) if (late >= MEAN // 2).any() else len(inner) - 1
+    late = late[late >= MEAN_STEPS // 2]
+    end = int(late[0]) if len(late) else len(inner) - 1
     return two.t[k + min(begin, end)], two.t[k + max(begin, end)], size
 
 
@@ -251,21 +259,21 @@ def _which(two, mean, imu, track, latitude, event):
     back by as much: the odds of the two come from how far mean and Imu part elsewhere.
     """
     begin, end, size = event
-    grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SLIP_STEP)
-    span = max(round((end - begin + 2 * BEFORE) / SLIP_STEP), 4 * PINS)
+    grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)
+    span = max(round((end - begin + 2 * SLIP_BESIDE) / SPIN_GRID), 4 * PIN_STEPS)
     if len(grid) < 3 * span:
         return 0
     a = acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
     excess = excess_way(span, a, np.interp(grid, two.t, mean))
-    turn = np.interp(grid, two.t, two.turn)[PINS:-PINS]
-    straight = np.abs(turn[span:] - turn[:-span]) < QUIET
-    at = int(np.searchsorted(grid, (begin + end) / 2)) - PINS - span // 2
+    turn = np.interp(grid, two.t, two.turn)[PIN_STEPS:-PIN_STEPS]
+    straight = np.abs(turn[span:] - turn[:-span]) < QUIET_TURN
+    at = int(np.searchsorted(grid, (begin + end) / 2)) - PIN_STEPS - span // 2
     if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
         return 0
     sigma = np.median(np.abs(excess[straight])) / 0.6745 + 1e-3
     odds = excess[at] * size / sigma**2
     # where it parts by far less than the half, the slip begins or ends elsewhere
-    told = abs(odds) > CHANCE and abs(excess[at]) > abs(size) / 2 / SHARE
+    told = abs(odds) > WHEEL_ODDS and abs(excess[at]) > abs(size) / 2 / PARTED_SHARE
     return int(np.sign(odds)) if told else 0
 
 
@@ -285,6 +293,6 @@ def _slip_reason(slips):
     return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
                    f'{100 * abs(slips.size[worst]):.0f} cm against the gyro from '
                    f't = {slips.begin[worst]:.1f} s for '
-                   f'{max(slips.end[worst] - slips.begin[worst], STEP):.1f} s'
+                   f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
                    + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
                       if n > 1 else '')),)

@@ -18,7 +18,7 @@ class Solution:
     The estimate: state, and how the observations make it.
 
     residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, p).
-    beliefs : (p,) inverse variance known beforehand.   parts : of the covariance.
+    priors : (p,) inverse variance known beforehand.   parts : of the covariance.
     kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
     against that of the alignment.   width_told : the drive turns enough for the track width.
     """
@@ -29,7 +29,7 @@ class Solution:
     fit: Fit
     residual: NDArray[np.float64]
     X: NDArray[np.float64]
-    beliefs: NDArray[np.float64]
+    priors: NDArray[np.float64]
     parts: tuple[Part, ...]
     height: Height
     noise: FixNoise
@@ -43,4 +43,4 @@ class Solution:
     def covariance(self):
         """Return the covariance of the observations, what is believed of nuisances and all."""
         X = self.X[:, NUISANCES]
-        return sum(p.whole() for p in self.parts) + X / self.beliefs[NUISANCES] @ X.T
+        return sum(p.whole() for p in self.parts) + X / self.priors[NUISANCES] @ X.T

@@ -6,24 +6,27 @@ elsewhere and the gyro hold against it, each by its weight, so that one no large
 noise makes is none. What is found joins the slips of the leg, and the fit is made again.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.wheels.estimate import solve
-from odocal_ros.calib.wheels.slips import BLUR, TURN_DOUBT
+from odocal_ros.calib.wheels.slips import TURN_DOUBT, TYRE_BLUR, WheelSlips
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.wheel_faults import SIDES
 
-SURE = 5.5           # sigmas
-APART = 5.0          # of z^2, by which one wheel is named before the other
-NEAR = 30.0          # s from a slip that is known: its begin and end are no others
-MOST = 4             # slips looked for
-AROUND = 0.5         # s each side of a slip that may be part of it
-LENGTHS = (0.0, 8.0, 20.0, 45.0)     # s, of the slips looked for
-SHORT = 5.0          # s, of which begin and end are not told apart
-TAIL = 0.15          # of a slip seen from a tenth to nine tenths, each side
-STEP = 1.0           # s between the steps that make a slip
-SIDES = ('left', 'right')
+UNSEEN_SIGMAS = 5.5                      # sigmas
+NAMED_BEFORE = 5.0                       # of z^2, by which one wheel is named before the other
+KNOWN_SLIP_REACH = 30.0    # s from a slip that is known: its begin and end are no others
+MOST_SLIPS = 4                           # slips looked for
+SLIP_MARGIN = 0.5                        # s each side of a slip that may be part of it
+SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)    # s, of the slips looked for
+SHORT_SLIP = 5.0                         # s, of which begin and end are not told apart
+SLIP_TAIL = 0.15                         # of a slip seen from a tenth to nine tenths, each side
+SLIP_STEP = 1.0                          # s between the steps that make a slip
 
 
 def solve_with_slips(leg, config, turn_rate=True):
@@ -45,7 +48,7 @@ def solve_with_slips(leg, config, turn_rate=True):
 
     """
     solution, seen = solve(leg, config, turn_rate), []
-    while turn_rate and solution and not leg.uneven and len(seen) < MOST:
+    while turn_rate and solution and not leg.uneven and len(seen) < MOST_SLIPS:
         found = unseen_slip(solution, leg.slips[0])
         if found is None:
             break
@@ -58,7 +61,7 @@ def solve_with_slips(leg, config, turn_rate=True):
     return solution, tuple(_said(*found) for found in seen), tuple(map(_slip, sorted(seen)))
 
 
-def drawn_out(begin, end, size):
+def drawn_out(begin: Floats, end: Floats, size: Floats) -> tuple[Floats, Floats]:
     """
     Return slips as steps, s and m, that together may be any slip of that size in that time.
 
@@ -67,8 +70,8 @@ def drawn_out(begin, end, size):
     """
     t, steps = [], []
     for a, b, whole in zip(begin, end, size, strict=True):
-        around = AROUND + TAIL * (b - a)
-        n = 2 + int((b - a + 2 * around) / STEP)
+        around = SLIP_MARGIN + SLIP_TAIL * (b - a)
+        n = 2 + int((b - a + 2 * around) / SLIP_STEP)
         at = np.linspace(a - around, b + around, n)
         t.append(at)
         steps.append(np.full(len(at), whole / np.sqrt(len(at))))
@@ -83,19 +86,20 @@ def unseen_slip(solution, known_t=()):
     known_t : s, of slips that are known already.   None where nothing stands out.
     """
     best = None
-    for length in LENGTHS:
+    for length in SLIP_LENGTHS:
         spans, columns, turn = _ramps(solution, length)
         if not len(spans):
             continue
         far = np.ones(len(spans), bool)
         for t in known_t:
-            far &= (spans[:, 1] < t - NEAR) | (spans[:, 0] > t + NEAR)
+            far &= (spans[:, 1] < t - KNOWN_SLIP_REACH) | (spans[:, 0] > t + KNOWN_SLIP_REACH)
         z, size = _scores(solution.fit, columns)
-        usual = SURE * np.hypot(BLUR, TURN_DOUBT * solution.state.width * turn)
-        score = np.where(far & (np.abs(z) > SURE) & (np.abs(size) > usual), np.abs(z), 0.0)
+        usual = UNSEEN_SIGMAS * np.hypot(TYRE_BLUR, TURN_DOUBT * solution.state.width * turn)
+        sure = far & (np.abs(z) > UNSEEN_SIGMAS) & (np.abs(size) > usual)
+        score = np.where(sure, np.abs(z), 0.0)
         k, j = np.unravel_index(np.argmax(score), score.shape)
         if score[k, j] > (best[0] if best else 0.0):
-            wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > APART else -1
+            wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > NAMED_BEFORE else -1
             best = (score[k, j], tuple(map(float, spans[j])), float(size[k, j]),
                     float(size[k, j] / z[k, j]), wheel)
     return best and best[1:]
@@ -146,7 +150,7 @@ def _slip(found):
             'wheel': (*SIDES, 'one of them')[wheel]}
 
 
-def with_unseen(known, seen):
+def with_unseen(known: WheelSlips, seen: Iterable[Mapping[str, Any]]) -> WheelSlips:
     """Return WheelSlips with those of calibration.json after them, in order of time."""
     begin = np.append(known.begin, [s['t'] for s in seen])
     order = np.argsort(begin, kind='stable')
@@ -160,7 +164,7 @@ def with_unseen(known, seen):
 def _said(span, size, sigma, wheel):
     which = 'one of the wheels parts from the other' if wheel < 0 else (
         f'the {SIDES[wheel]} wheel {"spins" if size > 0 else "slides"}')
-    when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < SHORT else (
+    when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < SHORT_SLIP else (
         f'between t = {span[0]:.0f} and {span[1]:.0f} s')
     return Reason(Code.WHEEL_SLIP, f'{which} by {100 * abs(size):.0f} cm (+-{100 * sigma:.1f}) '
                   f'{when}, as turns and fixes before and after tell; the sigmas hold it')

@@ -7,9 +7,9 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
 
-STEP = 1e-6     # rad, of the differences that give the derivatives of the forward axis
-STANDING = 1.0  # s without a count on either wheel: standing
-MARGIN = 1.0    # s of the track beyond the bins, for fixes that are late or early
+TURN_BY = 1e-6      # rad, of the differences that give the derivatives of the forward axis
+STANDING_TIME = 1.0    # s without a count on either wheel: standing
+TRACK_MARGIN = 1.0     # s of the track beyond the bins, for fixes that are late or early
 
 
 def turned(phi, v):
@@ -36,8 +36,8 @@ class Way:
     def __init__(self, leg, bins, state, since):
         self.bins, self.state = bins, state
         edges = bins.edges
-        inside = slice(max(0, np.searchsorted(leg.left.t, edges[0] - MARGIN) - 1),
-                       np.searchsorted(leg.left.t, edges[-1] + MARGIN) + 1)
+        inside = slice(max(0, np.searchsorted(leg.left.t, edges[0] - TRACK_MARGIN) - 1),
+                       np.searchsorted(leg.left.t, edges[-1] + TRACK_MARGIN) + 1)
         self.t = t = leg.left.t[inside]
         self.s = leg.left.s[inside], leg.right.s[inside]
         self.k = wheel_factors(state.scale, state.log_ratio)
@@ -47,8 +47,8 @@ class Way:
                           len(edges) - 2)
         d_b = forward_b(-state.heading, state.pitch)
         by_heading, by_pitch = ((forward_b(-state.heading - a, state.pitch + b)
-                                 - forward_b(-state.heading + a, state.pitch - b)) / (2 * STEP)
-                                for a, b in ((STEP, 0.0), (0.0, STEP)))
+                                 - forward_b(-state.heading + a, state.pitch - b)) / (2 * TURN_BY)
+                                for a, b in ((TURN_BY, 0.0), (0.0, TURN_BY)))
         dP = [np.diff(track.P[inside], axis=0) * k
               for track, k in zip((leg.left, leg.right), self.k, strict=True)]
         self.q_nb, self.d_b = leg.left.q_nb[inside], d_b
@@ -147,7 +147,7 @@ class Way:
         stands = (np.diff(self.s[0]) == 0) & (np.diff(self.s[1]) == 0)
         steps = np.diff(np.concatenate([[False], stands, [False]]).astype(int))
         runs = [(a, b) for a, b in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1),
-                                       strict=True) if self.t[b] - self.t[a] >= STANDING]
+                                       strict=True) if self.t[b] - self.t[a] >= STANDING_TIME]
         time = np.maximum(np.bincount(self.of, self.weight, n), 1e-9)
         share = np.zeros((n, len(runs)))
         for r, (a, b) in enumerate(runs):

@@ -1,0 +1,20 @@
+"""
+Take an odometer of a type that odocal does not know: python add_message_type.py BAG.
+
+Here the speed comes as geometry_msgs/Vector3Stamped, in vector.x. A type of your own works alike:
+a bag has its definition inside. Types that many vehicles send are worth a line in
+odocal_ros/messages/odometer_types.py.
+"""
+
+import sys
+
+from odocal_ros import calibrate_bag
+
+OURS = {
+    'odometer.type': 'geometry_msgs/msg/Vector3Stamped',
+    'odometer.field': 'vector.x',        # also wheel.ticks[0], or joints[rear_left]
+    'odometer.quantity': 'rate'}         # or cumulative, increment
+
+calibration = calibrate_bag(sys.argv[1], topics={'odometer': '/wheel_speed'}, config=OURS)
+print(f'{calibration.verdict.value}: metres per metre claimed '
+      f'{calibration.values["scale_factor"]} +- {calibration.sigmas["scale_factor"]}')

@@ -1,0 +1,37 @@
+"""A chunk of an mcap file, unpacked (mcap.dev/spec#chunk-op0x06), and what it says checked."""
+
+import struct
+from typing import NamedTuple
+import zlib
+
+from odocal_ros.bagio.mcap_records import CHUNK_HEAD, text_at
+from odocal_ros.messages.raws import Bytes
+from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
+
+CHUNK_DAMAGED = 'a damaged chunk'
+
+
+class Chunk(NamedTuple):
+    """Its records, the times it states, and the message index behind it, which nobody checked."""
+
+    records: Bytes
+    start_ns: int
+    end_ns: int
+    begins: Bytes = b''
+
+
+def unpacked(body: Bytes, allowance: Allowance, cut: bool = False) -> Chunk:
+    """Return the chunk that a record holds; or Damaged. ``cut``: the file ends in it."""
+    try:
+        start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
+        packing, at = text_at(body, CHUNK_HEAD.size)
+        (packed,) = struct.unpack_from('<Q', body, at)
+        data = body[at + 8:at + 8 + packed]
+        records = allowance.unpack(packing, data, size)
+    except (LimitReached, MemoryError):
+        raise
+    except Exception:    # each compression has its own error; what is lost is lost
+        raise Damaged(CHUNK_DAMAGED) from None
+    if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
+        raise Damaged(CHUNK_DAMAGED)
+    return Chunk(records, start_ns, end_ns)

@@ -1,0 +1,90 @@
+"""
+The smoother's last look carried on: keyframes that stay, a state reckoned on over what is new.
+
+What is added to a leg moves what was there only a little, so that few passes do where a state,
+noise levels and slips are taken over from the look before.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from odocal_ros.calib.smoother.estimate import WarmStart
+from odocal_ros.calib.smoother.imperfect import with_imperfect
+from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.preintegrate import preintegrate
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.start import SPEED_WINDOW
+from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
+
+SAME_KEY = 1e-6       # s, keyframes that are the same
+NEWEST_KEYS = 3.0     # s, last part of the old keyframes that may be others
+
+
+def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
+    """
+    Return the rows of a leg with keyframes that stay where they are as it grows.
+
+    They lie at multiples of ``spacing``; first and last row are keyframes too.
+    """
+    first = int(np.searchsorted(view.t_imu, view.t_begin))
+    last = int(np.searchsorted(view.t_imu, view.t_stop, side='right')) - 1
+    t = view.t_imu[first:last + 1]
+    grid = np.arange(np.ceil(t[0] / spacing), t[-1] / spacing) * spacing
+    k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    k -= grid - t[k - 1] < t[k] - grid
+    inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
+    key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
+    return ImuRows(t, view.f_b[first:last + 1], view.w_b[first:last + 1], key)
+
+
+def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
+    """Return what the last look ended with, reckoned on; None where the keyframes are others."""
+    t, old = problem.imu.t[problem.imu.key], last.state.t
+    at = np.clip(np.searchsorted(old, t - SAME_KEY), 0, len(old) - 1)
+    same = np.abs(old[at] - t) < SAME_KEY
+    n = len(t) if same.all() else int(np.argmin(same))
+    if n < 2 or t[n - 1] < old[-1] - NEWEST_KEYS:
+        return None
+    at = at[:n]
+    state = State(**{name: value if name == 'constants' else value[at]
+                     for name, value in vars(last.state).items()})
+    slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
+    spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
+    levels = problem.first_levels.but(**last.levels.values)
+    first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
+    return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors,
+                     first, spread)
+
+
+def _reckoned(state: State, problem: Problem) -> State:
+    """Return a state reckoned on by gyro and odometer over the keyframes that it lacks."""
+    imu, leg, n = problem.imu, problem.leg, len(state.t)
+    key = imu.key[n - 1:]
+    rows = replace(imu, key=key)
+    K, c = len(key) - 1, state.constants
+    on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
+          for name, value in vars(state).items() if name != 'constants'}
+    t = on['t'] = imu.t[imu.key]
+    on['travel_error'][n:] = 0.0
+    f = state.scale * state.forward
+
+    def travel(t):
+        return leg.travel.at(t + c[ODO_DELAY])
+    sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
+                           f, np.empty(0), c, derivatives=False)
+    for k in range(K):
+        on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
+    C = on['C_nb']
+    arm_b = state.C_bv @ (leg.odometer_arm - leg.imu_arm)
+    way = np.einsum('kij,kj->ki', C[n - 1:-1], sums.S @ f) - (C[n:] - C[n - 1:-1]) @ arm_b
+    on['p_n'][n:] = on['p_n'][n - 1] + np.cumsum(way, axis=0)
+    speed = (travel(t[n:] + SPEED_WINDOW) - travel(t[n:] - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
+    on['v_n'][n:] = (C[n:] @ f) * speed[:, None]
+    gained = np.einsum('kij,kj->ki', C[n - 1:-1], sums.dv) + sums.T[:, None] * gravity_n(
+        on['p_n'][n:], leg.origin)
+    for late in np.flatnonzero(t[n:] + SPEED_WINDOW > leg.travel.t[-1]):
+        on['v_n'][n + late] = on['v_n'][n + late - 1] + gained[late]
+    return State(**on, constants=c)

@@ -1,0 +1,182 @@
+"""One bag to its row: the very pipeline of replay, in bounded time and memory, on any worker."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+import faulthandler
+import json
+import os
+from pathlib import Path
+import resource
+import signal
+import threading
+import time
+
+from odocal_ros.errors import OdocalError
+from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
+from odocal_ros.fleet.leg_text import leg_text
+from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, Row, RowStore
+from odocal_ros.outside.names import said_by
+
+LATER = 10.0          # s after which what cannot even be told is ended
+LONGEST = 500         # characters of a reason
+NO_THREAD = "can't start new thread"      # what Python says where there is no memory for its stack
+
+
+@dataclass(frozen=True)
+class BagJob:
+    """
+    What a worker needs for a bag.
+
+    topics, config, legs : asked for, as ``library.calibrate_bag`` takes them.   settings : the
+    name of all that touches a leg.
+    seconds, memory : that it may take, bytes; 0: any.
+    """
+
+    bag: FleetBag
+    topics: dict[str, str]
+    config: dict[str, object]
+    legs: tuple[str, ...]
+    settings: str
+    folder: str
+    seconds: float = 0.0
+    memory: int = 0
+
+    @property
+    def place(self) -> str:
+        """Return the key of the row where its content is not known: of a bag that failed."""
+        return key_of('failed', self.bag.bag, self.settings)
+
+    def failed(self, reason: str, **more) -> Row:
+        """Return the row of the bag, failed."""
+        return Row(key=self.place, bag=self.bag.bag, vehicle=self.bag.vehicle,
+                   model=self.bag.model, odometer_km=self.bag.odometer_km, status=FAILED,
+                   reason=reason[:LONGEST], **more)
+
+
+@dataclass(frozen=True)
+class Done:
+    """What the command is told of a bag; the rest is in its row."""
+
+    key: str
+    status: str
+    reason: str
+    seconds: float
+    computed: bool      # now, not before
+
+
+def calibrate_bag(job: BagJob) -> Done:
+    """Have the row of a bag in the data set, computed if it is not there."""
+    store, began = RowStore(job.folder), time.monotonic()
+    seen = ''
+    with _bounded(job, lambda why: store.put(job.failed(why, seen=seen))):
+        try:
+            seen = seen_as(job.bag.bag, job.settings)
+            if found := _known(store, job, seen):
+                return Done(found.key, found.status, found.reason, 0.0, False)
+            row, computed = _row(job, store, seen, began)
+            store.put(row)
+            store.remember(seen, row.key)
+            store.drop(job.place)
+            return Done(row.key, row.status, row.reason, row.seconds, computed)
+        except OdocalError as error:
+            why = said_by(error)
+        except Exception as error:     # noqa: BLE001 one bag stops nobody
+            why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
+            if isinstance(error, MemoryError) or NO_THREAD in str(error):
+                why = f'needs more memory than --task-memory gives ({job.memory / 2**20:g} MiB)'
+        row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
+        store.put(row)
+        return Done(row.key, FAILED, row.reason, row.seconds, True)
+
+
+def _known(store, job, seen) -> Row | None:
+    """Return the row that is there of a bag unchanged."""
+    if key := store.known(seen):
+        return store.get(key)
+    failed = store.get(job.place)
+    # one that ended its worker was not looked at: its place is all that is known
+    if failed is not None and failed.seen in ('', seen):
+        return failed
+    return None
+
+
+def _row(job, store, seen, began) -> tuple[Row, bool]:
+    """Return the row of a bag, and whether it was computed: a copy of a known one is not."""
+    from odocal_ros.bagio.read import bag_sha256, open_bag
+    from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
+    with at_hand(job.bag.bag, _scratch()) as path:
+        with open_bag(path) as bag:
+            sha256 = bag_sha256(bag)
+            size = sum(Path(file).stat().st_size for file in bag.files)
+        key = key_of(sha256, job.settings)
+        if (known := store.get(key)) is not None:
+            return replace(known, bag=job.bag.bag, seen=seen), False
+        found = calibrated(path, job.topics, job.config, job.legs)
+    legs = found.result.legs
+    return Row(key=key, bag=job.bag.bag, vehicle=job.bag.vehicle, model=job.bag.model,
+               odometer_km=job.bag.odometer_km, status=DONE, seen=seen, sha256=sha256,
+               settings=json.dumps(changed_settings(found.config), sort_keys=True),
+               topics=json.dumps(found.inputs[0]['topics']), bytes=size,
+               seconds=time.monotonic() - began, driven_s=sum(leg.duration for leg in legs),
+               start_ns=min((leg.start_ns for leg in legs), default=0),
+               legs=leg_text(list(legs))), True
+
+
+def _worker():
+    """Return the Dask worker that runs this, None outside of one."""
+    from distributed import get_worker
+    try:
+        return get_worker()
+    except ValueError:
+        return None
+
+
+def _scratch() -> str | None:
+    worker = _worker()
+    return None if worker is None else worker.local_directory
+
+
+@contextmanager
+def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
+    """
+    End the worker where a bag takes too long, its row written first; have it refused memory.
+
+    Nothing else ends code that hangs; the worker's nanny starts another one, and Dask gives that
+    the bag again, whose row is then there. Without a nanny there are no bounds.
+    """
+    worker = _worker()
+    if worker is None or worker.nanny is None:
+        yield
+        return
+
+    def end() -> None:
+        with suppress(Exception):
+            give_up(f'took longer than --task-timeout gives ({job.seconds:g} s)')
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    clock = threading.Timer(job.seconds, end)
+    clock.daemon = True
+    if job.seconds:
+        clock.start()
+        faulthandler.dump_traceback_later(job.seconds + LATER, exit=True)   # needs no interpreter
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    if job.memory:
+        most = _data_bytes() + job.memory
+        hard = before[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (
+            most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+        clock.cancel()
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _data_bytes() -> int:
+    """Return the memory that this process has of its own."""
+    for line in Path('/proc/self/status').read_text().splitlines():
+        if line.startswith('VmData:'):
+            return int(line.split()[1]) * 1024
+    return 0

@@ -1,0 +1,205 @@
+"""Which bags of which vehicles: a manifest, folders, globs, or URLs that fsspec knows."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+import fnmatch
+from pathlib import Path, PurePosixPath
+import re
+import tempfile
+from typing import Any
+
+from odocal_ros.errors import BadBag, BadUsage
+from odocal_ros.fleet.rows import key_of
+from odocal_ros.outside.names import said_by
+
+COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
+ENDINGS = ('*.mcap', '*.db3', '*.bag')
+META = 'metadata.yaml'       # what makes a folder a rosbag2
+MOST_ROWS = 10_000_000
+
+
+@dataclass(frozen=True)
+class FleetBag:
+    """A bag of a vehicle; ``config`` and ``legs`` where its manifest has its own."""
+
+    vehicle: str
+    bag: str
+    model: str = ''
+    odometer_km: float | None = None
+    config: str = ''
+    legs: tuple[str, ...] = ()
+
+
+def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
+    """
+    Return the bags of a manifest, or in folders, globs and URLs.
+
+    vehicle_from : pattern (re) searched in a bag's path: its group ``vehicle``, else its first
+    one, names the vehicle; groups ``model`` and ``odometer_km`` likewise. None: the folder that
+    the bag lies in.
+
+    Raises
+    ------
+    BadUsage
+        A manifest cannot be read, nothing is found, or the pattern does not fit a path.
+
+    """
+    if len(names) == 1 and names[0].endswith(('.csv', '.parquet')):
+        return _of_manifest(names[0])
+    pattern = _pattern(vehicle_from) if vehicle_from else None
+    bags = [_named(bag, pattern) for name in names for bag in _bags_in(name)]
+    unique = list(dict.fromkeys(bags))
+    if not unique:
+        raise BadUsage(f'{", ".join(names)}: no bag is there; give a manifest, bags, or folders '
+                       'with bags')
+    return unique
+
+
+def _pattern(text: str) -> re.Pattern:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise BadUsage(f'--vehicle-from {text}: {error}; want a pattern with a group, as in '
+                       "'fleet/(?P<vehicle>[^/]+)/'") from None
+    if not pattern.groups:
+        raise BadUsage(f"--vehicle-from {text}: it has no group; mark the vehicle's name, as in "
+                       "'fleet/(?P<vehicle>[^/]+)/'")
+    return pattern
+
+
+def _named(bag: str, pattern: re.Pattern | None) -> FleetBag:
+    if pattern is None:
+        return FleetBag(PurePosixPath(bag).parent.name, bag)
+    found = pattern.search(bag)
+    if found is None:
+        raise BadUsage(f'--vehicle-from {pattern.pattern}: does not fit {bag}')
+    more = found.groupdict()
+    return FleetBag(more.get('vehicle') or found[1] or '', bag, more.get('model') or '',
+                    _number(more.get('odometer_km'), bag))
+
+
+def _number(value: Any, where: str) -> float | None:
+    if value in (None, '') or value != value:
+        return None
+    try:
+        return float(value)
+    except ValueError:
+        raise BadUsage(f'{where}: odometer_km {value!r} is no number') from None
+
+
+def _of_manifest(name: str) -> list[FleetBag]:
+    """Return the rows of a manifest; its paths are against its folder."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+    fs, path = file_system(name)
+    try:
+        with fs.open(path, 'rb') as file:
+            if name.endswith('.csv'):
+                text = dict.fromkeys(COLUMNS, pa.string())
+                table = csv.read_csv(file, convert_options=csv.ConvertOptions(
+                    column_types=text, strings_can_be_null=True))
+            else:
+                table = parquet.read_table(file)
+    except (OSError, pa.ArrowException) as error:
+        raise BadUsage(f'{name}: cannot be read as a manifest ({said_by(error)})') from None
+    lacking = {'vehicle', 'bag'} - set(table.column_names)
+    if lacking or not table.num_rows:
+        raise BadUsage(f'{name}: {"no column " + " and ".join(sorted(lacking)) if lacking else ""}'
+                       f'{"" if lacking else "holds no bag"}; want vehicle, bag and, as wished, '
+                       f'{", ".join(COLUMNS[2:])}')
+    known = [column for column in COLUMNS if column in table.column_names]
+    root = name[:len(name) - len(PurePosixPath(name).name)]
+    bags = []
+    for number, row in enumerate(table.select(known).to_pylist(), 2):
+        text = {k: str(v) for k, v in row.items() if v is not None}
+        if not (text.get('vehicle') and text.get('bag')):
+            raise BadUsage(f'{name}, row {number}: vehicle or bag is empty')
+        bags.append(FleetBag(
+            text['vehicle'], _against(root, text['bag']), text.get('model', ''),
+            _number(text.get('odometer_km'), f'{name}, row {number}'),
+            _against(root, text['config']) if text.get('config') else '',
+            tuple(text.get('legs', '').split())))
+    return bags
+
+
+def _against(root: str, path: str) -> str:
+    return path if '://' in path or path.startswith('/') else root + path
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a path or URL, and the path in it."""
+    from fsspec.core import url_to_fs
+    try:
+        return url_to_fs(url)
+    except (ValueError, ImportError, OSError) as error:      # no such protocol, or its package
+        raise BadUsage(f'{url}: {said_by(error)}') from None
+
+
+def _bags_in(name: str) -> list[str]:
+    """Return the bags at a path: itself, what a glob fits, or all in a folder."""
+    fs, path = file_system(name)
+    try:
+        paths = fs.glob(path) if any(c in path for c in '*?[') else [path]
+        return [_url(name, fs, bag) for found in sorted(paths) for bag in _in_folder(fs, found)]
+    except OSError as error:
+        raise BadUsage(f'{name}: cannot be read ({said_by(error)})') from None
+
+
+def _in_folder(fs: Any, path: str) -> list[str]:
+    if not fs.isdir(path):
+        return [path]
+    files = fs.find(path)
+    folders = {str(PurePosixPath(f).parent) for f in files if PurePosixPath(f).name == META}
+    single = [f for f in files if any(fnmatch.fnmatch(f, ending) for ending in ENDINGS)
+              and str(PurePosixPath(f).parent) not in folders]
+    return sorted([*folders, *single])
+
+
+def _url(name: str, fs: Any, path: str) -> str:
+    return str(fs.unstrip_protocol(path)) if '://' in name else path
+
+
+def is_local(url: str) -> bool:
+    """Return whether a path or URL is of this machine; no server is asked."""
+    from fsspec.utils import get_protocol
+    return get_protocol(url) in ('file', 'local')
+
+
+def seen_as(url: str, settings: str) -> str:
+    """
+    Return a name for a bag by its place, size and date, and by settings.
+
+    Raises
+    ------
+    BadBag
+        It cannot be looked at.
+
+    """
+    try:
+        fs, path = file_system(url)
+        files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
+        if not files:
+            raise FileNotFoundError(f'{url}: there is nothing')
+    except Exception as error:     # noqa: BLE001 each kind of server has errors of its own
+        raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
+    dates = ('mtime', 'ETag', 'etag', 'LastModified', 'last_modified', 'updated', 'modify', 'CRC')
+    return key_of('seen', settings, url, sorted(
+        [name, about.get('size'), *(str(about[d]) for d in dates if d in about)]
+        for name, about in files.items()))
+
+
+@contextmanager
+def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
+    """Give a bag as a path of this machine: a copy in ``scratch`` that is removed, if need be."""
+    fs, path = file_system(url)
+    if is_local(url):
+        yield Path(path)
+        return
+    with tempfile.TemporaryDirectory(prefix='odocal_', dir=scratch) as folder:
+        copy = Path(folder) / PurePosixPath(path).name
+        try:
+            fs.get(path, str(copy), recursive=fs.isdir(path))
+        except Exception as error:     # noqa: BLE001 as above
+            raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
+        yield copy

@@ -1,0 +1,127 @@
+"""
+When a vehicle changed: steps in a value over its legs (tyres, pressure, a moved Imu), and drift.
+
+The legs' values are one level, steps, a slope and errors of known covariance: what is each leg's
+own, what legs share, and the walk that a scale is known for. Of the slope, all steps and all
+single odd legs the one that explains most is taken as long as it is beyond chance; then what has
+lost its meaning beside the others is dropped (backward after forward: a pair is not kept for what
+one of it explains).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+FALSE = 1e-3       # chance that a vehicle without any is said to have a change
+RIDGE = 1e-18      # smallest variance of a leg: the inverse exists
+DAY_NS = 86400e9
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step: from leg ``leg`` on, by ``size`` of the value, with its sigma."""
+
+    leg: int
+    size: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class History:
+    """
+    What a value did.
+
+    changes : in order.   odd : legs that stand alone.   slope, slope_sigma : per unit of ``t``;
+    None where nothing tells it.
+    """
+
+    changes: tuple[Change, ...] = ()
+    odd: tuple[int, ...] = ()
+    slope: float | None = None
+    slope_sigma: float | None = None
+
+
+def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None = None,
+               walk: float = 0.0) -> Floats:
+    """
+    Return the covariance of the values of n legs.
+
+    own : (n,) variance of what is each leg's alone.   shared : (n, k) one-sigma effects of errors
+    that legs have in common.   walk : sigma of a random walk per square root of a day.
+    """
+    V = np.diag(np.maximum(own, RIDGE)) + sum((g @ g.T for g in shared), np.zeros(()))
+    return V if days is None else V + walk**2 * np.minimum.outer(days, days)
+
+
+def chance(n: int) -> float:
+    """Return the deviate that no step, odd leg or slope of n legs comes to by chance."""
+    from scipy.special import ndtri
+    return float(-ndtri(FALSE / (2 * max(1, 2 * n - 2))))
+
+
+def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
+    """
+    Return the changes of n values in order, y (n,), of covariance V, and their slope over t.
+
+    A last leg that is odd is a change: nothing after it says otherwise.
+    """
+    n = len(y)
+    if n < 2:
+        return History()
+    L = np.linalg.cholesky(V)
+    level, *_ = np.linalg.lstsq(L, np.ones(n), rcond=None)
+    z = np.linalg.solve(L, y)
+    # all that may be: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
+    drifts = t is not None and np.ptp(t) > 0 and n > 2
+    W = np.linalg.solve(L, np.column_stack([
+        np.tril(np.ones((n, n)))[:, 1:], np.eye(n)[:, 1:n - 1],
+        *([t - t[0]] if t is not None and drifts else [])]))
+    slope = W.shape[1] - 1 if drifts else -1
+    found = sorted(_selected(z, level[:, None], W, chance(n)))
+    known = [k for k in found if k != slope]
+    size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
+    told = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
+    if drifts and slope not in told and n > len(found) + 2:
+        X = np.column_stack([level, W[:, found], W[:, slope]])
+        if np.linalg.matrix_rank(X) == X.shape[1]:
+            size, sigma = _fit(z, X)
+            told[slope] = float(size[-1]), float(sigma[-1])
+    return History(tuple(Change(k + 1, *told[k]) for k in known if k < n - 1),
+                   tuple(k - n + 2 for k in known if k >= n - 1),
+                   *told.get(slope, (None, None)))
+
+
+def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
+    """Return which columns of W explain z, beside the level, beyond chance."""
+    found: list[int] = []
+    while len(found) < (len(z) - 1) // 2 or not found:
+        rest, left = _without(np.column_stack([level, W[:, found]]), z, W)
+        size = np.linalg.norm(left, axis=0)
+        told = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
+                        / np.maximum(size, 1e-300), 0.0)
+        best = int(np.argmax(np.abs(told)))
+        if abs(told[best]) <= least:
+            break
+        found.append(best)
+    while found:
+        size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
+        told = np.abs(size[1:] / sigma[1:])
+        if told.min() > least:
+            break
+        del found[int(told.argmin())]
+    return found
+
+
+def _without(X: Floats, z: Floats, W: Floats) -> tuple[Floats, Floats]:
+    """Return z and the columns of W with all that X explains taken out."""
+    Q, _ = np.linalg.qr(X)
+    return z - Q @ (Q.T @ z), W - Q @ (Q.T @ W)
+
+
+def _fit(z: Floats, X: Floats) -> tuple[Floats, Floats]:
+    """Return the factors of the columns of X, and their sigmas, where z has unit variance."""
+    C = np.linalg.inv(X.T @ X)
+    return C @ (X.T @ z), np.sqrt(np.diag(C))

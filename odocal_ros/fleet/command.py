@@ -1,0 +1,107 @@
+"""odocal fleet: bags of many vehicles, each a task on Dask, then the vehicles compared."""
+
+from argparse import ArgumentTypeError
+from pathlib import Path
+import re
+import sys
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.offline.replay import add_calibration_arguments
+from odocal_ros.offline.say import say, warn
+
+TIMEOUT = 3600.0      # s for a bag
+GIB = 2**30
+UNITS = {'': 1, 'K': 2**10, 'M': 2**20, 'G': GIB}
+SHOWN = 20            # vehicles that are named on the terminal
+
+
+def _bytes(text: str) -> int:
+    found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
+    if not found or not float(found[1]):
+        raise ArgumentTypeError(f'{text}: want a size, as in 2G or 500M')
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+def _positive(text: str) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise ArgumentTypeError(f'{text}: want a whole number from 1 on')
+    return number
+
+
+def add_arguments(parser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add('bags', nargs='+', metavar='BAG', help='a manifest (.csv or .parquet with columns vehicle '
+        'and bag), or bags, folders of bags, globs, URLs')
+    add('--output', required=True, metavar='DIR', help='folder for rows and results; all workers '
+        'must reach it')
+    add('--vehicle-from', metavar='PATTERN', help='regular expression on the path of a bag whose '
+        "group names the vehicle (default: the bag's folder)")
+    add('--scheduler', metavar='ADDRESS', help='Dask cluster, as tcp://host:8786 (default: local '
+        'processes)')
+    add('--workers', type=_positive, metavar='N', help='local processes (default: as many as '
+        'cores and memory allow)')
+    add('--task-timeout', type=float, default=TIMEOUT, metavar='S', help='longest time for a bag '
+        f'(default {TIMEOUT:g})')
+    add('--task-memory', type=_bytes, default=2 * GIB, metavar='SIZE', help='most memory for a '
+        'bag (default 2G)')
+    add('--tries', type=_positive, default=3, metavar='N', help='of a bag that ends its local '
+        'worker (default 3)')
+    add('--again', action='store_true', help='try bags once more that failed')
+    add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles whose '
+        'own report is drawn')
+    add('--files', action='store_true', help='write the load-ready files of each vehicle')
+    add('--quiet', action='store_true', help='print nothing but errors, and the lines of --accept')
+    add_calibration_arguments(parser)
+
+
+def run(args) -> int:
+    """Calibrate a fleet; return 0 if all is well (of --accept: all pass), else 1."""
+    from odocal_ros.fleet.engine import check_installed
+    check_installed()
+    from odocal_ros.fleet.bags import find_bags
+    from odocal_ros.fleet.engine import dashboard, engine
+    from odocal_ros.fleet.jobs import bag_jobs, writable
+    from odocal_ros.fleet.outcome import exit_code, said, write_outcome
+    from odocal_ros.offline.cli import OK, REJECTED
+    if not args.task_timeout > 0:
+        raise BadUsage(f'--task-timeout {args.task_timeout:g}: want seconds above 0')
+    output = Path(args.output)
+    bags = find_bags(args.bags, args.vehicle_from)
+    jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
+    writable(output)
+    with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
+        if not args.quiet:
+            warn(f'odocal: {len(jobs)} bags of {len({b.vehicle for b in bags})} vehicles; '
+                 f'dashboard: {dashboard(client)}')
+        rows = _computed(client, jobs, args)
+        vehicles = write_outcome(client, jobs, rows, output, args)
+    if args.accept or any(row['decision'] for row in vehicles):
+        for row in vehicles:
+            say(row['line'])
+    if not args.quiet:
+        say(said(vehicles, output, SHOWN))
+    return OK if exit_code(vehicles, args.strict) == 0 else REJECTED
+
+
+def _computed(client, jobs, args) -> list[str]:
+    """Have all rows; return the file of each, and tell how far it is meanwhile."""
+    from tqdm import tqdm
+
+    from odocal_ros.fleet.jobs import computed_rows
+    from odocal_ros.fleet.rows import FAILED, RowStore
+    store, failed = RowStore(jobs[0].folder), 0
+    files = [''] * len(jobs)
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()
+    with tqdm(total=len(jobs), unit='bag', disable=args.quiet, file=sys.stderr, dynamic_ncols=True,
+              mininterval=0.5 if on_terminal else 30.0, desc='bags') as bar:
+        for i, done in computed_rows(client, jobs, args.again):
+            files[i] = str(store.path(done.key))
+            failed += done.status == FAILED
+            bar.set_postfix(failed=failed, refresh=False)
+            bar.update()
+    return files

@@ -1,0 +1,104 @@
+"""Dask: local processes, or a cluster that is there; tasks given, results as they come."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+import logging
+import os
+from typing import Any
+
+from odocal_ros.errors import BadUsage, OdocalError
+
+NEEDS = ('dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
+INSTALL = "pip install 'odocal_ros[fleet]'"
+MEMORY = 2 * 2**30       # bytes for a task, unless said
+BATCH = 1000             # tasks given to the scheduler at a time
+
+
+class EngineLost(OdocalError):
+    """The scheduler went away while it was needed."""
+
+
+def check_installed() -> None:
+    """Raise BadUsage with the line that installs what is missing."""
+    missing = [name for name in NEEDS if find_spec(name) is None]
+    if missing:
+        raise BadUsage(f'odocal fleet needs {", ".join(missing)}: {INSTALL}')
+
+
+@contextmanager
+def engine(scheduler: str | None, workers: int | None, memory: int,
+           tries: int) -> Iterator[Any]:
+    """
+    Give a Dask client: of the scheduler at an address, or of local processes for as long.
+
+    workers : None: as many as cores or memory allow.   memory : bytes of a task.
+    tries : of a bag that ends its worker; of a cluster that is there, its own setting holds.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+    if scheduler:
+        for name in ('distributed', 'tornado.application'):      # we say it in a sentence
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        try:
+            client = Client(scheduler, timeout='5s')
+        except (OSError, ValueError) as error:
+            raise BadUsage(f'--scheduler {scheduler}: nobody answers there ({error}); start one '
+                           'with: dask scheduler') from None
+        with client:
+            yield client
+        return
+    ours = {'distributed.scheduler.allowed-failures': tries - 1,
+            # one bag a worker: what ends it takes no other bag with it
+            'distributed.scheduler.worker-saturation': 1.0,
+            'distributed.logging.distributed': 'critical',
+            'distributed.worker.memory.terminate': False}
+    with dask.config.set(ours), LocalCluster(
+            n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
+            host='127.0.0.1', dashboard_address='127.0.0.1:0', memory_limit=0,
+            silence_logs='CRITICAL') as cluster, Client(cluster) as client:
+        yield client
+
+
+def _workers(memory: int) -> int:
+    """Return how many processes cores and free memory allow."""
+    import psutil
+    return max(1, min(len(os.sched_getaffinity(0)), psutil.virtual_memory().available // memory))
+
+
+def dashboard(client: Any) -> str:
+    """Return where the engine can be watched, and what that needs."""
+    if not client.dashboard_link:
+        return 'none'
+    hint = '' if find_spec('bokeh') else ' (pip install bokeh to see it)'
+    return f'{client.dashboard_link}{hint}'
+
+
+def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: str,
+            keys: Sequence[str]) -> Iterator[tuple[int, Any, BaseException | None]]:
+    """
+    Yield (number of the job, result, what went wrong) as tasks end, in any order.
+
+    Raises
+    ------
+    EngineLost
+        The scheduler is gone.
+
+    """
+    from distributed import as_completed, CancelledError
+    futures = client.map(task, jobs, key=[f'{name}-{key}' for key in keys], pure=True, retries=0,
+                         batch_size=BATCH)
+    number = {future.key: i for i, future in enumerate(futures)}
+    ended = as_completed(futures)
+    del futures
+    for future in ended:
+        error, found = None, None
+        try:
+            found = future.result()
+        except CancelledError:
+            raise EngineLost('the Dask scheduler is gone; start it again and give the same '
+                             'command: what is done is kept') from None
+        except Exception as what:     # noqa: BLE001 of the task, or that its workers were ended
+            error = what
+        yield number[future.key], found, error
+        future.release()

@@ -1,0 +1,129 @@
+"""The pictures of a fleet: each vehicle beside its model, and the scale over time."""
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.fleet.second_stage import COMPARED, flagged
+
+DEG = 57.29577951308232
+MOST_POINTS = 3000       # of a picture: more are thinned, but for those far off
+WIDE = 6.0               # medians of the distance that a picture shows
+MOST_LINES = 6           # vehicles that are told apart in time
+TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
+          'pitch_mounting_angle': 'Pitch mounting angle'}
+
+
+def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[str, str, str]]:
+    """Return (svg, title, what it shows) of what there is to draw."""
+    from odocal_ros.output.plots_svg import look
+    drawn = []
+    with look():
+        for name in COMPARED:
+            rows = [row for row in vehicles if row[name] is not None
+                    and row[f'{COMPARED[name]}_deviate'] is not None]
+            if rows:
+                drawn.append(_population(name, rows))
+        if chart := _control(vehicles, legs):
+            drawn.append(chart)
+    return drawn
+
+
+def _population(name: str, rows: list[dict]) -> tuple[str, str, str]:
+    """Draw each vehicle's value against its model's mean, one column a model."""
+    from odocal_ros.output.plots_svg import BLUE, evenly, RED, sheet, svg
+    models = sorted({row['model'] for row in rows})
+    figure, (ax,) = sheet(2.8)
+    scale, every = name == 'scale_factor', []
+    for k, model in enumerate(models):
+        some = [row for row in rows if row['model'] == model]
+        x, sigma = (np.array([row[key] for row in some], float)
+                    for key in (name, f'{name}_sigma'))
+        far = np.array([COMPARED[name] in row['outlier'].split() for row in some])
+        mean = np.median(x)
+        off, error = ((x / mean - 1) * 100, sigma / mean * 100) if scale else (
+            (x - mean) * DEG, sigma * DEG)
+        keep = np.union1d(evenly(len(x), MOST_POINTS // len(models)), np.flatnonzero(far))
+        at = k + 0.7 * (np.linspace(-0.5, 0.5, len(x)) if len(x) > 1 else np.zeros(1))
+        for which, colour in ((~far, BLUE), (far, RED)):
+            some_of = keep[which[keep]]
+            ax.errorbar(at[some_of], off[some_of], error[some_of], fmt='o', ms=3, lw=0.8,
+                        color=colour)
+        every += [(at[i], off[i]) for i in keep]
+    _within(ax, np.array(every))
+    ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
+    ax.set_ylabel('off the median, ' + ('%' if scale else 'deg'))
+    title = f'{TITLES[name]} by model.'
+    says = ('One point a vehicle with its sigma; red: far from its model; an arrow: beyond the '
+            'picture.')
+    return svg(figure, f'population-{COMPARED[name]}', f'{title} {says}'), title, says
+
+
+def _within(ax: Any, points: np.ndarray) -> None:
+    """Have the many fill the picture; those far beyond are arrows at its edge."""
+    from odocal_ros.output.plots_svg import RED
+    usual = WIDE * float(np.median(np.abs(points[:, 1])))
+    beyond = np.abs(points[:, 1]) > 2 * usual
+    if not beyond.any() or not usual:
+        return
+    most = 1.15 * max(usual, float(np.abs(points[~beyond, 1]).max()))
+    ax.set_ylim(-most, most)
+    for sign, mark in ((1, '^'), (-1, 'v')):
+        some = points[beyond & (sign * points[:, 1] > 0)]
+        ax.plot(some[:, 0], np.full(len(some), sign * 0.95 * most), mark, ms=6, color=RED)
+
+
+def _control(vehicles: Sequence[dict], legs: Path) -> tuple[str, str, str] | None:
+    """Draw the scale of legs over dates, those that changed or drift told apart."""
+    from odocal_ros.output.plots_svg import BLUE, GREEN, GREY, PINK, RED, sheet, svg
+    base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
+    told = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
+        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:MOST_LINES]
+    told += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
+             and row['vehicle'] not in told][:MOST_LINES - len(told)]
+    found = _legs(legs, set(base), set(told))
+    if not found:
+        return None
+    figure, (ax,) = sheet(3.4)
+    rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in found
+                     if vehicle not in told]).reshape(-1, 2)
+    ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
+            label='others')
+    styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
+    for vehicle, (colour, mark) in zip(told, styles, strict=False):
+        own = sorted((day, value, sigma) for name, day, value, sigma in found if name == vehicle)
+        day, value, sigma = np.array(own).T
+        ax.errorbar(day.astype('datetime64[s]'), (value / base[vehicle] - 1) * 100,
+                    sigma / base[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
+                    label=vehicle[:18])
+    ax.set_ylabel('scale off the present one, %')
+    figure.autofmt_xdate(rotation=20, ha='right')
+    figure.subplots_adjust(bottom=0.2, top=0.82)
+    figure.legend(loc='upper center', borderaxespad=0.2, ncols=4, handlelength=1.4,
+                  columnspacing=1.0)
+    title = 'Scale over time.'
+    says = ('Legs against the present scale of their vehicle; with lines: vehicles that changed '
+            'or want looking at, the worst first.')
+    return svg(figure, 'control', f'{title} {says}'), title, says
+
+
+def _legs(path: Path, known: set[str], told: set[str]) -> list[tuple[str, float, float, float]]:
+    """Return (vehicle, seconds since 1970, scale, sigma) of legs, of others than told thinned."""
+    import pyarrow.parquet as pq
+    columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
+    with pq.ParquetFile(path) as file:
+        every = max(1, file.metadata.num_rows // MOST_POINTS)
+        found, k = [], 0
+        for batch in file.iter_batches(columns=columns, batch_size=10_000):
+            for row in batch.to_pylist():
+                k += 1
+                vehicle = row['vehicle']
+                if row['scale_factor'] is None or row['verdict'] == 'rejected' \
+                        or vehicle not in known or vehicle not in told and k % every:
+                    continue
+                found.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
+                              row['scale_factor_sigma'] or 0.0))
+    return found

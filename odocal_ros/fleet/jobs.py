@@ -1,0 +1,119 @@
+"""From the bags of a fleet and the options of the command to what workers are given."""
+
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+
+from odocal_ros.errors import BadBag, BadUsage
+from odocal_ros.fleet.bag_task import BagJob, calibrate_bag, Done
+from odocal_ros.fleet.bags import file_system, FleetBag, is_local, seen_as
+from odocal_ros.fleet.engine import results
+from odocal_ros.fleet.rows import changed_settings, FAILED, RowStore, settings_key
+
+
+def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: float,
+             memory: int, config: Any = None) -> list[BagJob]:
+    """
+    Return a job for each bag.
+
+    args : as replay's options parse them (``add_calibration_arguments``).   config : settings
+    that go before them, in any form that the library takes.
+
+    Raises
+    ------
+    BadUsage, BadConfig
+        A setting or a settings file is wrong.
+
+    """
+    from odocal_ros.library.asked import config_of, legs_of
+    from odocal_ros.offline.replay import asked_config, asked_topics
+    read: dict[str, dict] = {}
+    jobs, topics = [], asked_topics(args)
+    before = changed_settings(config_of(config))
+    for bag in bags:
+        file = bag.config or args.config or ''
+        if file not in read:
+            read[file] = asked_config(Namespace(**vars(args) | {'config': file}))
+        settled = before | read[file] | {'vehicle': bag.vehicle}
+        legs = bag.legs or tuple(args.leg)
+        legs_of(legs)
+        settings = settings_key(config_of(settled), topics, legs)
+        jobs.append(BagJob(_from_anywhere(bag), topics, settled, legs, settings,
+                           str(folder.resolve()), seconds, memory))
+    return jobs
+
+
+def _from_anywhere(bag: FleetBag) -> FleetBag:
+    """Return the bag with a path that workers understand, whatever folder they run in."""
+    if not is_local(bag.bag):
+        return bag
+    return replace(bag, bag=os.path.abspath(file_system(bag.bag)[1]))
+
+
+def computed_rows(client: Any, jobs: Sequence[BagJob],
+                  again: bool = False) -> Iterator[tuple[int, Done]]:
+    """
+    Yield (number of the job, what came of it) for each, as they end; rows are then there.
+
+    again : those that failed before are tried once more.
+    """
+    store = RowStore(jobs[0].folder)
+    open_jobs = []
+    for i, job in enumerate(jobs):
+        if (key := _known(store, job)) is None:
+            open_jobs.append(i)
+            if again:
+                store.drop(job.place)
+        else:
+            yield i, Done(key, 'done', '', 0.0, False)
+    asked = [jobs[i] for i in open_jobs]
+    for k, done, error in results(client, calibrate_bag, asked, 'bag',
+                                  [f'{job.place}-{os.urandom(4).hex()}' for job in asked]):
+        job = jobs[open_jobs[k]]
+        if error is not None:      # the worker was ended each time, or could not write
+            row = store.get(job.place) or job.failed(_why(error))
+            store.put(row)
+            done = Done(row.key, FAILED, row.reason, 0.0, True)
+        yield open_jobs[k], done
+
+
+def _known(store: RowStore, job: BagJob) -> str | None:
+    """Return the key of the row of a bag on this machine that is unchanged."""
+    if not is_local(job.bag.bag):      # a server is asked by the worker: it may not answer
+        return None
+    try:
+        return store.known(seen_as(job.bag.bag, job.settings))
+    except BadBag:
+        return None
+
+
+def _why(error: BaseException) -> str:
+    from distributed.scheduler import KilledWorker
+    if isinstance(error, KilledWorker):
+        return (f'its worker was ended {error.allowed_failures + 1} times while it was computed: '
+                'killed, or out of memory')
+    return f'{type(error).__name__}: {error}'
+
+
+def writable(folder: Path) -> None:
+    """
+    Make the output folder.
+
+    Raises
+    ------
+    BadUsage
+        It cannot be written.
+
+    """
+    try:
+        for part in ('rows', 'seen'):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadUsage(f'{folder}: cannot be written ({error.strerror}); choose another '
+                       '--output') from None

@@ -1,0 +1,143 @@
+"""What a fleet's rows come to: tables, page, single reports, a few lines, an exit code."""
+
+from argparse import Namespace
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from odocal_ros.errors import OdocalError
+from odocal_ros.fleet.bag_task import BagJob
+from odocal_ros.fleet.bags import at_hand
+from odocal_ros.fleet.engine import results
+from odocal_ros.fleet.second_stage import (
+    file_name,
+    flagged,
+    vehicle_jobs,
+    VEHICLES,
+    vehicles_together,
+)
+from odocal_ros.outside.names import for_table
+from odocal_ros.outside.whole import write_text
+from odocal_ros.reasons import Verdict
+
+TABLE, PAGE = 'fleet.csv', 'fleet.html'
+
+
+@dataclass(frozen=True)
+class ReportJob:
+    """A replay of the bags of a vehicle since its last change."""
+
+    jobs: tuple[BagJob, ...]
+    output: str
+
+
+def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], output: Path,
+                  args: Namespace) -> list[dict[str, Any]]:
+    """Write tables, reports and page from the rows of all bags; return the vehicles' rows."""
+    from odocal_ros.fleet.page import fleet_page
+    of = vehicle_jobs([job.bag for job in jobs], rows, asked(jobs))
+    vehicles = vehicles_together(client, of, output, args.files)
+    write_text(output / TABLE, _csv(output / VEHICLES))
+    _reports(client, vehicles, jobs, output, args.reports)
+    write_text(output / PAGE, fleet_page(vehicles, output))
+    return vehicles
+
+
+def asked(jobs: Sequence[BagJob]) -> dict[str, Any]:
+    """Return what was asked of results now, whatever the rows were made with."""
+    from odocal_ros.fleet.rows import NOT_OF_LEGS
+    from odocal_ros.library.asked import config_of
+    from odocal_ros.settings.config import flat
+    return {name: value for name, value in flat(config_of(jobs[0].config)).items()
+            if name.partition('.')[0] in NOT_OF_LEGS and (name != 'frames.imu' or value)}
+
+
+def _csv(table: Path) -> str:
+    """Return a table as text for a spreadsheet."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet as pq
+    whole = pq.read_table(table)
+    for i, name in enumerate(whole.column_names):
+        if pa.types.is_string(whole.schema.types[i]):
+            text = [None if x is None else for_table(x) for x in whole[name].to_pylist()]
+            whole = whole.set_column(i, name, pa.array(text, pa.string()))
+    sink = io.BytesIO()
+    csv.write_csv(whole, sink)
+    return sink.getvalue().decode()
+
+
+def _reports(client: Any, vehicles: Sequence[dict], jobs: Sequence[BagJob], output: Path,
+             which: str) -> None:
+    """Draw single reports, each a task; note in a vehicle's row where it is, or why not."""
+    of = {job.bag.bag: job for job in jobs}
+    wanted = [row for row in vehicles if row['now'] and (
+        which == 'all' or which == 'flagged' and flagged(row))]
+    asked_for = [ReportJob(tuple(of[bag] for bag in row['now']), str(
+        (output / 'reports' / file_name(row['vehicle'])).resolve())) for row in wanted]
+    keys = [f'{k}-{id(asked_for)}' for k in range(len(asked_for))]
+    for k, why, error in results(client, draw_report, asked_for, 'report', keys):
+        wanted[k]['report'] = why if error is None else f'{type(error).__name__}: {error}'
+
+
+def draw_report(job: ReportJob) -> str:
+    """Replay bags into a folder; return why it could not be."""
+    from odocal_ros.library.calibrate_bag import calibrate_bag
+    first = job.jobs[0]
+    troubles: list[str] = []
+    try:
+        with ExitStack() as stack:
+            bags = [stack.enter_context(at_hand(one.bag.bag, None)) for one in job.jobs]
+            found = calibrate_bag(bags, first.topics, first.config, first.legs)
+            found.save(Path(job.output), True, troubles.append)
+    except OdocalError as error:
+        return str(error)
+    return '; '.join(troubles)
+
+
+def said(vehicles: Sequence[dict], output: Path, most: int) -> str:
+    """Return what a person must know of a fleet."""
+    counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
+    failed = sum(row['bags_failed'] for row in vehicles)
+    bags = sum(row['bags'] for row in vehicles)
+    lines = [', '.join(f'{n} {what}' for what, n in sorted(counts.items()))
+             + f'; {bags} bags, {failed} failed']
+    worth = [row for row in vehicles if flagged(row)]
+    lines += [f'  {row["vehicle"]}: {"; ".join(remarks(row))}' for row in worth[:most]]
+    if len(worth) > most:
+        lines.append(f'  and {len(worth) - most} more')
+    return '\n'.join([*lines, f'written: {output}/ ({TABLE}, vehicles.parquet, legs.parquet)',
+                      f'report:  {output / PAGE}'])
+
+
+def remarks(row: dict) -> list[str]:
+    """Return what is worth saying of a vehicle."""
+    out = [row['decision'] or row['verdict']]
+    for change in json.loads(row['changes']):
+        size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
+                f'{57.29577951308232 * change["size"]:+.2f} deg')
+        out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
+                   f'{change["after"][:10]} and {change["by"][:10]}')
+    if row['outlier']:
+        out.append(f'{" and ".join(row["outlier"].split())} far from its model')
+    if row['odd_legs']:
+        out.append(f'odd leg {", ".join(row["odd_legs"].split())}')
+    if row['rejected_for']:
+        since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
+        out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '
+                   f'({", ".join(row["rejected_for"].split())}){since}')
+    if row['bags_failed']:
+        out.append(f'{row["bags_failed"]} of {row["bags"]} bags failed ({row["failures"]})')
+    return [*out, row['why']] if row['why'] else out
+
+
+def exit_code(vehicles: Sequence[dict], strict: bool) -> int:
+    """Return 0 where all vehicles are well: of limits, all that pass."""
+    bad = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
+        {Verdict.CAUTION.value} if strict else set())
+    return int(any(row['bags_failed'] or (row['decision'] or row['verdict']) in bad
+                   for row in vehicles))

@@ -1,0 +1,97 @@
+"""fleet.html: one page that needs no network, for whoever answers for all the vehicles."""
+
+from collections import Counter
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from odocal_ros import __version__
+from odocal_ros.fleet.outcome import file_name, remarks
+from odocal_ros.fleet.population import LEAST, population
+from odocal_ros.fleet.second_stage import COMPARED, LEGS
+from odocal_ros.output.figures import with_sigma
+
+DEG = 57.29577951308232
+MOST_ROWS = 2000     # vehicles in the table
+
+
+def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
+    """Return the page of a fleet whose rows stand in ``output``, the worst vehicle first."""
+    from jinja2 import Environment, StrictUndefined
+
+    from odocal_ros.fleet.figures import fleet_figures
+    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+                           lstrip_blocks=True).from_string(
+        (files('odocal_ros.fleet') / 'templates' / 'fleet.html').read_text(encoding='utf-8'))
+    style = (files('odocal_ros.output') / 'templates' / 'report.css').read_text(encoding='utf-8')
+    counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
+    return template.render(
+        style=style, title=output.resolve().name, facts=_facts(vehicles),
+        counts=sorted(counts.items()), models=[_model(*one) for one in _models(vehicles)],
+        figures=fleet_figures(vehicles, output / LEGS),
+        vehicles=[_row(row) for row in vehicles[:MOST_ROWS]],
+        left=max(0, len(vehicles) - MOST_ROWS)) + '\n'
+
+
+def _facts(vehicles: Sequence[dict]) -> str:
+    dates = [row[key] for row in vehicles for key in ('first', 'last') if row[key]]
+    when = f', {min(dates):%Y-%m-%d} to {max(dates):%Y-%m-%d}' if dates else ''
+    bags, failed, legs = (sum(row[key] for row in vehicles)
+                          for key in ('bags', 'bags_failed', 'legs'))
+    return (f'{len(vehicles)} vehicles, {bags} bags ({failed} failed), {legs} legs, '
+            f'{sum(row["distance_km"] for row in vehicles):.0f} km in '
+            f'{sum(row["driven_h"] for row in vehicles):.1f} h{when}; odocal_ros {__version__}')
+
+
+def _models(vehicles: Sequence[dict]) -> list[tuple[str, str, list[dict]]]:
+    """Return (model, unit of the scale, vehicles), what was rejected left out."""
+    kinds: dict[tuple[str, str], list[dict]] = {}
+    for row in vehicles:
+        if row['legs'] and row['verdict'] != 'rejected':
+            kinds.setdefault((row['model'], row['unit']), []).append(row)
+    return [(model, unit, rows) for (model, unit), rows in sorted(kinds.items())]
+
+
+def _model(model: str, unit: str, rows: list[dict]) -> dict:
+    cells = []
+    for name in COMPARED:
+        have = [row for row in rows if row[name] is not None]
+        if not have:
+            cells += ['-', '-']
+            continue
+        found = population(*(np.array([row[key] for row in have], float)
+                             for key in (name, f'{name}_sigma')))
+        few = len(have) < LEAST
+        if name == 'scale_factor':
+            cells += [f'{with_sigma(found.mean, found.sigma)} {unit}',
+                      '-' if few else f'{100 * found.spread / found.mean:.2f} %']
+        else:
+            cells += [with_sigma(found.mean, found.sigma, DEG, signed=True),
+                      '-' if few else f'{DEG * found.spread:.2f}']
+    far = sorted(row['vehicle'] for row in rows if row['outlier'])
+    return {'model': model, 'vehicles': len(rows), 'cells': cells, 'far': ', '.join(far[:20])
+            + (f' and {len(far) - 20} more' if len(far) > 20 else '')}
+
+
+def _row(row: dict) -> dict:
+    values = [_cell(row, 'scale_factor', 1.0), _cell(row, 'yaw_mounting_angle', DEG),
+              _cell(row, 'pitch_mounting_angle', DEG), _cell(row, 'drift_per_year', 100.0)]
+    drawn = row['report'] == ''
+    said = remarks(row)[1:]
+    return {'vehicle': row['vehicle'], 'model': row['model'], 'cells': values,
+            'judged': row['decision'] or row['verdict'],
+            'legs': f'{row["legs_good"]} of {row["legs"]}', 'km': f'{row["distance_km"]:.1f}',
+            'since': f'{row["since"]:%Y-%m-%d}' if row['since'] else '',
+            'remarks': '; '.join(said + ([f'no report: {row["report"]}'] if row['report'] else
+                                         [])),
+            'link': f'reports/{quote(file_name(row["vehicle"]))}/report.html' if drawn else ''}
+
+
+def _cell(row: dict, name: str, factor: float) -> str:
+    if row[name] is None:
+        return '-'
+    return with_sigma(row[name], row[f'{name}_sigma'], factor, signed=factor != 1.0)

@@ -1,0 +1,68 @@
+"""The vehicles of a model beside each other: robust mean and spread, and who lies outside."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+FAR = 4.0            # sigmas of a vehicle from its model: by chance one in 16,000
+HUBER = 1.5          # sigmas from which a vehicle counts for less
+QUARTILE = 0.6745    # of the normal law: half of all lie within
+LEAST = 3            # vehicles of which a spread can be told
+PASSES = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """
+    Values of one model's vehicles.
+
+    mean, sigma : robust, and how well it is known.   spread : between vehicles, beyond their
+    sigmas, 1 sigma.   deviates : (n,) of each vehicle, in sigmas of spread and its own together;
+    nan of too few vehicles.
+    """
+
+    mean: float
+    sigma: float
+    spread: float
+    deviates: Floats
+
+    @property
+    def outliers(self) -> NDArray[np.intp]:
+        """Return the numbers of those who lie outside."""
+        return np.flatnonzero(np.abs(self.deviates) > FAR)
+
+
+def population(values: Floats, sigmas: Floats) -> Population:
+    """
+    Return what vehicles have in common, values (n,) with their sigmas.
+
+    The spread is that with which half of all lie as near to the mean as the normal law says; the
+    mean is Huber's, so that a vehicle far off moves neither.
+    """
+    x, s = np.asarray(values, float), np.asarray(sigmas, float)
+    mean, spread = float(np.median(x)), 0.0
+    if len(x) < LEAST:
+        return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
+    for _ in range(PASSES):
+        before = mean
+        spread = _spread(np.abs(x - mean), s)
+        total = np.hypot(s, max(spread, 1e-300))
+        weight = np.minimum(1.0, HUBER * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
+        mean = float(weight @ x / weight.sum())
+        if abs(mean - before) <= 1e-12 * max(float(total.min()), 1e-300):
+            break
+    return Population(mean, float(weight.sum()**-0.5), spread, (x - mean) / total)
+
+
+def _spread(off: Floats, s: Floats) -> float:
+    """Return the spread at which the median of off / sigma is that of the normal law."""
+    if np.median(off / np.maximum(s, 1e-300)) <= QUARTILE:
+        return 0.0
+    low, high = 0.0, float(off.max()) / QUARTILE
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.median(off / np.hypot(s, middle)) > QUARTILE else (
+            low, middle)
+    return high

@@ -1,0 +1,131 @@
+"""
+The data set of a fleet: one small Parquet file a bag, there whole or not at all.
+
+rows/ab/<key>.parquet: the key is of the bag's content, the settings that touch its legs and the
+software's version; of a bag that failed, of its place instead of its content. seen/ab/<key> holds
+the row's key by place, size and date of the bag: known ones are not read again.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from odocal_ros import __version__
+from odocal_ros.outside.whole import whole_file, write_text
+from odocal_ros.settings.config import Config, flat, with_settings
+
+DONE, FAILED = 'done', 'failed'
+# groups of settings that do not touch the legs of a bag
+NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What is known of one bag; ``legs`` as ``leg_text`` has them, ``settings`` those changed."""
+
+    key: str
+    bag: str
+    vehicle: str
+    model: str = ''
+    odometer_km: float | None = None
+    status: str = DONE
+    reason: str = ''
+    seen: str = ''              # place, size and date of the bag as a hash
+    sha256: str = ''
+    software: str = __version__
+    settings: str = '{}'
+    topics: str = '{}'
+    bytes: int = 0
+    seconds: float = 0.0        # that it took
+    driven_s: float = 0.0
+    start_ns: int = 0
+    legs: str = '[]'
+
+    def config(self) -> Config:
+        """Return the settings that it was made with."""
+        return with_settings(Config(), json.loads(self.settings))
+
+
+def key_of(*parts: object) -> str:
+    """Return a name for what the parts are of."""
+    return hashlib.sha256(json.dumps([__version__, *parts]).encode()).hexdigest()[:40]
+
+
+def changed_settings(config: Config) -> dict[str, Any]:
+    """Return the settings that are not the default."""
+    default = flat(Config())
+    return {name: value for name, value in flat(config).items()
+            if repr(value) != repr(default[name])}
+
+
+def settings_key(config: Config, *more: object) -> str:
+    """Return a name for the settings that touch the legs of a bag, and what else does."""
+    return key_of([[name, repr(value)] for name, value in flat(config).items()
+                   if name.partition('.')[0] not in NOT_OF_LEGS], *more)
+
+
+class RowStore:
+    """The rows in an output folder."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+
+    def path(self, key: str) -> Path:
+        """Return where the row of a key is."""
+        return self.folder / 'rows' / key[:2] / f'{key}.parquet'
+
+    def put(self, row: Row) -> None:
+        """Write a row."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+        path = self.path(row.key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as file:
+            sink = pa.BufferOutputStream()
+            pq.write_table(pa.Table.from_pylist([asdict(row)], schema=row_schema()), sink,
+                           compression='zstd')
+            file.write(sink.getvalue().to_pybytes())
+
+    def get(self, key: str) -> Row | None:
+        """Return the row of a key, None where there is none."""
+        return next(rows_of([self.path(key)]), None) if self.path(key).exists() else None
+
+    def drop(self, key: str) -> None:
+        """Take a row away."""
+        self.path(key).unlink(missing_ok=True)
+
+    def remember(self, seen: str, key: str) -> None:
+        """Note which row is that of a bag at a place, of a size and date."""
+        path = self._seen(seen)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, key)
+
+    def known(self, seen: str) -> str | None:
+        """Return the key of the row that is there of a bag, None where there is none."""
+        try:
+            key = self._seen(seen).read_text()
+        except OSError:
+            return None
+        return key if self.path(key).exists() else None
+
+    def _seen(self, seen: str) -> Path:
+        return self.folder / 'seen' / seen[:2] / seen
+
+
+def row_schema() -> Any:
+    """Return the columns of the data set."""
+    import pyarrow as pa
+    kinds: dict[Any, Any] = {str: pa.string(), int: pa.int64()}
+    return pa.schema([(f.name, kinds.get(f.type, pa.float64())) for f in fields(Row)])
+
+
+def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
+    """Yield the rows of files, one file after the other."""
+    import pyarrow.parquet as pq
+    for path in paths:
+        with open(path, 'rb') as file:
+            for entry in pq.read_table(file, schema=row_schema()).to_pylist():
+                yield Row(**entry)

@@ -1,0 +1,228 @@
+"""From rows to vehicles on the engine: groups of vehicles, each a task that writes its part."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, UTC
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+import uuid
+
+import numpy as np
+
+from odocal_ros.fleet.bags import FleetBag
+from odocal_ros.fleet.engine import results
+from odocal_ros.fleet.population import FAR, population
+from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
+from odocal_ros.outside.whole import whole_file
+
+LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
+TOGETHER = 500       # bags of a group of vehicles, at least
+COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
+WORST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
+
+
+@dataclass(frozen=True)
+class GroupJob:
+    """Vehicles whose legs go to one part of a table; ``files``: write their results there."""
+
+    vehicles: tuple[VehicleJob, ...]
+    part: str
+    files: str = ''
+
+
+def vehicle_jobs(bags: Sequence[FleetBag], rows: Sequence[str],
+                 settings: dict[str, Any]) -> list[VehicleJob]:
+    """Return a job for each vehicle; ``rows``: the file of each bag's row."""
+    of: dict[str, list[int]] = {}
+    for i, bag in enumerate(bags):
+        of.setdefault(bag.vehicle, []).append(i)
+    # the same bag given twice under one vehicle is one row
+    return [VehicleJob(vehicle, tuple(bags[i] for i in which),
+                       tuple(dict.fromkeys(rows[i] for i in which)), settings)
+            for vehicle, which in of.items()]
+
+
+def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, files: bool,
+                      tell: Callable[[int], None] = lambda done: None) -> list[dict[str, Any]]:
+    """
+    Return the rows of all vehicles, the worst first; write legs.parquet and vehicles.parquet.
+
+    files : write the load-ready files of each vehicle too.
+    """
+    parts = folder / f'.parts.{uuid.uuid4().hex}'
+    parts.mkdir(parents=True)
+    try:
+        groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
+                           str(folder / 'vehicles') if files else '')
+                  for k, group in enumerate(_grouped(jobs))]
+        found: dict[int, list[dict]] = {}
+        for k, rows, error in results(client, group_of, groups, 'vehicles',
+                                      [Path(group.part).stem + parts.name for group in groups]):
+            if error is not None:
+                raise error
+            found[k] = rows
+            tell(len(rows))
+        vehicles = beside_their_model([row for k in sorted(found) for row in found[k]])
+        _write(folder / LEGS, leg_schema(), _batches(sorted(parts.glob('*.parquet'))))
+        _write(folder / VEHICLES, vehicle_schema(), _in_batches(vehicles))
+        return vehicles
+    finally:
+        shutil.rmtree(parts, ignore_errors=True)
+
+
+def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
+    group: list[VehicleJob] = []
+    for job in jobs:
+        group.append(job)
+        if sum(len(one.bags) for one in group) >= TOGETHER:
+            yield tuple(group)
+            group = []
+    if group:
+        yield tuple(group)
+
+
+def group_of(group: GroupJob) -> list[dict[str, Any]]:
+    """Compute vehicles one after the other; write their legs as a part, return their rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    rows = []
+    with pq.ParquetWriter(group.part, leg_schema(), compression='zstd') as writer:
+        legs: list[dict] = []
+        for job in group.vehicles:
+            vehicle = vehicle_of(job)
+            rows.append(vehicle.row)
+            legs += vehicle.legs
+            if group.files and vehicle.calibration is not None:
+                _write_files(vehicle, Path(group.files))
+        if legs:
+            writer.write_table(pa.Table.from_pylist(legs, schema=leg_schema()))
+    return rows
+
+
+def _write_files(vehicle: Vehicle, folder: Path) -> None:
+    """Write what replay writes of a vehicle, but for what is drawn."""
+    from odocal_ros.output.files import write_results
+    from odocal_ros.settings.config import with_settings
+    assert vehicle.calibration is not None
+    assert vehicle.config is not None
+    formats = tuple(f for f in vehicle.config.output.formats if f not in ('report', 'track'))
+    write_results(vehicle.calibration, with_settings(vehicle.config, {'output.formats': formats}),
+                  folder / file_name(vehicle.row['vehicle']), list(vehicle.inputs),
+                  datetime.now(UTC).isoformat(timespec='seconds'), force=True)
+
+
+def file_name(vehicle: str) -> str:
+    """Return a name for a vehicle's folder: no path, whatever it is called."""
+    from urllib.parse import quote
+    return quote(vehicle, safe=' ').lstrip('.') or '_'
+
+
+def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows with each vehicle's deviates from its model, the worst first."""
+    for name, short in COMPARED.items():
+        for row in rows:
+            row[f'{short}_deviate'] = None
+        kinds: dict[tuple, list[dict]] = {}
+        for row in rows:
+            if row[name] is not None and row['verdict'] != 'rejected':
+                kinds.setdefault((row['model'], row['unit']), []).append(row)
+        for some in kinds.values():
+            found = population(*(np.array([row[key] for row in some], float)
+                                 for key in (name, f'{name}_sigma')))
+            for row, deviate in zip(some, found.deviates.tolist(), strict=True):
+                row[f'{short}_deviate'] = None if deviate != deviate else deviate
+    for row in rows:
+        row['outlier'] = ' '.join(short for short in COMPARED.values()
+                                  if abs(row[f'{short}_deviate'] or 0.0) > FAR)
+    return sorted(rows, key=_badness)
+
+
+def flagged(row: dict[str, Any]) -> bool:
+    """Return whether somebody should look at a vehicle."""
+    return bool(row['outlier'] or row['bags_failed'] or row['odd_legs'] or row['rejected_for']
+                or json.loads(row['changes']) or row['verdict'] == 'rejected'
+                or row['decision'] in ('FAIL', 'UNDECIDED'))
+
+
+def _badness(row: dict[str, Any]) -> tuple:
+    judged = row['decision'] or row['verdict']
+    far = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
+    return (not row['legs'] and -1 or 0, WORST.index(judged), not row['outlier'],
+            row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
+            not row['rejected_for'], -far, row['vehicle'])
+
+
+def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') -> Any:
+    import pyarrow as pa
+    kinds = ((texts, pa.string()), (times, pa.timestamp('us', 'UTC')), (counts, pa.int64()),
+             (flags, pa.bool_()), (numbers, pa.float64()))
+    return pa.schema([(name, kind) for names, kind in kinds for name in names.split()])
+
+
+VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in (
+    'scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle'))
+
+
+def leg_schema() -> Any:
+    """Return the columns of legs.parquet."""
+    return _schema('vehicle model bag verdict reasons unit',
+                   f'odometer_km duration_s distance_m {VALUE_COLUMNS}',
+                   'leg start_ns stop_ns fixes period', 'start', 'odd')
+
+
+def vehicle_schema() -> Any:
+    """Return the columns of vehicles.parquet."""
+    return _schema(
+        'vehicle model decision verdict unit why remedy reasons changes odd_legs '
+        'outlier failures rejected_for',
+        f'{VALUE_COLUMNS} drift_per_year drift_per_year_sigma drift_per_1000_km '
+        'drift_per_1000_km_sigma distance_km driven_h scale_deviate yaw_deviate pitch_deviate',
+        'bags bags_failed legs legs_good', 'first last since rejected_since')
+
+
+def _in_batches(rows: list[dict[str, Any]]) -> Iterator[Any]:
+    import pyarrow as pa
+    for k in range(0, len(rows), 1000):
+        yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
+
+
+def _batches(parts: Sequence[Path]) -> Iterator[Any]:
+    import pyarrow.parquet as pq
+    for part in parts:
+        yield pq.read_table(part, partitioning=None)
+
+
+def _write(path: Path, schema: Any, tables: Iterable[Any]) -> None:
+    """Write tables one after the other as one file, whole or not at all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    with whole_file(path) as file, pq.ParquetWriter(
+            pa.PythonFile(_Sink(file), mode='w'), schema, compression='zstd') as writer:
+        for table in tables:
+            if table.num_rows:
+                writer.write_table(table)
+
+
+class _Sink:
+    """A file that pyarrow may write to and believes it has closed."""
+
+    closed = False
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._at = file, 0
+
+    def write(self, data: bytes) -> int:
+        self._at += len(data)
+        self._file.write(bytes(data))
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass

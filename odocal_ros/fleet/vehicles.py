@@ -1,0 +1,262 @@
+"""A vehicle from the rows of its bags: legs combined as replay has it, changes, pass or fail."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, UTC
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.combine import DRAWN_ANEW
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.fleet.bags import FleetBag
+from odocal_ros.fleet.changes import Change, covariance, DAY_NS, History, history
+from odocal_ros.fleet.leg_text import legs_from
+from odocal_ros.fleet.rows import DONE, Row, rows_of
+from odocal_ros.library.bags import told_apart
+from odocal_ros.nav.angles import wrap
+from odocal_ros.output.acceptance import accept_line
+from odocal_ros.output.stored import known_imu
+from odocal_ros.outside.names import one_line
+from odocal_ros.pipeline.acceptance import accept, Decision
+from odocal_ros.pipeline.calibrate import combine
+from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config, with_settings
+
+VALUES = {'scale_factor': '', 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+          'pitch_mounting_angle': 'rad'}
+YEAR = 365.25        # days
+
+
+@dataclass(frozen=True)
+class VehicleJob:
+    """The bags of a vehicle and where their rows are; ``accept`` and the like as asked now."""
+
+    vehicle: str
+    bags: tuple[FleetBag, ...]
+    rows: tuple[str, ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """What is known of a vehicle: its row of vehicles.parquet, those of legs.parquet, and more."""
+
+    row: dict[str, Any]
+    legs: list[dict[str, Any]]
+    calibration: Calibration | None = None
+    config: Config | None = None
+    inputs: tuple[dict, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Driven:
+    """A leg with what its bag is known for."""
+
+    leg: LegResult
+    odometer_km: float | None
+
+
+def vehicle_of(job: VehicleJob) -> Vehicle:
+    """Return what the rows of a vehicle's bags say of it."""
+    rows = [row for row in rows_of(job.rows) if row.vehicle == job.vehicle]
+    known = {bag.bag: bag for bag in job.bags}
+    done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
+    failed = [row for row in rows if row.status != DONE]
+    row = {'vehicle': job.vehicle, 'model': next((b.model for b in job.bags if b.model), ''),
+           'bags': len(rows), 'bags_failed': len(failed),
+           'failures': '; '.join(f'{Path(r.bag).name}: {r.reason}' for r in failed[:5])}
+    driven = _driven(done, known)
+    if not driven:
+        limits = with_settings(Config(), job.settings).accept.limits
+        return Vehicle(_undriven(row, Decision.UNDECIDED.value if limits else ''), [])
+    config = with_settings(done[-1].config(), job.settings)
+    histories = {name: _history(name, driven, config) for name in (
+        'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
+    starts = _periods(histories, driven)
+    now = driven[starts[-1]:]
+    calibration = combine([one.leg for one in now], config, imu=known_imu(config))
+    row |= _told(calibration, config, driven, starts) | _changes(histories, driven) \
+        | _rejected(driven)
+    since = now[0].leg.start_ns
+    row |= {'now': [r.bag for r in done if r.start_ns >= since or r is done[-1]], 'report': None}
+    legs = [_leg_row(job, k, one, starts, histories) for k, one in enumerate(driven)]
+    inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
+                   for r in done)
+    return Vehicle(row, legs, calibration, config, inputs)
+
+
+def _driven(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[_Driven]:
+    """Return the legs of rows by time, those of bags of one name told apart as replay does it."""
+    legs = [legs_from(row.legs) for row in rows]
+    entries = [{'bag': next((leg.bag for leg in some), row.bag)}
+               for row, some in zip(rows, legs, strict=True)]
+    named, _ = told_apart([Path(row.bag) for row in rows], legs, entries)
+    km = [known[row.bag].odometer_km if row.bag in known else row.odometer_km
+          for row, some in zip(rows, legs, strict=True) for _ in some]
+    return sorted((_Driven(leg, k) for leg, k in zip(named, km, strict=True)),
+                  key=lambda one: one.leg.start_ns)
+
+
+def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
+    none = {f'{name}{part}': None for name in VALUES for part in ('', '_sigma')}
+    return row | none | {
+        'legs': 0, 'legs_good': 0, 'distance_km': 0.0, 'driven_h': 0.0, 'first': None,
+        'last': None, 'unit': '', 'since': None, 'verdict': Verdict.REJECTED.value,
+        'decision': decision, 'why': 'no bag could be calibrated', 'remedy':
+        'See the reasons of the bags.', 'reasons': '', 'changes': '[]', 'odd_legs': '',
+        'rejected_for': '', 'rejected_since': None,
+        'drift_per_year': None, 'drift_per_year_sigma': None, 'drift_per_1000_km': None,
+        'drift_per_1000_km_sigma': None, 'now': [], 'report': None, 'line': json.dumps(
+            {'vehicle': row['vehicle'], 'decision': decision,
+             'why': row['failures'], 'remedy': 'See the reasons of the bags.', 'values': {},
+             'verdict': Verdict.REJECTED.value, 'reasons': []})}
+
+
+def _history(name: str, driven: Sequence[_Driven], config: Config
+             ) -> tuple[list[int], History, History]:
+    """Return which legs tell of a value, its history over days, and over kilometres."""
+    told = []
+    for k, one in enumerate(driven):
+        e = leg_estimates(one.leg).get(name)
+        if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
+            told.append((k, e.value, one.leg.methods[e.method]))
+    if not told:
+        return [], History(), History()
+    scale = name == 'scale_factor'
+    number, values, methods = (list(column) for column in zip(*told, strict=True))
+    value = np.array(values)
+    y = np.log(value / value[0]) if scale else np.asarray(wrap(value - value[0]))
+    own, shared = _errors(name, methods)
+    days = np.array([driven[k].leg.driven_ns for k in number]) / DAY_NS
+    days -= days[0]
+    V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
+    km = [driven[k].odometer_km for k in number]
+    by_way = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
+    return number, history(y, V, days / YEAR), by_way
+
+
+def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the variance of what is each leg's own, and the effects of what legs share."""
+    own = np.zeros(len(methods))
+    shared: dict[tuple, np.ndarray] = {}
+    for k, method in enumerate(methods):
+        i = method.parameters.index(name)
+        for source in method.sources:
+            if not source.shared or source.name in DRAWN_ANEW:
+                own[k] += source.effects[i] @ source.effects[i]
+                continue
+            effects = shared.setdefault((method.name, source.name, source.effects.shape[1]),
+                                        np.zeros((len(methods), source.effects.shape[1])))
+            effects[k] = source.effects[i]
+    return own, list(shared.values())
+
+
+def _periods(histories: dict, driven: Sequence[_Driven]) -> list[int]:
+    """Return with which leg each period begins in which nothing changed, the first at 0."""
+    return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
+                         for change in found.changes})
+
+
+def _told(calibration: Calibration, config: Config, driven: Sequence[_Driven],
+          starts: Sequence[int]) -> dict[str, Any]:
+    """Return what the calibration since the last change says."""
+    estimates, legs = calibration.estimates, [one.leg for one in driven]
+    row: dict[str, Any] = {}
+    for name in VALUES:
+        e = estimates.get(name)
+        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
+    acceptance = accept(calibration, config)
+    scale = estimates.get('scale_factor')
+    return row | {
+        'legs': len(legs), 'legs_good': sum(g.verdict is not Verdict.REJECTED for g in legs),
+        'distance_km': sum(g.distance for g in legs) / 1000,
+        'driven_h': sum(g.duration for g in legs) / 3600,
+        'first': _utc(legs[0].start_ns), 'last': _utc(legs[-1].start_ns),
+        'unit': scale.unit if scale else '', 'since': _utc(legs[starts[-1]].start_ns),
+        'verdict': calibration.verdict.value,
+        'decision': acceptance.decision.value if acceptance else '',
+        'why': acceptance.why if acceptance else '',
+        'remedy': acceptance.do if acceptance else '',
+        'line': accept_line(calibration, acceptance, config) if acceptance else '',
+        'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
+
+
+def _rejected(driven: Sequence[_Driven]) -> dict[str, Any]:
+    """Return why legs are rejected, and since when all of them are."""
+    legs = [one.leg for one in driven]
+    codes = dict.fromkeys(
+        r.code.name for leg in legs if leg.verdict is Verdict.REJECTED
+        for r in (*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons))
+        if r.code.gravity is Verdict.REJECTED)
+    good = [k for k, leg in enumerate(legs) if leg.verdict is not Verdict.REJECTED]
+    since = max(good, default=-1) + 1
+    return {'rejected_for': ' '.join(codes),
+            'rejected_since': _utc(legs[since].start_ns) if since < len(legs) else None}
+
+
+def _changes(histories: dict, driven: Sequence[_Driven]) -> dict[str, Any]:
+    """Return the changes of all values by date, and the drift of the scale."""
+    found = []
+    for name, (number, told, _) in histories.items():
+        for change in told.changes:
+            before, after = (driven[number[k]].leg for k in (change.leg - 1, change.leg))
+            found.append({
+                'value': name, 'after': _iso(before.start_ns), 'by': _iso(after.start_ns),
+                'leg': number[change.leg] + 1, 'size': _size(name, change), 'sigma': change.sigma,
+                'unit': '1' if name == 'scale_factor' else 'rad'})
+    odd = Counter(number[k] + 1 for number, told, _ in histories.values() for k in told.odd)
+    _, by_date, by_way = histories['scale_factor']
+    return {'changes': json.dumps(sorted(found, key=lambda change: change['by'])),
+            'odd_legs': ' '.join(map(str, sorted(odd))),
+            'drift_per_year': by_date.slope, 'drift_per_year_sigma': by_date.slope_sigma,
+            'drift_per_1000_km': by_way.slope, 'drift_per_1000_km_sigma': by_way.slope_sigma}
+
+
+def _size(name: str, change: Change) -> float:
+    return math.expm1(change.size) if name == 'scale_factor' else change.size
+
+
+def _leg_row(job: VehicleJob, k: int, one: _Driven, starts: Sequence[int],
+             histories: dict) -> dict[str, Any]:
+    model = next((b.model for b in job.bags if b.model), '')
+    return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
+        'period': sum(start <= k for start in starts),
+        'odd': any(k in (number[i] for i in told.odd) for number, told, _ in histories.values())}
+
+
+def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
+            leg: LegResult) -> dict[str, Any]:
+    """Return a leg as a row of a table."""
+    estimates = leg_estimates(leg)
+    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+    row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
+           'odometer_km': odometer_km, 'start': _utc(leg.start_ns), 'start_ns': leg.start_ns,
+           'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
+           'fixes': leg.fixes, 'verdict': leg.verdict.value,
+           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
+    for name in VALUES:
+        e = estimates.get(name)
+        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
+    return row | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
+
+
+def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
+    """Return the legs of a bag's row as rows of a table; of one that failed a row without."""
+    of_bag = {'status': row.status, 'reason': row.reason}
+    return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
+            for k, leg in enumerate(legs_from(row.legs), 1)] or [
+        {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **of_bag}]
+
+
+def _utc(stamp_ns: int) -> datetime:
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
+
+
+def _iso(stamp_ns: int) -> str:
+    return f'{_utc(stamp_ns):%Y-%m-%dT%H:%M:%SZ}'

@@ -1,0 +1,76 @@
+"""Whose clock differs from the Imu's, from the blocks as they come, and how it is said."""
+
+from collections import deque
+
+import numpy as np
+
+from odocal_ros.screening.clocks import CLOCK_APART, remedy
+from odocal_ros.settings.config import Config
+
+CLOCK_ROWS = 10
+DAY_S = 86400.0
+
+
+class Clocks:
+    """
+    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
+
+    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
+    """
+
+    def __init__(self, simulated: bool = False) -> None:
+        self._simulated = simulated
+        self._imu: deque = deque(maxlen=40)
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
+        self._ahead_s: dict[str, deque] = {}
+
+    def feed(self, slot: str, block) -> None:
+        """Take a block."""
+        if slot != 'imu':
+            self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])
+            return
+        self._imu.append((block.received_ns, block.stamp_ns))
+        if not self._waiting:
+            return
+        # differences first: float64 seconds since 1970 have a grain of 238 ns, ns fit
+        received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
+        first_received, first_stamp = int(received[0]), int(stamps[0])
+        received, stamps = received - first_received, stamps - first_stamp
+        # messages that queued for a node in simulated time arrive late, the Imu's more so than
+        # others': which of them belong together is not known then
+        queued = self._simulated and np.ptp(received - stamps) > CLOCK_APART * 1e9
+        for name, (row_ns, stamp_ns) in list(self._waiting.items()):
+            row = row_ns - first_received
+            if row > received.max():
+                continue
+            del self._waiting[name]
+            if row >= received.min() and not queued:
+                ahead = (stamp_ns - first_stamp - np.interp(row, received, stamps)) * 1e-9
+                self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
+
+    def differing(self, config: Config) -> list[tuple[str, float]]:
+        """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
+        offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
+                   'odometer_right': config.odometer.time_offset,
+                   'fix_velocity': config.gnss.time_offset}
+        result = []
+        for slot, ahead in self._ahead_s.items():
+            offset = offsets.get(slot, 0.0) - config.imu.time_offset
+            # latency on the way makes a row look older: behind are those of whom the freshest is;
+            # that of an Imu's row makes others look newer: ahead are those of whom most are
+            value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
+            if abs(value) > CLOCK_APART:
+                result.append((slot, value))
+        return result
+
+
+def clocks_differ(clocks: list[tuple[str, float]]) -> str:
+    """Return the sentence about clocks that differ from the Imu's."""
+    seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} the '
+                     "Imu's" for slot, s in clocks)
+    return f'CLOCKS_DIFFER: {seen}. {remedy(max((s for _, s in clocks), key=abs))}'
+
+
+def _apart(seconds: float) -> str:
+    days = seconds / DAY_S
+    return f'{seconds:.3g} s' if days < 2 else f'{days:.0f} days'

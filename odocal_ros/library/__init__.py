@@ -1,0 +1,1 @@
+"""From recordings, options and figures to answers: for the commands, and for other programs."""

@@ -1,0 +1,63 @@
+"""What a caller asks for: settings in any of their forms, legs as text or seconds."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.settings.config import Config, with_settings
+
+Settings = Config | Mapping[str, object] | str | Path | None
+Leg = str | tuple[float | None, float | None]
+
+
+def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> Config:
+    """
+    Return all settings: defaults, then those of a journal, then those asked for.
+
+    asked : by dotted name, or a ROS parameter file; a Config is taken as it is.
+
+    Raises
+    ------
+    BadConfig, BadUsage
+        A setting is unknown or of a wrong value; the file cannot be read.
+
+    """
+    if isinstance(asked, Config):
+        return asked
+    if isinstance(asked, (str, Path)):
+        from odocal_ros.settings.config_file import read_config_file
+        asked = read_config_file(Path(asked))
+    return with_settings(with_settings(Config(), journal or {}), asked or {})
+
+
+def legs_of(asked: Iterable[Leg] | Leg | None):
+    """
+    Return legs as ``find_legs`` takes them.
+
+    asked : 'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop',
+        or (A, B), None for open; one or many.
+
+    Raises
+    ------
+    BadUsage
+        One is not of these forms.
+
+    """
+    from odocal_ros.library.legs import EACH_STOP, parse_leg
+    if asked is None:
+        return []
+    if isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked):
+        asked = [asked]
+    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in asked]
+
+
+def _is_pair(asked):
+    return len(asked) == 2 and not any(isinstance(edge, (str, tuple)) for edge in asked)
+
+
+def _text(leg) -> str:
+    if isinstance(leg, str):
+        return leg
+    if not (isinstance(leg, tuple) and _is_pair(leg)):
+        raise BadUsage(f"legs: {leg!r} is neither 'A:B', 'A/B', 'each-stop' nor (A, B)")
+    return ':'.join('' if edge is None else f'{float(edge):.9f}' for edge in leg)

@@ -1,0 +1,143 @@
+"""A calibration as other programs take it: values, tables, series, figures, files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime, UTC
+from pathlib import Path
+from typing import Any
+
+from odocal_ros.calib import result
+from odocal_ros.errors import BadUsage
+from odocal_ros.library.series import residuals, Series, states, trajectory
+from odocal_ros.reasons import Reason, Verdict
+from odocal_ros.settings.config import Config
+
+TABLES = 'pip install pandas pyarrow'
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec='seconds')
+
+
+def frame_of(columns: dict[str, Any]):
+    """Return columns as a pandas.DataFrame."""
+    try:
+        import pandas
+    except ImportError:
+        raise BadUsage(f'a table needs pandas: {TABLES}') from None
+    return pandas.DataFrame(columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """
+    A calibration of a vehicle.
+
+    result : all of it, as the pipeline gives it.   config : settings it was made with.
+    inputs : of each bag its name, sha256 and topics.   notes : sentences said on the way.
+    created : ISO 8601 time.
+    """
+
+    result: result.Calibration
+    config: Config = Config()
+    inputs: tuple[dict, ...] = ()
+    notes: tuple[str, ...] = ()
+    created: str = field(default_factory=_now)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return accepted, caution or rejected."""
+        return self.result.verdict
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Return what lowers the verdict or is good to know: code, text, remedy."""
+        return self.result.reasons
+
+    @property
+    def values(self) -> dict[str, float | None]:
+        """Return each value by name, SI and radians; None: not determined."""
+        return {name: e.value for name, e in self.result.estimates.items()}
+
+    @property
+    def sigmas(self) -> dict[str, float | None]:
+        """Return one standard deviation of each value."""
+        return {name: e.sigma for name, e in self.result.estimates.items()}
+
+    def __str__(self) -> str:
+        """Return the result as one screen of text, as ``odocal replay`` prints it."""
+        from odocal_ros.output.summary import screen
+        return screen(self.result)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of calibration.json: plain dicts and lists, no NaN."""
+        from odocal_ros.output.files import as_json
+        return as_json(self.result, self.config, list(self.inputs), self.created)
+
+    def to_frame(self):
+        """Return a pandas.DataFrame, a row for each value: value, sigma, unit, method."""
+        found = self.result.estimates
+        columns = {name: [getattr(e, name) for e in found.values()]
+                   for name in ('value', 'sigma', 'unit', 'method')}
+        return frame_of(columns).set_axis(list(found))
+
+    def trajectory(self) -> Series:
+        """Return the smoothed drive; see ``series.trajectory``."""
+        return trajectory(self.result)
+
+    def states(self) -> Series:
+        """Return attitude and biases of the Imu over time; see ``series.states``."""
+        return states(self.result)
+
+    def residuals(self) -> Series:
+        """Return dead reckoning less each fix; see ``series.residuals``."""
+        return residuals(self.result)
+
+    def plot_track(self, ax, leg: int = 1):
+        """Draw a leg's track over its fixes on matplotlib axes; return these."""
+        from odocal_ros.output.plots import draw_track
+        from odocal_ros.output.track_table import before_label
+        draw_track(ax, self._drawable(leg), before_label(self.result.legs))
+        ax.legend()
+        return ax
+
+    def plot_residuals(self, ax, leg: int = 1):
+        """Draw dead reckoning less fix over the way on matplotlib axes; return these."""
+        from odocal_ros.output.plots import draw_residuals
+        draw_residuals(ax, self._drawable(leg))
+        ax.legend()
+        return ax
+
+    def save(self, folder: Path | str, force: bool = False,
+             tell: Callable[[str], None] = lambda note: None) -> list[Path]:
+        """
+        Write all result files; return their paths, calibration.json first.
+
+        ``tell`` is given a sentence when the report cannot be drawn.
+
+        Raises
+        ------
+        BadUsage
+            There is a calibration.json and no ``force``, or the folder cannot be written.
+
+        """
+        from odocal_ros.output.files import write_results
+        return write_results(self.result, self.config, Path(folder), list(self.inputs),
+                             self.created, force=force, tell=tell)
+
+    def export(self, *files: Path | str) -> list[Path]:
+        """
+        Write time series for other programs; the names tell which: ``export.KNOWN``.
+
+        trajectory.tum (evo), states.csv, residuals.parquet, track.kml, debug.mcap and others.
+        """
+        from odocal_ros.library.export import export
+        return export(self.result, files)
+
+    def _drawable(self, leg):
+        if not 1 <= leg <= len(self.result.legs):
+            raise BadUsage(f'leg {leg}: there are legs 1 to {len(self.result.legs)}')
+        found = self.result.legs[leg - 1].evidence
+        if found is None or not len(found.t):
+            raise BadUsage(f'leg {leg} has no track to draw: its reasons say why')
+        return found

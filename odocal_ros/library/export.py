@@ -1,0 +1,156 @@
+"""Time series of a calibration as files of other programs: evo, tables, maps, PlotJuggler."""
+
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from pathlib import Path
+import tempfile
+from xml.etree import ElementTree
+
+import numpy as np
+
+from odocal_ros.bagio import encode
+from odocal_ros.bagio.write import write_bag
+from odocal_ros.calib.result import Calibration
+from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
+from odocal_ros.errors import BadUsage
+from odocal_ros.library.series import residuals, Series, states, trajectory
+from odocal_ros.outside.whole import whole_file
+
+TABLES = 'pip install pandas pyarrow'
+KML = 'http://www.opengis.net/kml/2.2'
+
+
+def tum(columns: Series) -> str:
+    """Return poses as evo reads them: s, m, quaternion x y z w, by spaces."""
+    stamp = columns['stamp_ns']
+    rows = zip(*(columns[name] for name in (
+        'east_m', 'north_m', 'up_m', 'qx', 'qy', 'qz', 'qw')), strict=True)
+    return '# timestamp tx ty tz qx qy qz qw\n' + ''.join(
+        f'{s // 10**9}.{s % 10**9:09d} {" ".join(f"{x:.9g}" for x in row)}\n'
+        for s, row in zip(stamp.tolist(), rows, strict=True))
+
+
+def csv(columns: Series) -> str:
+    """Return a series as text with its names at the top, numbers in full."""
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return ','.join(columns) + '\n' + ''.join(
+        f'{",".join(map(repr, row))}\n' for row in rows)
+
+
+def kml(columns: Series) -> str:
+    """Return the track of each leg as a line on the ground, for Google Earth."""
+    ElementTree.register_namespace('', KML)
+    root = ElementTree.Element(f'{{{KML}}}kml')
+    document = ElementTree.SubElement(root, f'{{{KML}}}Document')
+    for leg in np.unique(columns['leg']).tolist():
+        rows = columns['leg'] == leg
+        place = ElementTree.SubElement(document, f'{{{KML}}}Placemark')
+        ElementTree.SubElement(place, f'{{{KML}}}name').text = f'leg {leg}'
+        line = ElementTree.SubElement(place, f'{{{KML}}}LineString')
+        ElementTree.SubElement(line, f'{{{KML}}}tessellate').text = '1'
+        ElementTree.SubElement(line, f'{{{KML}}}coordinates').text = ' '.join(
+            f'{longitude:.8f},{latitude:.8f},{height:.3f}' for longitude, latitude, height in zip(
+                *(columns[name][rows] for name in ('longitude_deg', 'latitude_deg', 'height_m')),
+                strict=True))
+    return ElementTree.tostring(root, 'unicode', xml_declaration=True) + '\n'
+
+
+def parquet(columns: Series, path: Path) -> None:
+    """Write a series as a Parquet file."""
+    import pyarrow
+    from pyarrow import parquet as files
+    held = pyarrow.BufferOutputStream()
+    files.write_table(pyarrow.table(columns), held)
+    with whole_file(path) as file:
+        file.write(held.getvalue())
+
+
+def mcap(result: Calibration, path: Path) -> None:
+    """
+    Write all series as one mcap file, for PlotJuggler and Foxglove.
+
+    /odocal/track NavSatFix; /odocal/biases Imu: the vehicle's attitude, and the biases in the
+    place of rates and forces; /odocal/residuals JointState: m, along and across.
+    """
+    with tempfile.TemporaryDirectory(prefix='.odocal_', dir=path.parent) as work:
+        bag = write_bag(Path(work) / 'debug', _topics(result))
+        next(bag.glob('*.mcap')).replace(path)
+
+
+def _topics(result) -> list[encode.Topic]:
+    pose, bias, left = (_by_time(make(result)) for make in (trajectory, states, residuals))
+    t, n = pose['stamp_ns'], len(pose['stamp_ns'])
+    whole = np.zeros(n, np.int64)
+    gyro, accelerometer = (np.stack([bias[f'{sensor}_bias_{axis}'] for axis in 'xyz'], -1)
+                           for sensor in ('gyro', 'accelerometer'))
+    track = FixSamples(t, t, np.deg2rad(pose['latitude_deg']), np.deg2rad(pose['longitude_deg']),
+                       pose['height_m'], np.zeros((n, 3, 3)), whole, whole)
+    biases = ImuSamples(t, t, gyro, accelerometer, np.stack(
+        [pose[q] for q in ('qx', 'qy', 'qz', 'qw')], -1), np.zeros(n))
+    t = left['stamp_ns']
+    off = {name: OdometerSamples(t, t, left[f'{name}_m']) for name in ('along', 'across')}
+    return [encode.fix('/odocal/track', track, 'base_link'),
+            encode.imu('/odocal/biases', biases, 'base_link'),
+            encode.joints('/odocal/residuals', off)]
+
+
+def _by_time(columns: Series) -> Series:
+    order = np.argsort(columns['stamp_ns'], kind='stable')
+    return {name: column[order] for name, column in columns.items()}
+
+
+def _there(module: str) -> bool:
+    try:
+        import_module(module)
+    except ImportError:
+        return False
+    return True
+
+
+SERIES: dict[str, Callable[[Calibration], Series]] = {
+    'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals}
+TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
+KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', *(
+    f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals')
+    for ending in ('csv', 'parquet')))
+
+
+def check_names(files: Iterable[Path | str]) -> None:
+    """Raise BadUsage where a file has a name that tells nothing, or no program to write it."""
+    for file in files:
+        if Path(file).suffix == '.parquet' and not _there('pyarrow'):
+            raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES}')
+        if Path(file).name not in KNOWN:
+            raise BadUsage(f'export: {file}: there are {", ".join(KNOWN)}')
+
+
+def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
+    """
+    Write series as files; their names tell which, and how: ``KNOWN``.
+
+    Raises
+    ------
+    BadUsage
+        A name is another, a leg gives no such series, a file cannot be written.
+
+    """
+    paths = [Path(file) for file in files]
+    check_names(paths)
+    for file in paths:
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            _write(result, file)
+        except OSError as error:
+            raise BadUsage(f'{file}: cannot be written ({error.strerror or error})') from None
+    return paths
+
+
+def _write(result, file) -> None:
+    name, ending = file.stem, file.suffix[1:]
+    if ending == 'mcap':
+        mcap(result, file)
+    elif ending == 'parquet':
+        parquet(SERIES[name](result), file)
+    else:
+        with whole_file(file) as out:
+            out.write(TEXTS[ending](SERIES[name](result)).encode())

@@ -1,0 +1,34 @@
+"""Who hears how the work goes: a command shows it, another program need not."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+Progress = Callable[..., None]      # of the share done, 0 to 1, and what is being done
+
+
+class Hearer:
+    """Hears sentences and phases of the work; this one keeps to itself."""
+
+    def note(self, text: str) -> None:
+        """Take a sentence that the user should know."""
+
+    def phase(self, title: str) -> AbstractContextManager[Progress]:
+        """Return a context for a phase of the work, whose value is told the share done."""
+        return nullcontext(lambda share, stage='': None)
+
+
+class Notes(Hearer):
+    """Keeps the sentences, and passes all on."""
+
+    def __init__(self, onward: Hearer) -> None:
+        self.said: list[str] = []
+        self._onward = onward
+
+    def note(self, text: str) -> None:
+        """Keep a sentence."""
+        self.said.append(text)
+        self._onward.note(text)
+
+    def phase(self, title: str) -> AbstractContextManager[Progress]:
+        """Return the phase as the other has it."""
+        return self._onward.phase(title)

@@ -1,0 +1,269 @@
+"""Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
+
+from dataclasses import dataclass
+from datetime import datetime, UTC
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+
+from odocal_ros.errors import BadData, BadUsage
+from odocal_ros.nav.standstill import standstills
+from odocal_ros.outside.limits import LATEST_NS
+from odocal_ros.pipeline.automatic import LegSearch
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.placed import place
+from odocal_ros.screening.screen import screen
+
+EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
+EACH_STOP = 'each-stop'
+OPENING = 0.2                 # of the distance: a first stop later than this splits no leg
+STATUS_NAME = 'calibrator: calibration'
+DROPPED = ('cancelled', 'undone')
+OPEN_LEG = ('the leg has no stop mark, recording ended while it was driven: it is taken to end at '
+            'the last sample that all topics have')
+STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+
+
+@dataclass(frozen=True)
+class LegSpan:
+    """A leg as asked for; None: open on that side."""
+
+    start_ns: int | None
+    stop_ns: int | None
+    relative: tuple[bool, bool] = (False, False)   # against the bag's first message
+
+
+def parse_leg(text: str) -> LegSpan:
+    """
+    Return the leg of ``A:B`` (seconds) or ``A/B`` (ISO 8601); either side may be empty.
+
+    Raises
+    ------
+    BadUsage
+        Not of that form, or B not after A.
+
+    """
+    separator = '/' if '/' in text else ':'
+    parts = text.split(separator)
+    if len(parts) != 2:
+        raise BadUsage(f'--leg {text}: want A:B in seconds, or A/B for ISO 8601 dates')
+    (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
+    if start is not None and stop is not None and rel_a == rel_b and stop <= start:
+        raise BadUsage(f'--leg {text}: the end is not after the start')
+    return LegSpan(start, stop, (rel_a, rel_b))
+
+
+def _edge(text, whole):
+    """Return nanoseconds and whether they are against the bag's first message."""
+    if not text:
+        return None, False
+    try:
+        seconds = Decimal(text)
+        if seconds.is_finite():
+            if seconds.copy_abs() >= LATEST_NS // 10**9:
+                raise BadUsage(f'--leg {whole}: {text[:40]} is no time of a recording: beyond the '
+                               'year 2116')
+            return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
+    except InvalidOperation:
+        pass
+    try:
+        moment = datetime.fromisoformat(text.replace('Z', '+00:00'))
+    except ValueError:
+        raise BadUsage(f'--leg {whole}: {text!r} is neither seconds nor an ISO 8601 date; use A:B '
+                       'for seconds, A/B for dates') from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
+    if abs(whole_ns) >= LATEST_NS:
+        raise BadUsage(f'--leg {whole}: {text} is no time of a recording')
+    return whole_ns, False
+
+
+def marked_legs(bag) -> list[tuple[int, int]]:
+    """
+    Return the legs that a node marked in the bag by its status; cancelled ones are left out.
+
+    The stop is 0 where the bag ends before it.
+    """
+    legs = []
+    for values in _last_marks(bag):
+        start, stop = int(values['leg_start_ns']), int(values['leg_stop_ns'])
+        if values.get('leg_event') not in DROPPED and start > 0:
+            legs.append((start, stop))
+    return sorted(legs)
+
+
+def open_ended(spans, marks) -> list[tuple[Reason, ...]]:
+    """
+    Return a note for each leg that was marked at its start and not at its end.
+
+    spans : (start, stop) of the legs.   marks : as ``marked_legs`` gives them.
+    """
+    starts = {start for start, stop in marks if not stop}
+    return [(Reason(Code.STOP_MARK_MISSING, OPEN_LEG),) if start in starts else ()
+            for start, _ in spans]
+
+
+def dropped_legs(bag) -> bool:
+    """Return whether the operator cancelled or undid a leg that is marked in the bag."""
+    return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
+
+
+def _last_marks(bag) -> list[dict]:
+    """Return the last that was said of each leg."""
+    last: dict[tuple, dict] = {}
+    for topic in bag.topics.values():
+        if topic.msgtype != STATUS_TYPE:
+            continue
+        for _, message in bag.messages(topic.name):
+            for status in message.status:
+                if status.name.endswith(STATUS_NAME):
+                    values = {kv.key: kv.value for kv in status.values}
+                    _remember(last, values)
+    return list(last.values())
+
+
+def _remember(last, values):
+    try:
+        start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
+    except (KeyError, ValueError):
+        return
+    # ids begin again with each run of the node: a leg is told by its start too
+    leg_id = values.get('leg_id', ''), start
+    if leg_id[0] in ('', '0'):
+        return
+    before = last.get(leg_id, {})
+    if before.get('leg_event') in DROPPED:
+        return
+    event = values.get('leg_event') or before.get('leg_event', '')
+    last[leg_id] = values | {'leg_event': event}
+
+
+def find_legs(recorder, bag, asked, marks, config, inputs=None) -> list[tuple[int, int]]:
+    """
+    Return (start, stop) stamps of the legs of one bag.
+
+    Parameters
+    ----------
+    recorder : LegRecorder
+        Fed with the whole bag.
+    bag : Bag
+        For its time span.
+    asked : list of LegSpan or 'each-stop'
+        Empty: marks if there are any, else legs by themselves with leg.automatic, else one from
+        standstill to standstill.
+    marks : list of (start, stop)
+        As the node marked them.
+    config : Config
+        What counts as a standstill, least distance.
+    inputs : Inputs, optional
+        What ``screen`` makes of all that the topics have in common, where that is known.
+
+    Raises
+    ------
+    BadUsage
+        An asked leg lies outside the bag.
+
+    """
+    first, last = _common(recorder)
+    legs = [_placed(a, bag, first, last) for a in asked if a != EACH_STOP]
+    if EACH_STOP in asked:
+        legs += _each_stop(recorder, first, last, config, inputs)
+    if legs:
+        return legs
+    if marks:
+        return _marked(marks, last, bag)
+    if config.leg.automatic:
+        return by_themselves(recorder, last, config) or [(first, last)]
+    return [_by_standstill(recorder, first, last, config, inputs)]
+
+
+def _marked(marks, last, bag):
+    """Return marked legs, each with an end."""
+    legs = [(a, b or last) for a, b in marks if (b or last) > a]
+    if not legs:
+        raise BadData(f'{bag.name}: the recording broke off at its start mark, or so soon after '
+                      'that nothing of the leg is in it; drive it again (--leg : takes what came '
+                      'before the mark)')
+    return legs
+
+
+def _common(recorder):
+    """Return the first and the last stamp at which all of Imu, odometer and fix are there."""
+    stamps = [recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')]
+    stamps = [s[s > 0] for s in stamps]
+    stamps = [s for s in stamps if len(s)]
+    if not stamps:
+        return 0, 1
+    # percentiles of order, not extremes: one wild stamp must not move the leg
+    first = max(int(np.median(s[:5])) if len(s) > 20 else int(s.min()) for s in stamps)
+    last = min(int(np.median(s[-5:])) if len(s) > 20 else int(s.max()) for s in stamps)
+    return first, max(last, first + 1)
+
+
+def _placed(span, bag, first, last):
+    start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
+    stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
+    # stamps may be of another clock than the bag's times, as of a drive that was played again
+    begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
+    if stop <= start or stop < begin - 10**10 or start > end + 10**10:
+        length = (bag.end_ns - bag.start_ns) * 1e-9
+        raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} holds nothing; the '
+                       f'bag runs from 0 to {length:.1f} s')
+    return start, stop
+
+
+def _s(stamp, bag):
+    return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
+
+
+def _stops(recorder, first, last, config, inputs):
+    """Return standstills of the whole recording, stamps, and metres driven before each time."""
+    if inputs is None:
+        inputs, _ = screen(recorder.close(first, last, preroll=0.0), config)
+    if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
+        return np.empty((0, 2), np.int64), None
+    scale = place(inputs, config).rough or 1.0
+    spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
+    metres = np.interp(spans, inputs.travel.t, way) if len(spans) else np.empty((0, 2))
+    return first + np.round(spans * 1e9).astype(np.int64), (metres, float(way[-1]))
+
+
+def by_themselves(recorder, last, config) -> list[tuple[int, int]]:
+    """Return the legs that the node would have begun and ended by itself."""
+    search = LegSearch(config)
+    for slot in ('fix', 'imu', 'odometer'):
+        search.feed(slot, recorder.rows(slot), recorder.form)
+    return [(leg.start_ns, leg.stop_ns or last) for leg in search.spans
+            if (leg.stop_ns or last) > leg.start_ns]
+
+
+def _by_standstill(recorder, first, last, config, inputs):
+    """Return one leg, from the first standstill to the last; intermediate stops never split."""
+    stops, driven = _stops(recorder, first, last, config, inputs)
+    if not len(stops):
+        return first, last
+    metres, whole = driven
+    start, stop = first, last
+    opening = 0
+    if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
+        start, opening = int(stops[0, 1]), 1
+    after = np.flatnonzero(np.arange(len(stops)) >= opening)
+    if len(after) and whole - metres[after[-1], 1] < 0.02 * whole + 1.0:
+        stop = int(stops[after[-1], 1])
+    return start, stop
+
+
+def _each_stop(recorder, first, last, config, inputs):
+    """Return a leg from each standstill to the next that is long enough."""
+    stops, driven = _stops(recorder, first, last, config, inputs)
+    legs, lengths = [], []
+    if driven is None:
+        return legs
+    metres, _ = driven
+    for i in range(len(stops) - 1):
+        legs.append((int(stops[i, 1]), int(stops[i + 1, 1])))
+        lengths.append(metres[i + 1, 0] - metres[i, 1])
+    long = [leg for leg, m in zip(legs, lengths, strict=True) if m >= config.leg.min_distance]
+    return long or legs

@@ -1,0 +1,199 @@
+"""Where a planned drive comes from: figures, a named scenario, a GPX track or a recorded bag."""
+
+from datetime import UTC
+import math
+from pathlib import Path
+
+import numpy as np
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.nav.angles import arctan2
+from odocal_ros.planning.drive import DRIVE_STEP, from_rates, marked, PlannedDrive
+
+TURN_TIME = 8.0          # s of a turn of 90 deg
+MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
+GPX_STEP = 5.0           # m between points used: nearer ones are receiver noise
+GPX_REST, GPX_SLOW = 0.3, 0.1    # m/s, or of the median speed: slower steps were mostly a stop
+# s: what changes faster between points is their noise and spacing; rests, found too long by the
+# way to the next point used, lose half of it at each end
+GPX_SMOOTH = 4.0
+SLOPES = 5     # odd; times longer for slopes: heights are noisier, hills longer
+MOST_POINTS = 1_000_000
+
+
+def from_figures(speed: float, distance: float, standstill: float, turns: int,
+                 acceleration: float) -> PlannedDrive:
+    """
+    Return a drive of so many metres between two standstills, with 90 deg turns left and right.
+
+    Turns are spread evenly over the stretch at full speed; a drive too short to reach ``speed``
+    turns back to braking where it must.
+    """
+    for flag, value, least in (('--speed', speed, 0.0), ('--distance', distance, 0.0),
+                               ('--acceleration', acceleration, 0.0)):
+        if not (math.isfinite(value) and value > least):
+            raise BadUsage(f'{flag} {value:g}: want a number above 0; a drive must move')
+    if not (math.isfinite(standstill) and standstill >= 0):
+        raise BadUsage(f'--standstill {standstill:g}: want 0 s or more')
+    top = min(speed, math.sqrt(distance * acceleration))
+    ramp, cruise = top / acceleration, distance / top - top / acceleration
+    whole = 2 * (standstill + ramp) + cruise
+    if distance > MOST_METRES or whole > MOST_SECONDS:
+        raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {whole / 3600:.1f} h; want '
+                       f'{MOST_METRES / 1000:g} km and {MOST_SECONDS / 3600:g} h at most')
+    if turns < 0 or turns * TURN_TIME > cruise:
+        raise BadUsage(f'--turns {turns}: want 0 to {int(cruise / TURN_TIME)}, each takes '
+                       f'{TURN_TIME:g} s of the {cruise:.0f} s at full speed')
+    t = np.linspace(0.0, whole, max(2, math.ceil(whole / max(DRIVE_STEP, whole / 20_000)) + 1))
+    knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])
+    t = np.union1d(t, knots)        # kinks on the grid: the trapezoid sum is then exact
+    rate = np.zeros_like(t)
+    for k in range(turns):
+        begin = standstill + ramp + (k + 1) * cruise / (turns + 1) - TURN_TIME / 2
+        rate[(t >= begin) & (t < begin + TURN_TIME)] = (-1)**k * math.pi / 2 / TURN_TIME
+    return from_rates(t, np.interp(t, knots, [0.0, top, top, 0.0]), rate,
+                      latitude=math.radians(45.0))
+
+
+def from_scenario(name: str, duration: float | None) -> PlannedDrive:
+    """Return the motion of a simulated scenario."""
+    from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions
+    options = resolved(SimOptions(scenario=name) if duration is None
+                       else SimOptions(scenario=name, duration=duration))
+    motion = motion_of(options)
+    t = np.union1d(np.arange(0.0, motion.duration, max(DRIVE_STEP, motion.duration / 50_000)),
+                   np.append(motion.speed.breaks, motion.duration))
+    t = t[np.diff(t, prepend=-1.0) > 1e-6]
+    return from_rates(t, motion.speed(t), motion.yaw_rate(t), options.heading,
+                      latitude=options.latitude, longitude=options.longitude,
+                      height=options.height)
+
+
+def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
+    """
+    Return the drive of a GPX track; of a route without times at ``speed`` m/s.
+
+    Raises
+    ------
+    BadUsage
+        The file cannot be read, is no GPX, has too few points, or lacks times and no speed is
+        given.
+
+    """
+    t, geodetic = _gpx_points(path)
+    from odocal_ros.nav.dead_reckoning import Origin
+    position_n = Origin(*geodetic[0]).to_n(geodetic)
+    if t is None:
+        if speed is None:
+            raise BadUsage(f'{path}: the track has no times; give --speed to drive it at')
+        steps = np.hypot(*np.diff(position_n[:, :2], axis=0).T)
+        t = np.concatenate([[0.0], np.cumsum(steps / speed)])
+    return _from_points(path, t, position_n, geodetic[0])
+
+
+def _gpx_points(path):
+    """Return times since the first point, s (None: none given), and (n, 3) geodetic, rad, m."""
+    import xml.etree.ElementTree as ElementTree
+    try:
+        root = ElementTree.fromstring(Path(path).read_bytes())
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot be read ({error.strerror}); give the path of a GPX '
+                       'file') from None
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise BadUsage(f'{path}: is no GPX file ({error}); export the track again as '
+                       'GPX') from None
+    points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
+    if not 2 <= len(points) <= MOST_POINTS:
+        raise BadUsage(f'{path}: holds {len(points)} track points, want 2 to {MOST_POINTS:,}; '
+                       'export a track, not waypoints')
+    try:
+        level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
+        heights = [float(_child(p, 'ele') or 'nan') for p in points]
+        times = [_seconds(_child(p, 'time')) for p in points]
+    except ValueError as error:
+        raise BadUsage(f'{path}: a track point is not readable ({error})') from None
+    lat, lon = np.deg2rad(level).T
+    if not (np.abs(lat) < np.pi / 2).all() or not (np.abs(lon) <= 2 * np.pi).all():
+        raise BadUsage(f'{path}: a track point lacks a latitude or longitude in range')
+    heights = np.array(heights)
+    known = np.isfinite(heights)
+    heights = np.interp(np.arange(len(heights)), np.flatnonzero(known), heights[known]) \
+        if known.any() else np.zeros(len(heights))
+    geodetic = np.stack([lat, lon, heights], -1)
+    if any(x is None for x in times):
+        return None, geodetic
+    return np.array(times) - times[0], geodetic
+
+
+def _child(point, name):
+    return next((c.text for c in point if c.tag.rpartition('}')[2] == name), None)
+
+
+def _seconds(text):
+    """Return seconds since 1970 of an ISO 8601 date, None where there is none."""
+    from datetime import datetime
+    if text is None:
+        return None
+    moment = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _from_points(path, t, position_n, start) -> PlannedDrive:
+    """Return the drive through points; nearer than GPX_STEP they tell no direction."""
+    rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
+    t, p = t[rising], position_n[rising]
+    used = [0]
+    for k in range(1, len(t)):
+        if np.hypot(*(p[k] - p[used[-1]])[:2]) >= GPX_STEP:
+            used.append(k)
+    if len(used) < 2:
+        raise BadUsage(f'{path}: the track never moves {GPX_STEP:g} m; give one that was driven')
+    a, b = np.array(used[:-1]), np.array(used[1:])
+    step = p[b] - p[a]
+    way, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
+    # a slow step was mostly a stop: its motion is put into the interval of its last point
+    pace = way / (t[b] - t[a])
+    rest = pace < max(GPX_REST, GPX_SLOW * np.median(pace))
+    begin = np.where(rest, t[b - 1], t[a])
+    grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
+    if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
+        raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; want up to '
+                       f'{MOST_SECONDS / 3600:g} h')
+    piece = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)
+    moving = (grid >= begin[piece]) & (grid <= t[b][piece])
+    speed = np.where(moving, (way / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
+    yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
+    middle = (begin + t[b]) / 2
+    wide = max(1, round(GPX_SMOOTH / (grid[1] - grid[0]) / 2)) * 2 + 1
+    return marked(grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
+                  _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), SLOPES * wide),
+                  latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
+
+
+def _smooth(x, wide):
+    """Return means over so many rows, odd; the ends go on as they are."""
+    padded = np.pad(x, wide // 2, mode='edge')
+    total = np.concatenate([[0.0], np.cumsum(padded)])
+    return (total[wide:] - total[:-wide]) / wide
+
+
+def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
+    """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
+    from odocal_ros.bagio.read import open_bag
+    from odocal_ros.data.leg import LegRecorder
+    from odocal_ros.library.legs import find_legs, marked_legs
+    from odocal_ros.library.topics import choose_topics
+    from odocal_ros.messages.decode import make_reader
+    from odocal_ros.planning.leg_profile import count_size, fix_figures, profile_of
+    with open_bag(path) as bag:
+        chosen = choose_topics(bag.topics, config, topics)
+        readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
+                   for slot, topic in chosen.items()}
+        recorder = LegRecorder()
+        bag.read(readers, recorder.feed, None)
+        recorder.form = readers[chosen['odometer']].form or recorder.form
+        if 'odometer_right' in chosen:
+            recorder.form_right = readers[chosen['odometer_right']].form
+        start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
+    leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
+    return profile_of(leg, config), fix_figures(leg, config) | {'quantum': count_size(leg, config)}

@@ -1,0 +1,125 @@
+"""A bag to samples: topics chosen, messages decoded, what was marked in it remembered."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from odocal_ros.bagio.read import Bag, bag_sha256, open_bag
+from odocal_ros.data.leg import Leg, LegRecorder
+from odocal_ros.data.samples import OdometerForm, Samples
+from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
+from odocal_ros.library.hearer import Hearer
+from odocal_ros.library.journal import journal_notes, JournalNotes
+from odocal_ros.messages.decode import make_reader
+from odocal_ros.outside.names import one_line
+from odocal_ros.reasons import Reason
+from odocal_ros.settings.config import Config
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """
+    A bag that was read.
+
+    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : of the Imu's headers.
+    start_ns, end_ns : bag times of its first and last message.   marks : (start, stop) stamps of
+    the legs that a node marked, stop 0 where there is none; dropped : it took one back.
+    notes : what a result says of the bag.   config : settings in force, a journal's among them.
+    """
+
+    name: str
+    sha256: str
+    topics: dict[str, str]
+    imu_frame: str
+    start_ns: int
+    end_ns: int
+    marks: tuple[tuple[int, int], ...]
+    dropped: bool
+    notes: tuple[Reason, ...]
+    config: Config
+    recorder: LegRecorder
+
+    @property
+    def form(self) -> OdometerForm:
+        """Return what the odometer's values mean."""
+        return self.recorder.form
+
+    def samples(self, slot: str) -> Samples:
+        """Return the rows of imu, odometer, odometer_right, fix, fix_velocity or heading."""
+        rows: Samples = self.recorder.rows(slot)
+        return rows
+
+    def spans(self, legs: list) -> list[tuple[int, int]]:
+        """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
+        from odocal_ros.library.legs import find_legs
+        return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
+
+    def legs(self, legs: AskedLeg | list[AskedLeg] | None = None) -> list[Leg]:
+        """Return the legs asked for, or those it holds, for ``pipeline.calibrate``."""
+        return [self.recorder.close(start, stop, self.config.leg.preroll)
+                for start, stop in self.spans(legs_of(legs))]
+
+
+def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
+               journal: JournalNotes | None):
+    """Return slot -> topic of a bag, and topic -> reader; those named go before a journal's."""
+    from odocal_ros.library.topics import choose_topics
+    named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
+    chosen = choose_topics(bag.topics, config, named)
+    return chosen, {topic: make_reader(slot, bag.topics[topic].msgtype, config)
+                    for slot, topic in chosen.items()}
+
+
+def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: Settings = None,
+             *, hearer: Hearer | None = None) -> Recording:
+    """
+    Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
+
+    Parameters
+    ----------
+    path : path
+        Of the bag, or of a journal of the node: that brings settings and topics of its own.
+    topics : mapping, optional
+        Slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others are
+        found by their type.
+    config : Config, mapping of dotted names, or a parameter file, optional
+        Settings.
+    hearer : Hearer, optional
+        Is told how it goes.
+
+    Raises
+    ------
+    BadBag, BadData, BadUsage, BadConfig
+        The bag cannot be read, lacks an input, or holds several that could be it.
+
+    """
+    from odocal_ros.library.legs import dropped_legs, marked_legs
+    hearer = hearer or Hearer()
+    path = Path(path)
+    journal = journal_notes(path)
+    settings = config_of(config, journal.settings if journal else None)
+    # the hash costs as long as reading the file: beside the decoding, which holds one core
+    with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
+        name = one_line(bag.name)
+        if journal:
+            hearer.note(f'{bag.name} is a journal: settings and topics from {journal.path}; '
+                        'options go before them')
+        chosen, readers = readers_of(bag, topics or {}, settings, journal)
+        digest = beside.submit(bag_sha256, bag)
+        recorder = LegRecorder()
+        with hearer.phase(f'reading {name}') as progress:
+            bag.read(readers, recorder.feed, progress)
+        recorder.form = readers[chosen['odometer']].form or recorder.form
+        if 'odometer_right' in chosen:
+            recorder.form_right = readers[chosen['odometer_right']].form
+        marks = marked_legs(bag)
+        for note in bag.notes:
+            if isinstance(note, str):
+                hearer.note(note)
+        with hearer.phase(f'checksum of {name}'):
+            sha256 = digest.result()
+        return Recording(
+            name, sha256, chosen, bag.frame(chosen['imu']), bag.start_ns, bag.end_ns,
+            tuple(marks), bool(journal and not marks and dropped_legs(bag)),
+            tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)

@@ -1,0 +1,134 @@
+"""
+Time series of a calibration as columns: what was estimated along each leg, and what is left over.
+
+A series is a dict of equally long arrays. Of every row: ``leg``, from 1, and ``stamp_ns``, header
+time. Names tell the unit, but for SI and rad. At most 5000 rows of a leg.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.smoother.state import C_bv
+from odocal_ros.errors import BadUsage
+from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
+
+Series = dict[str, NDArray]
+NONE = ('no leg has a fit of the smoother, which gives this series; see the reasons, or take the '
+        'method auto')
+
+
+def trajectory(result: Calibration) -> Series:
+    """
+    Return the smoothed drive, second by second, of the legs that the smoother could fit.
+
+    east_m, north_m, up_m : of the odometer's point, in n, which stands at the leg's origin.
+    latitude_deg, longitude_deg, height_m : the same.   qx, qy, qz, qw : take vehicle axes
+    (forward, left, up) to n.
+
+    Raises
+    ------
+    BadUsage
+        No leg has a fit of the smoother.
+
+    """
+    return _of_fits(result, _pose)
+
+
+def states(result: Calibration) -> Series:
+    """
+    Return attitude and biases of the Imu, second by second, as the smoother finds them.
+
+    roll, pitch, yaw : of the vehicle in n, yaw from east.   gyro_bias_x ... : rad/s, in the body
+    frame b.   accelerometer_bias_x ... : m/s^2.
+
+    Raises
+    ------
+    BadUsage
+        No leg has a fit of the smoother.
+
+    """
+    return _of_fits(result, _state)
+
+
+def residuals(result: Calibration) -> Series:
+    """
+    Return dead reckoning less each fix that was used.
+
+    distance_m : driven since the start mark.   along_m, across_m : along the vehicle's forward
+    axis and to its left, as calibrated; before_along_m, before_across_m : as configured.
+    sigma_m : of the fix, horizontal, each axis.   status : NavSatStatus.
+
+    Raises
+    ------
+    BadUsage
+        No leg has a track.
+
+    """
+    found = []
+    for number, leg in enumerate(result.legs, 1):
+        if (e := leg.evidence) is not None:
+            found.append((number, leg, {
+                't': e.t_fix, 'distance_m': e.fix_distance,
+                'along_m': e.residual[:, 0], 'across_m': e.residual[:, 1],
+                'before_along_m': e.residual_before[:, 0],
+                'before_across_m': e.residual_before[:, 1],
+                'sigma_m': e.fix_sigma, 'status': e.fix_status}))
+    if not found:
+        raise BadUsage('no leg has a track to hold against its fixes: see the reasons')
+    return _stacked(found)
+
+
+def _of_fits(result: Calibration, columns) -> Series:
+    """Return the columns of each leg that the smoother fitted: (leg, its details) to them."""
+    found = [(number, leg, columns(leg, leg.methods['smoother'].details))
+             for number, leg in enumerate(result.legs, 1)
+             if leg.origin and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
+    if not found:
+        raise BadUsage(NONE)
+    return _stacked(found)
+
+
+def _rows(smoothed, column):
+    """Return the rows of what each keyframe has at which the track was kept."""
+    return column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
+
+
+def _vehicle(leg, smoothed):
+    """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
+    found = leg.methods['smoother'].estimates
+    angles = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
+    return _rows(smoothed, smoothed['key_C_nb']) @ C_bv(*angles)
+
+
+def _pose(leg, smoothed) -> Series:
+    track_n = smoothed['track_n']
+    latitude, longitude, height = Origin(*leg.origin).to_geodetic(track_n).T
+    quaternion = quat_from_matrix(_vehicle(leg, smoothed))
+    return {'t': smoothed['track_t'],
+            **dict(zip(('east_m', 'north_m', 'up_m'), track_n.T, strict=True)),
+            'latitude_deg': np.rad2deg(latitude), 'longitude_deg': np.rad2deg(longitude),
+            'height_m': height,
+            **dict(zip(('qx', 'qy', 'qz', 'qw'), quaternion.T, strict=True))}
+
+
+def _state(leg: LegResult, smoothed) -> Series:
+    gyro, accelerometer = smoothed['key_biases']
+    angles = rpy_from_matrix(_vehicle(leg, smoothed))
+    return {'t': smoothed['track_t'],
+            **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True)),
+            **{f'gyro_bias_{axis}': _rows(smoothed, column)
+               for axis, column in zip('xyz', gyro.T, strict=True)},
+            **{f'accelerometer_bias_{axis}': _rows(smoothed, column)
+               for axis, column in zip('xyz', accelerometer.T, strict=True)}}
+
+
+def _stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
+    """Return the series of legs, one under the other, their times as stamps."""
+    legs = [{'leg': np.full(len(columns['t']), number),
+             'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),
+             't_s': columns['t'],
+             **{name: column for name, column in columns.items() if name != 't'}}
+            for number, leg, columns in found]
+    return {name: np.concatenate([one[name] for one in legs]) for name in legs[0]}

@@ -1,0 +1,99 @@
+"""A drive with known truth, as samples or as a bag with its truth beside it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from odocal_ros.bagio.write import check_target, drive_topics, write_bag
+from odocal_ros.errors import BadUsage
+from odocal_ros.outside.names import for_comment, one_line
+from odocal_ros.outside.whole import uninterrupted, write_text
+from odocal_ros.sim import scenarios
+from odocal_ros.sim.scenarios import Drive, SimOptions
+from odocal_ros.sim.truth import settings, truth_entries
+
+TRUTH, SETTINGS = 'truth.yaml', 'calibrator.yaml'
+MADE_HERE = 'Made by odocal simulate.'
+
+
+def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None, *,
+             storage: str = 'mcap', compression: str = 'none', force: bool = False,
+             heading_sigma: float | None = None,
+             progress: Callable[[float], None] | None = None, **options: Any) -> Drive:
+    """
+    Simulate a drive; equal options give equal drives, to the last bit.
+
+    Parameters
+    ----------
+    scenario : str or SimOptions
+        paper, straight, out_and_back, town, motorway or yard; or all options.
+    out : path, optional
+        Bag to write; truth.yaml and calibrator.yaml, what an operator would know, go beside it.
+    storage, compression, force, progress
+        As ``bagio.write.write_bag`` takes them.
+    heading_sigma : float, optional
+        rad: a heading of this accuracy goes into calibrator.yaml.
+    options
+        Fields of SimOptions: duration, seed, imu_grade, fix_noise, two_wheels and so on.
+
+    Raises
+    ------
+    BadUsage
+        An option is unknown or out of range; a file is there already and no ``force``.
+
+    """
+    if out is not None:
+        out = Path(out)
+        for path in beside(out):
+            _check_beside(path, force)
+        check_target(out, storage, compression, force)
+    try:
+        asked = scenario if isinstance(scenario, SimOptions) else SimOptions(
+            scenario=scenario, **options)
+    except TypeError as error:
+        raise BadUsage(f'simulate: {error}') from None
+    drive = scenarios.simulate(asked)
+    if out is not None:
+        write_bag(out, drive_topics(drive), storage, compression, force, progress)
+        _write_beside(out, drive, heading_sigma)
+    return drive
+
+
+def beside(out: Path) -> list[Path]:
+    """Return where truth and settings go: with the bag's name where another bag's are there."""
+    plain = [out.parent / name for name in (TRUTH, SETTINGS)]
+    text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
+    if MADE_HERE in text and one_line(f'Truth of {out.name}.') not in text:
+        return [path.with_name(f'{out.name}.{path.name}') for path in plain]
+    return plain
+
+
+def _check_beside(path: Path, force: bool) -> None:
+    """Refuse to write over a file, unless forced and it was made here."""
+    if not path.exists():
+        return
+    if not force:
+        raise BadUsage(f'{path} is there already; give --force to replace it, or --out in '
+                       'another folder')
+    if MADE_HERE not in path.read_text(encoding='utf-8', errors='replace'):
+        raise BadUsage(f'{path} was not made by odocal simulate and is kept; give --out in '
+                       'another folder')
+
+
+def _write_beside(out: Path, drive: Drive, heading_sigma: float | None) -> None:
+    truth, known = beside(out)
+    with uninterrupted():      # a bag is never without its truth
+        _write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
+        _write_yaml(known, {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}},
+                    f'What an operator of {out.name} would know.')
+
+
+def _write_yaml(path: Path, content: dict, title: str) -> None:
+    """Write a file whole or not at all."""
+    import yaml
+    try:
+        write_text(path, for_comment(one_line(f'{title} {MADE_HERE}'))
+                   + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    except OSError as error:
+        raise BadUsage(f'{path}: cannot write ({error.strerror}); the bag itself is '
+                       'complete') from None

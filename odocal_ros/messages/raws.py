@@ -1,0 +1,77 @@
+"""Serialised messages side by side in one buffer: values at one place of all of them at once."""
+
+from collections.abc import Sequence
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Bools, Ints
+
+Bytes = bytes | bytearray | memoryview
+Rows = Ints | Bools | slice
+
+
+class Raws(Sequence[bytes]):
+    """Messages: ``data``, and where in it each starts and how long it is."""
+
+    def __init__(self, data: Bytes, start: Ints, size: Ints) -> None:
+        self.data, self.start, self.size = data, start, size
+
+    @classmethod
+    def of(cls, raws: Sequence[bytes]) -> 'Raws':
+        """Return messages that lie apart."""
+        if isinstance(raws, Raws):
+            return raws
+        size = np.fromiter(map(len, raws), np.int64, len(raws))
+        return cls(b''.join(raws), np.cumsum(size) - size, size)
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.start)
+
+    @overload
+    def __getitem__(self, which: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, which: slice) -> 'Raws': ...
+
+    def __getitem__(self, which: int | slice) -> 'bytes | Raws':
+        """Return one message, or some."""
+        if isinstance(which, slice):
+            return self.take(which)
+        start = int(self.start[which])
+        return bytes(self.data[start:start + int(self.size[which])])
+
+    def take(self, rows: Rows) -> 'Raws':
+        """Return the messages of some rows; nothing is copied."""
+        return Raws(self.data, self.start[rows], self.size[rows])
+
+    def column(self, offset: int, dtype: str, count: int) -> NDArray[Any]:
+        """Return (n, count) values that lie at one place of messages that are as long."""
+        if not len(self) or not count:
+            return np.empty((len(self), count), dtype)
+        width = np.dtype(dtype).itemsize * count
+        # every place of the buffer as such a value; the rows picked are all that is touched
+        there = np.ndarray((len(self.data) - offset - width + 1,), f'V{width}', self.data, offset,
+                           (1,))
+        return there[self.start].view(dtype).reshape(-1, count)
+
+    def packed(self) -> 'Raws':
+        """Return the same messages in a buffer of their own."""
+        data, start, at = [], np.empty(len(self), np.int64), 0
+        for rows in self.by_size():
+            size = int(self.size[rows[0]])
+            data.append(self.take(rows).column(0, 'u1', size).tobytes())
+            start[rows] = at + np.arange(len(rows)) * size
+            at += len(data[-1])
+        return Raws(b''.join(data), start, self.size)
+
+    def by_size(self) -> list[Ints]:
+        """Return the rows of messages of one length, for each length."""
+        if not len(self):
+            return []
+        if (self.size == self.size[0]).all():
+            return [np.arange(len(self))]
+        order = np.argsort(self.size, kind='stable')
+        return np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1)

@@ -1,0 +1,73 @@
+"""odocal doctor: what is installed and where data would go, as one screen to paste."""
+
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import platform
+import shutil
+import subprocess
+import sys
+
+from odocal_ros import __version__
+from odocal_ros.offline.say import say
+
+NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'rosbags', 'matplotlib', 'jinja2', 'tqdm')
+OPTIONAL = {'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
+WORTH = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY',
+         'ROS_HOME', 'ODOCAL_LIMITS')     # of the environment; no other is shown
+MISSING = 'MISSING'
+PROBE = ('import sys, rclpy\n'
+         'from rclpy.utilities import get_rmw_implementation_identifier as rmw\n'
+         'sys.stdout.write(f"{rclpy.__file__}\\n{rmw()}\\n")')
+
+
+def add_arguments(parser) -> None:
+    """Declare the options: there are none."""
+
+
+def run(args) -> int:
+    """Print what is there; return 0, 1 where something that is needed is not."""
+    rows = [('odocal_ros', f'{__version__}, {Path(__file__).resolve().parents[1]}'),
+            ('Python', f'{platform.python_version()}, {sys.executable}'),
+            ('system', f'{platform.platform()}, {os.cpu_count()} cores')]
+    rows += [(name, _version(name)) for name in NEEDED]
+    rows += [(name, _version(name, f'none: no {use}')) for name, use in OPTIONAL.items()]
+    rows += _ros()
+    rows += [(name, os.environ[name]) for name in WORTH if name in os.environ]
+    rows += [('results of a node', _room(Path(os.environ.get('ROS_HOME') or '~/.ros') / 'odocal')),
+             ('results of a replay', _room(Path.cwd()))]
+    width = max(len(name) for name, _ in rows)
+    say('\n'.join(f'{name:<{width}}  {text}' for name, text in rows))
+    lacking = [name for name, text in rows if text == MISSING]
+    say(f'lacking: {", ".join(lacking)}; install again with pip or rosdep' if lacking
+        else 'all that is needed is there')
+    return 1 if lacking else 0
+
+
+def _version(name: str, absent: str = MISSING) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return absent
+
+
+def _ros() -> list[tuple[str, str]]:
+    """Return how ROS is there."""
+    if find_spec('rclpy') is None:
+        return [('rclpy', 'none: no node here, bags can be replayed')]
+    # in a process of its own, where a broken one breaks nothing
+    found = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
+    if found.returncode:
+        return [('rclpy', f'BROKEN: {(found.stderr.strip().splitlines() or ["?"])[-1]}')]
+    where, rmw = found.stdout.splitlines()
+    return [('rclpy', where), ('rmw', rmw)]
+
+
+def _room(folder: Path) -> str:
+    """Return a folder, whether it can be written and how much room there is."""
+    folder = folder.expanduser()
+    there = next(p for p in (folder, *folder.parents) if p.exists())
+    free = shutil.disk_usage(there).free / 1e9
+    able = 'can be written' if os.access(there, os.W_OK) else 'CANNOT BE WRITTEN'
+    return f'{folder}, {able}, {free:.1f} GB free'

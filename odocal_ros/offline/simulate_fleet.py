@@ -1,0 +1,96 @@
+"""odocal simulate --fleet: the bags of many vehicles, their manifest and their truth."""
+
+import csv
+from datetime import datetime, UTC
+import io
+import math
+from pathlib import Path
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.offline.phases import Phase
+from odocal_ros.offline.say import say
+from odocal_ros.outside.whole import write_text
+
+MANIFEST = 'manifest.csv'
+MOST = 100_000       # vehicles
+
+
+def simulate_fleet(args, options) -> int:
+    """
+    Write DIR/<vehicle>/bag_<nn>, DIR/<model>.yaml, DIR/manifest.csv and DIR/truth.yaml; return 0.
+
+    options : of each drive, but for what differs between vehicles.
+    """
+    from odocal_ros.sim.fleet import fleet_of
+    out = Path(args.out)
+    if not (1 <= args.fleet <= MOST and 1 <= args.bags <= 1000):
+        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: want 1 to {MOST} vehicles with '
+                       '1 to 1000 bags each')
+    if (out / MANIFEST).exists() and not args.force:
+        raise BadUsage(f'{out / MANIFEST} is there already; give --force to replace the fleet, or '
+                       'another --out')
+    vehicles = fleet_of(args.fleet, args.bags, options.seed)
+    rows, truth = [], []
+    with Phase('simulating', args.quiet) as phase:
+        for number, vehicle in enumerate(vehicles):
+            drives = [_bag(args, out, number, vehicle, bag, options) for bag in range(args.bags)]
+            rows += [row for row, _ in drives]
+            truth.append(_truth(vehicle, [made for _, made in drives]))
+            phase((number + 1) / len(vehicles), vehicle.name)
+    _write(out, rows, truth)
+    if not args.quiet:
+        say(f'{out}: {len(vehicles)} vehicles, {len(rows)} bags; truth in {out}/truth.yaml; next: '
+            f'odocal fleet {out / MANIFEST} --output result')
+    return 0
+
+
+def _bag(args, out, number, vehicle, bag, options):
+    """Write a bag; return its row of the manifest and the drive's options and truth."""
+    from odocal_ros.bagio.write import drive_topics, write_bag
+    from odocal_ros.sim.fleet import as_driven, drive_options, MODELS
+    from odocal_ros.sim.scenarios import simulate
+    from odocal_ros.sim.truth import settings
+    drive = simulate(drive_options(vehicle, number, bag, options))
+    name = f'{vehicle.name}/bag_{bag + 1:02d}'
+    write_bag(out / name, drive_topics(as_driven(drive, vehicle.broken(bag))), args.storage,
+              args.compression, args.force)
+    config = f'{vehicle.model.name}.yaml'
+    if number < len(MODELS) and not bag:      # one of each model
+        _yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},
+              f'What an operator of a {vehicle.model.name} would know.')
+    return {'vehicle': vehicle.name, 'bag': name, 'config': config, 'model': vehicle.model.name,
+            'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}, drive
+
+
+def _truth(vehicle, drives):
+    last = drives[-1].truth
+    return {
+        'vehicle': vehicle.name, 'model': vehicle.model.name,
+        'scale_factor': [float(drive.truth.scale) for drive in drives],
+        'scale_ratio': last.scale_ratio,
+        'yaw_mounting_deg': [math.degrees(drive.truth.yaw) for drive in drives],
+        'pitch_mounting_deg': math.degrees(last.pitch),
+        'start': [_iso(drive.truth.start_ns) for drive in drives],
+        'changes': [{'value': change.what, 'bag': change.bag + 1,
+                     'size': change.size, 'after': _iso(drives[change.bag - 1].truth.start_ns),
+                     'by': _iso(drives[change.bag].truth.start_ns)}
+                    for change in vehicle.changes]}
+
+
+def _write(out, rows, truth) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(rows)
+    _yaml(out / 'truth.yaml', {'vehicles': truth}, 'Truth of a fleet; sizes relative or rad.')
+    write_text(out / MANIFEST, text.getvalue())      # last: it says that all is there
+
+
+def _yaml(path: Path, content: dict, title: str) -> None:
+    import yaml
+    write_text(path, f'# {title} Made by odocal simulate.\n' + yaml.safe_dump(
+        content, sort_keys=False, default_flow_style=None))
+
+
+def _iso(stamp_ns: int) -> str:
+    return f'{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}'

@@ -1,0 +1,131 @@
+"""
+Pass or fail of a calibration against limits: what a line's end must know.
+
+A value passes where all within two sigma of it lies within its limits, and fails where all of it
+lies outside; else it is not decided, and more must be driven. With an honest sigma a vehicle that
+is on a limit or beyond passes in 2.3 % of all cases at most, and one within its limits fails in no
+more (docs/fleet.md).
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+import math
+from typing import Any
+
+from odocal_ros.calib.choice import ABOUT
+from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.nav.angles import wrap
+from odocal_ros.reasons import Code, Reason, Verdict
+from odocal_ros.settings.config import Config
+
+LIMIT_SIGMAS = 2.0      # of a value, that lie on one side of its limit
+DRIVE_MORE = {'scale_factor': Code.SCALE_SIGMA_TOO_LARGE, 'scale_ratio':
+              Code.SCALE_SIGMA_TOO_LARGE, 'yaw_mounting_angle': Code.YAW_SIGMA_TOO_LARGE,
+              'pitch_mounting_angle': Code.YAW_SIGMA_TOO_LARGE}
+
+
+class Decision(Enum):
+    """Whether a vehicle passes, the best first."""
+
+    PASS = 'PASS'
+    UNDECIDED = 'UNDECIDED'
+    FAIL = 'FAIL'
+
+
+@dataclass(frozen=True)
+class Held:
+    """One value held against its limits; sigma_wanted: with which this value would pass."""
+
+    name: str
+    estimate: Estimate
+    low: float
+    high: float
+    decision: Decision
+    sigma_wanted: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json; a limit that is not set is None."""
+        return {'decision': self.decision.value, **self.estimate.as_dict(),
+                'low': self.low if math.isfinite(self.low) else None,
+                'high': self.high if math.isfinite(self.high) else None,
+                'sigma_wanted': self.sigma_wanted}
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """The decision on a vehicle, each value's own, why it is not decided and what to do then."""
+
+    decision: Decision
+    values: tuple[Held, ...]
+    why: str = ''
+    do: str = ''
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of calibration.json."""
+        return {'decision': self.decision.value, 'why': self.why, 'remedy': self.do,
+                'values': {held.name: held.as_dict() for held in self.values}}
+
+
+def decide(value: float, sigma: float, low: float, high: float) -> Decision:
+    """Return whether a value surely lies within its limits (PASS), or surely outside (FAIL)."""
+    least, most = value - LIMIT_SIGMAS * sigma, value + LIMIT_SIGMAS * sigma
+    if low <= least and most <= high:
+        return Decision.PASS
+    return Decision.FAIL if most < low or least > high else Decision.UNDECIDED
+
+
+def accept(calibration: Calibration, config: Config) -> Acceptance | None:
+    """
+    Hold a calibration against the settings ``accept.*``; None where no limit is set.
+
+    A vehicle fails with any of its values, and passes with all of them. A rejected calibration
+    decides nothing, and with ``accept.strict`` one with a caution does not pass.
+    """
+    values = tuple(_held(name, calibration, low, high)
+                   for name, (low, high) in config.accept.limits.items())
+    if not values:
+        return None
+    worst = max((held.decision for held in values), key=list(Decision).index)
+    barred = calibration.verdict is Verdict.REJECTED or (
+        config.accept.strict and calibration.verdict is not Verdict.ACCEPTED)
+    if calibration.verdict is Verdict.REJECTED or (barred and worst is Decision.PASS):
+        gravest = next(r for r in calibration.reasons if r.code.gravity is calibration.verdict)
+        return Acceptance(Decision.UNDECIDED, values, f'{calibration.verdict.value}: '
+                          f'{gravest.code.name}: {gravest.text}', gravest.remedy)
+    open_ones = [held for held in values if held.decision is Decision.UNDECIDED]
+    if worst is not Decision.UNDECIDED:
+        return Acceptance(worst, values)
+    said = [_lacking(held, calibration.reasons) for held in open_ones]
+    return Acceptance(worst, values, '; '.join(why for why, _ in said),
+                      ' '.join(dict.fromkeys(do for _, do in said)))
+
+
+def _held(name: str, calibration: Calibration, low: float, high: float) -> Held:
+    found = calibration.estimates.get(name, Estimate(None, None, ''))
+    value, sigma = found.value, found.sigma
+    if value is None or sigma is None:
+        return Held(name, found, low, high, Decision.UNDECIDED)
+    if found.unit == 'rad':      # half a turn from the limits is the same on either side
+        middle = low if math.isinf(high) else high if math.isinf(low) else (low + high) / 2
+        value = middle + float(wrap(value - middle))
+    room = min(value - low, high - value)
+    return Held(name, found, low, high, decide(value, sigma, low, high),
+                room / LIMIT_SIGMAS if room > 0 else None)
+
+
+def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
+    """Return why a value is not decided, and what to do about it."""
+    name, found = held.name.replace('_', ' '), held.estimate
+    if found.value is None or found.sigma is None:
+        about = 'scale_factor' if held.name == 'scale_ratio' else held.name
+        told = next((r for r in reasons if ABOUT.get(r.code) == about), None)
+        if held.name == 'scale_ratio' and told is None:
+            return f'{name} not known', 'Set odometer.nominal_scale.'
+        return f'{name} not determined', (told or DRIVE_MORE[held.name]).remedy
+    if held.sigma_wanted is None:
+        return (f'{name} lies beyond its limit, by less than {LIMIT_SIGMAS:g} sigma',
+                DRIVE_MORE[held.name].remedy)
+    times = (found.sigma / held.sigma_wanted)**2
+    return (f'{name} lies within its limits, its sigma is too large: '
+            f'{held.sigma_wanted:.2g} would do, it is {found.sigma:.2g} (about '
+            f'{math.ceil(times)} times as many such legs)', DRIVE_MORE[held.name].remedy)

@@ -1,0 +1,101 @@
+"""What the smoother will make of a planned drive: its own covariance, at what is true."""
+
+import numpy as np
+
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.chain import NotPositive, solve
+from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
+from odocal_ros.calib.smoother.imperfect import judged_priors
+from odocal_ros.calib.smoother.imu_noise import sensor_noise
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.outcome import outcome, refused
+from odocal_ros.calib.smoother.problem import Problem, SPACING
+from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
+from odocal_ros.calib.smoother.smoother import too_little
+from odocal_ros.planning.drive import PlannedDrive
+from odocal_ros.planning.predict import Sigmas
+from odocal_ros.planning.samples import Ideal, ideal
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.grades import grade_of
+
+# keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at
+# WIDEST_SPACING, more beyond two hours, which is more than a live leg may last; never too small
+ENOUGH_INTERVALS, MOST_INTERVALS = 600, 1440
+WIDEST_SPACING = 5.0    # s
+SWAY_RATE = 10.0        # Hz of the white noise that sigmas.sway is said for
+
+
+def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
+                     spacing: float | None = None) -> MethodResult:
+    """
+    Return what the smoother will give for a drive, covariance only.
+
+    The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
+    ``planned_levels``, and what is said of the outcome is said by the code that says it of a fit.
+
+    Parameters
+    ----------
+    drive, sigmas : PlannedDrive, Sigmas
+        As for ``predict``.
+    spacing : float, optional
+        s between keyframes; as ``spacing_for`` has it.
+
+    Returns
+    -------
+    MethodResult named ``smoother``; scale 1, angles 0, sigmas and budget as they will be.
+
+    """
+    few = too_little(int(drive.duration * sigmas.fix_rate), drive.duration)
+    if few:
+        return refused([few], '1')
+    made = ideal(drive, sigmas, spacing_for(drive) if spacing is None else spacing)
+    problem = Problem.of(made.leg, sigmas.config, made.imu)
+    levels = planned_levels(problem, sigmas, made.fixes_in_one)
+    try:
+        fit = _fit(problem, made, levels, problem.priors)
+        priors = judged_priors(fit, problem.grade, found=False)
+        if priors is not fit.priors:
+            fit = _fit(problem, made, levels, priors)
+    except (NotPositive, np.linalg.LinAlgError) as error:
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
+                       '1')
+    return outcome(made.leg, problem, fit, sigmas.config)
+
+
+def spacing_for(drive: PlannedDrive) -> float:
+    """Return the seconds between keyframes that a drive is predicted with."""
+    usual = np.clip(drive.duration / ENOUGH_INTERVALS, SPACING, WIDEST_SPACING)
+    return float(max(usual, drive.duration / MOST_INTERVALS))
+
+
+def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:
+    """
+    Return the noise that a drive is planned with, where a fit would estimate it.
+
+    Imu by its grade; wheels that slip by ``sigmas.slip``, slide and bounce by ``sigmas.sway``;
+    fixes of the stated sigma, white, or white to WHITE_SHARE of it beside a part that stays alike
+    for the correlation time. Never less than the smoother believes in.
+    """
+    grade = grade_of(sigmas.config.imu)
+    road = dict.fromkeys(ROAD_NOISE, sigmas.sway**2 / SWAY_RATE)
+    road |= dict.fromkeys(('along', 'along_hard'), sigmas.slip**2)
+    tau = sigmas.correlation_time
+    white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]
+    values = road | {name: sigma**2 for name, sigma in sensor_noise(grade).items()} | {
+        name: 2 / max(tau, 1.0) * (1 - white) * variance
+        for name, variance in (('slow', sigmas.fix**2), ('slow_up', up))}
+    values |= dict.fromkeys(('fix', 'fix_up'), white / fixes_in_one)
+    least = {name: problem.least.get(name, 0.0) for name in values}
+    # that of a fix is for each, not for those that one stands for
+    least |= {name: least[name] / fixes_in_one for name in ('fix', 'fix_up')}
+    return problem.first_levels.but(
+        correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
+
+
+def _fit(problem, made: Ideal, levels, priors) -> Fit:
+    """Return the fit that stands where it is: no step is taken."""
+    state = made.state
+    weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
+    return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
+               np.nan, weighted, solve(weighted.normal()))

@@ -1,0 +1,36 @@
+"""--accept NAME=LOW:HIGH, the short way to the settings accept.*; angles in degrees too."""
+
+import math
+
+from odocal_ros.errors import BadUsage
+from odocal_ros.settings.config import ACCEPTED
+
+WANTED = '--accept NAME=LOW:HIGH, as in --accept scale_ratio=0.995:1.005; either may be left out'
+DEG = '_deg'
+
+
+def parse_accept(text: str) -> dict[str, float]:
+    """
+    Return the settings of one ``NAME=LOW:HIGH``; of ``NAME_deg`` the limits are in degrees.
+
+    Raises
+    ------
+    BadUsage
+        Not of that form, or of no result that has limits.
+
+    """
+    name, equals, limits = (part.strip() for part in text.partition('='))
+    low, colon, high = limits.partition(':')
+    plain, factor = name, 1.0
+    if name.endswith(f'angle{DEG}'):
+        plain, factor = name.removesuffix(DEG), math.radians(1.0)
+    if plain not in ACCEPTED:
+        raise BadUsage(f'--accept {text}: want one of '
+                       + ', '.join(n + f' (or {n}{DEG})' * n.endswith('angle') for n in ACCEPTED))
+    if not (equals and colon and limits != ':'):
+        raise BadUsage(f'--accept {text}: want {WANTED}')
+    try:
+        return {f'accept.{plain}_{side}': float(value) * factor
+                for side, value in (('min', low), ('max', high)) if value.strip()}
+    except ValueError:
+        raise BadUsage(f'--accept {text}: {limits} are no two numbers; want {WANTED}') from None

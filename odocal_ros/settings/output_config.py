@@ -1,0 +1,50 @@
+"""Settings of what goes out: files, journal, topics, frames; the groups of ``Config`` of that."""
+
+from dataclasses import dataclass
+
+from odocal_ros.settings.setting import setting
+
+FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track', 'legs',
+           'report')
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig:
+    directory: str = setting('', about='Where results go; empty: odocal/ and the full name of '
+                             'the node in $ROS_HOME (~/.ros/odocal/calibrator)'
+                             '.')
+    autosave: bool = setting(True, about='Write the result files after every leg that is not '
+                             'rejected.')
+    automatic_kept: int = setting(100, '', 0, 10**6, about='Result folders that are kept of those '
+                                  'written with leg.automatic; the oldest go first, but never '
+                                  'what latest shows and the newest good one. 0: all.')
+    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
+                                       'calibration.json.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalConfig:
+    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk for the journals of legs '
+                             '(journal/ under output.directory); the oldest go first. 0: no '
+                             'journal.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishConfig:
+    rate: float = setting(2.0, 'Hz', 0.1, 20.0, ro=True, about='Rate of the status message.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig:
+    base: str = setting('base_link', ro=True, frame=True,
+                        about='Vehicle frame in the files written.')
+    imu: str = setting('', ro=True, frame=True,
+                       about='Imu frame; empty: that of the Imu messages.')
+    local: str = setting('odocal_enu', ro=True, frame=True,
+                         about='Frame of the published paths.')
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdaterConfig:
+    period: float = setting(1.0, 's', 0.1, 60.0, ro=True, about='Period of /diagnostics.')
+    use_fqn: bool = setting(False, ro=True, about='Full node name in /diagnostics.')

@@ -1,0 +1,112 @@
+"""A fleet with known truth: models, vehicles that differ, tyres changed, Imus moved."""
+
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+
+from odocal_ros.sim.noise import stream
+from odocal_ros.sim.scenarios import Drive, SimOptions
+
+WEEK_NS, HOUR_NS = 7 * 86_400 * 10**9, 3600 * 10**9
+WALK = 1e-4              # of the scale, relative, per square root of a day
+SCALE_SPREAD = 0.003     # between vehicles of a model, relative, 1 sigma
+YAW_SPREAD, PITCH_SPREAD = math.radians(0.3), math.radians(0.2)
+TYRES, MOVED, BROKEN = 0.1, 0.05, 1 / 30     # shares of the vehicles, at least one of three
+KM_A_WEEK = 400.0
+ALIVE = 1 / 3            # of the drive: then a broken counter stands
+
+
+@dataclass(frozen=True)
+class Model:
+    """A kind of vehicle: scale as its maker says and as it is, m/pulse; mounting angles, rad."""
+
+    name: str
+    nominal: float
+    scale: float
+    yaw: float
+    pitch: float
+
+
+MODELS = (Model('shuttle', 0.0210, 0.0213, math.radians(1.0), math.radians(0.4)),
+          Model('van', 0.0245, 0.0243, math.radians(-0.5), math.radians(0.8)),
+          Model('truck', 0.0310, 0.0312, math.radians(0.2), math.radians(-0.6)))
+
+
+@dataclass(frozen=True)
+class FleetChange:
+    """What happened to a vehicle before one of its bags, the first being 0."""
+
+    bag: int
+    what: str            # scale_factor, yaw_mounting_angle or counter
+    size: float = 0.0    # relative, or rad
+
+
+@dataclass(frozen=True, eq=False)
+class FleetVehicle:
+    """A vehicle and what its drives are made of."""
+
+    name: str
+    model: Model
+    scale: np.ndarray    # (bags,) m/pulse
+    yaw: np.ndarray      # (bags,) rad
+    pitch: float
+    odometer_km: np.ndarray
+    changes: tuple[FleetChange, ...] = field(default=())
+
+    def broken(self, bag: int) -> bool:
+        """Return whether the counter was broken in a drive."""
+        return any(change.what == 'counter' and change.bag <= bag for change in self.changes)
+
+
+def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
+    """Return so many vehicles with so many drives each, a week from one to the next."""
+    rng = stream(seed, 'fleet')
+    order = rng.permutation(vehicles).tolist()
+    fates: dict[int, str] = {}
+    for what, share in (('scale_factor', TYRES), ('yaw_mounting_angle', MOVED),
+                        ('counter', BROKEN)):
+        for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
+            fates[order.pop()] = what
+    return [_vehicle(k, bags, fates.get(k), stream(seed, f'fleet vehicle {k}'))
+            for k in range(vehicles)]
+
+
+def _vehicle(k: int, bags: int, fate: str | None, rng) -> FleetVehicle:
+    model = MODELS[k % len(MODELS)]
+    walk = np.cumsum(WALK * math.sqrt(7) * rng.standard_normal(bags))
+    scale = model.scale * (1 + SCALE_SPREAD * rng.standard_normal()) * np.exp(walk)
+    yaw = np.full(bags, model.yaw + YAW_SPREAD * rng.standard_normal())
+    pitch = model.pitch + PITCH_SPREAD * rng.standard_normal()
+    km = 1000.0 + KM_A_WEEK * np.cumsum(rng.uniform(0.5, 1.5, bags))
+    when = int(rng.integers(1, max(2, bags - 1)))
+    size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0))
+    changes: tuple[FleetChange, ...] = ()
+    if fate == 'scale_factor':
+        size *= 0.02
+        scale[when:] *= 1 + size
+    elif fate == 'yaw_mounting_angle':
+        size *= math.radians(3.0)
+        yaw[when:] += size
+    if fate:
+        changes = (FleetChange(when, fate, 0.0 if fate == 'counter' else size),)
+    return FleetVehicle(f'{model.name}_{k + 1:03d}', model, scale, yaw, pitch, km, changes)
+
+
+def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOptions) -> SimOptions:
+    """Return the options of a drive of the ``number``-th vehicle."""
+    return replace(
+        options, seed=options.seed + 1000 * (number + 1) + bag, yaw=float(vehicle.yaw[bag]),
+        start_ns=options.start_ns + bag * WEEK_NS + number % 100 * HOUR_NS,
+        pitch=vehicle.pitch, scale=float(vehicle.scale[bag]),
+        nominal_scale=vehicle.model.nominal)
+
+
+def as_driven(drive: Drive, broken: bool) -> Drive:
+    """Return a drive as its bag has it: a broken counter stands from a third of it on."""
+    if not broken:
+        return drive
+    rows = drive.odometer
+    value = rows.value.copy()
+    value[int(ALIVE * len(value)):] = value[int(ALIVE * len(value))]
+    return replace(drive, odometer=replace(rows, value=value))

@@ -1,0 +1,57 @@
+"""A small fleet, simulated once, and two workers for all tests of it."""
+
+from argparse import ArgumentParser
+import csv
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytest.importorskip('distributed')
+
+from odocal_ros.fleet.bags import find_bags
+from odocal_ros.fleet.engine import engine
+from odocal_ros.fleet.jobs import bag_jobs
+from odocal_ros.offline.cli import main
+from odocal_ros.offline.replay import add_calibration_arguments
+
+VEHICLES, BAGS = 3, 4
+
+
+class Fleet:
+    """Bags with their truth."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.manifest = str(folder / 'manifest.csv')
+        self.truth = yaml.safe_load((folder / 'truth.yaml').read_text())['vehicles']
+        with open(self.manifest, newline='') as file:
+            self.rows = list(csv.DictReader(file))
+
+    def jobs(self, output: Path, *options: str, seconds: float = 0.0, memory: int = 0,
+             bags: list | None = None) -> list:
+        return bag_jobs(bags if bags is not None else find_bags([self.manifest], None),
+                        arguments(*options), output, seconds, memory)
+
+
+def arguments(*options: str):
+    """Return replay's options: the quick method, unless they say another."""
+    parser = ArgumentParser()
+    add_calibration_arguments(parser)
+    return parser.parse_args(['--method', 'two_point', *options])
+
+
+@pytest.fixture(scope='session')
+def fleet(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('fleet') / 'fleet'
+    assert main(['simulate', '--scenario', 'straight', '--duration', '180', '--fix-noise', 'rtk',
+                 '--imu-rate', '25', '--odometer-rate', '10', '--fix-rate', '2', '--fleet',
+                 str(VEHICLES), '--bags', str(BAGS), '--out', str(folder), '--quiet']) == 0
+    return Fleet(folder)
+
+
+@pytest.fixture(scope='session')
+def client():
+    """Two local workers; a bag that ends its worker is tried once."""
+    with engine(None, 2, 2**31, 1) as client:
+        yield client

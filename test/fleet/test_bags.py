@@ -1,0 +1,69 @@
+"""Which bags are meant: manifests, folders, globs, patterns, URLs."""
+
+import zipfile
+
+import pytest
+
+pytest.importorskip('fsspec')
+
+from odocal_ros.errors import BadBag, BadUsage
+from odocal_ros.fleet.bags import at_hand, find_bags, FleetBag, seen_as
+
+
+def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
+    from pyarrow import csv, parquet
+    bags = find_bags([fleet.manifest], None)
+    assert [(b.vehicle, b.model, b.odometer_km) for b in bags] == [
+        (row['vehicle'], row['model'], float(row['odometer_km'])) for row in fleet.rows]
+    assert bags[0].bag == str(fleet.folder / fleet.rows[0]['bag'])
+    assert bags[0].config == str(fleet.folder / fleet.rows[0]['config'])
+    parquet.write_table(csv.read_csv(fleet.manifest), fleet.folder / 'manifest.parquet')
+    assert find_bags([str(fleet.folder / 'manifest.parquet')], None) == bags
+
+
+def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
+    whole = find_bags([str(fleet.folder)], None)
+    assert [(b.vehicle, b.bag) for b in whole] == sorted(
+        (row['vehicle'], str(fleet.folder / row['bag'])) for row in fleet.rows)
+    some = find_bags([f'{fleet.folder}/*/bag_01'], r'/(?P<model>[a-z]+)_(?P<vehicle>\d+)/')
+    assert {(b.model, b.vehicle) for b in some} == {
+        tuple(row['vehicle'].split('_')) for row in fleet.rows}
+    for wrong, what in ((r'/(\d+)/x', 'does not fit'), ('no group', 'group'), ('(', '--vehicle')):
+        with pytest.raises(BadUsage, match=what):
+            find_bags([str(fleet.folder)], wrong)
+
+
+@pytest.mark.parametrize(('text', 'what'), [
+    ('vehicle,model\na,b\n', 'no column bag'), ('vehicle,bag\n', 'no bag'),
+    ('vehicle,bag\n,x\n', 'row 2: vehicle or bag is empty'),
+    ('vehicle,bag,odometer_km\na,x,far\n', "'far' is no number"), ('', 'cannot be read')])
+def test_a_wrong_manifest_says_where(text, what, tmp_path):
+    (tmp_path / 'm.csv').write_text(text)
+    with pytest.raises(BadUsage, match=what):
+        find_bags([str(tmp_path / 'm.csv')], None)
+
+
+def test_legs_and_urls_of_a_manifest_are_kept(tmp_path):
+    (tmp_path / 'm.csv').write_text('vehicle,bag,legs\n007,s3://b/x.mcap,12:95 100:\n')
+    assert find_bags([str(tmp_path / 'm.csv')], None) == [
+        FleetBag('007', 's3://b/x.mcap', legs=('12:95', '100:'))]
+
+
+def test_a_bag_by_url_is_copied_and_the_copy_removed(tmp_path):
+    with zipfile.ZipFile(tmp_path / 'bags.zip', 'w') as archive:
+        archive.writestr('drive/drive_0.mcap', b'12345')
+        archive.writestr('drive/metadata.yaml', b'x')
+    url = f'zip://drive::{tmp_path}/bags.zip'
+    scratch = tmp_path / 'scratch'
+    scratch.mkdir()
+    with at_hand(url, str(scratch)) as path:
+        assert path.is_relative_to(scratch)
+        assert (path / 'drive_0.mcap').read_bytes() == b'12345'
+    assert not list(scratch.iterdir())
+    before = seen_as(url, 'settings')
+    assert before == seen_as(url, 'settings') != seen_as(url, 'others')
+    with zipfile.ZipFile(tmp_path / 'bags.zip', 'w') as archive:
+        archive.writestr('drive/drive_0.mcap', b'12346')
+    assert seen_as(url, 'settings') != before
+    with pytest.raises(BadBag, match='gone'):
+        seen_as(f'{tmp_path}/gone', '')

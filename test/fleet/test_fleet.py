@@ -1,0 +1,239 @@
+"""A fleet on real Dask workers: rows, re-runs, bags that fail, hang or lose their worker."""
+
+from contextlib import contextmanager
+import csv
+from dataclasses import replace
+import json
+import os
+import signal
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('distributed')
+
+import pandas as pd
+from pyarrow import parquet
+
+from odocal_ros.fleet import calibrate_bags
+from odocal_ros.fleet.bags import find_bags
+from odocal_ros.fleet.jobs import computed_rows
+from odocal_ros.fleet.rows import DONE, FAILED, rows_of
+from odocal_ros.offline.cli import main
+
+
+def stored(output):
+    """Return all rows in an output folder, by bag, but for how long each took."""
+    rows = list(rows_of(sorted((output / 'rows').rglob('*.parquet'))))
+    by_bag = {row.bag: replace(row, seconds=0.0) for row in rows}
+    assert len(by_bag) == len(rows)      # one row a bag
+    return by_bag
+
+
+def computed(client, jobs, **more):
+    """Return how many bags were computed, and the rows' states."""
+    ended = [done for _, done in computed_rows(client, jobs, **more)]
+    return sum(done.computed for done in ended), [done.status for done in ended]
+
+
+@pytest.fixture(scope='module')
+def output(fleet, client, tmp_path_factory):
+    """Return the output folder of the command itself, on the workers of the client."""
+    folder = tmp_path_factory.mktemp('output') / 'result'
+    code = main(['fleet', fleet.manifest, '--output', str(folder), '--scheduler',
+                 client.scheduler.address, '--method', 'two_point', '--files', '--quiet'])
+    assert code == 0
+    return folder
+
+
+def test_each_bag_has_one_row_with_what_replay_says_of_it(fleet, output, tmp_path):
+    rows = stored(output)
+    assert len(rows) == len(fleet.rows)
+    bag = fleet.folder / fleet.rows[0]['bag']
+    config = fleet.folder / fleet.rows[0]['config']
+    assert main(['replay', str(bag), '--config', str(config), '--method', 'two_point', '--quiet',
+                 '--output', str(tmp_path), '--set', 'output.formats=[legs]']) == 0
+    told = json.loads((tmp_path / 'calibration.json').read_text())
+    row = rows[str(bag)]
+    assert row.sha256 == told['inputs'][0]['sha256']
+    estimates = json.loads(row.legs)[0]['methods']['two_point']['estimates']
+    found = told['result']['scale_factor']
+    assert [estimates['scale_factor'][key] for key in ('value', 'sigma', 'unit')] == [
+        found[key] for key in ('value', 'sigma', 'unit')]
+
+
+def test_a_vehicle_is_what_replay_of_its_bags_since_the_change_says(fleet, output, tmp_path):
+    table = pd.read_parquet(output / 'vehicles.parquet').set_index('vehicle')
+    changed = next(v for v in fleet.truth if v['changes'][0]['value'] == 'scale_factor')
+    row, = [table.loc[changed['vehicle']]]
+    bags = [fleet.folder / r['bag'] for r in fleet.rows if r['vehicle'] == changed['vehicle']]
+    since = bags[changed['changes'][0]['bag'] - 1:]
+    config = fleet.folder / f'{changed["model"]}.yaml'
+    main(['replay', *map(str, since), '--config', str(config), '--method', 'two_point', '--quiet',
+          '--output', str(tmp_path), '--set', 'output.formats=[legs]'])
+    told = json.loads((tmp_path / 'calibration.json').read_text())
+    by_files = json.loads(
+        (output / 'vehicles' / changed['vehicle'] / 'calibration.json').read_text())
+    drawn = json.loads((output / 'reports' / changed['vehicle'] / 'calibration.json').read_text())
+    for name in ('scale_factor', 'scale_ratio'):
+        found = told['result'][name]
+        assert (row[name], row[f'{name}_sigma']) == (found['value'], found['sigma'])
+        assert by_files['result'][name] == drawn['result'][name] == found
+    assert 'report.html' in {p.name for p in (output / 'reports' / changed['vehicle']).iterdir()}
+
+
+def test_changes_and_broken_counters_are_found_when_they_were(fleet, output):
+    table = pd.read_parquet(output / 'vehicles.parquet').set_index('vehicle')
+    for vehicle in fleet.truth:
+        row, (change,) = table.loc[vehicle['vehicle']], vehicle['changes']
+        found = json.loads(row.changes)
+        if change['value'] == 'scale_factor':
+            assert [(c['after'], c['by']) for c in found] == [(change['after'], change['by'])]
+            assert abs(found[0]['size'] - change['size']) < 4 * found[0]['sigma'] + 2e-3
+        else:      # no heading is known: two_point says nothing of the yaw
+            assert found == []
+        broken = change['value'] == 'counter'
+        assert pd.isna(row.rejected_since) != broken
+        if broken:
+            assert f'{row.rejected_since:%Y-%m-%d}' == change['by'][:10]
+            assert row.rejected_for == 'ODOMETER_STILL'
+        # its scale now: 4 sigma, one draw in 16,000; the walk of the weeks is in the sigma
+        good = len(vehicle['start']) - 1 if not broken else change['bag'] - 2
+        assert abs(row.scale_factor - vehicle['scale_factor'][good]) < 4 * np.hypot(
+            row.scale_factor_sigma, 1e-4 * 7**0.5 * 2 * row.scale_factor)
+
+
+def test_tables_and_page_hold_the_fleet(fleet, output):
+    legs = parquet.read_table(output / 'legs.parquet').to_pandas()
+    assert len(legs) == len(fleet.rows)
+    assert set(legs.columns) >= {'vehicle', 'bag', 'scale_factor', 'period', 'verdict', 'start'}
+    with open(output / 'fleet.csv', newline='') as file:
+        text = list(csv.DictReader(file))
+    whole = pd.read_parquet(output / 'vehicles.parquet')
+    assert list(text[0]) == list(whole.columns)
+    assert [float(row['scale_factor']) for row in text] == list(whole.scale_factor)
+    page = (output / 'fleet.html').read_text()
+    assert 'src=' not in page
+    assert not [link for link in page.split('href="')[1:]
+                if not link.startswith(('reports/', '#'))]
+    for vehicle in fleet.truth:
+        assert vehicle['vehicle'] in page
+        if vehicle['changes'][0]['value'] == 'scale_factor':
+            assert f'href="reports/{vehicle["vehicle"]}/report.html"' in page
+
+
+def test_a_second_run_computes_only_what_is_new_or_changed(fleet, client, output, tmp_path):
+    jobs = fleet.jobs(output)
+    before = stored(output)
+    assert computed(client, jobs) == (0, [DONE] * len(jobs))
+    # another date or place: the bag is read, known by its content, and not computed
+    bag = fleet.folder / fleet.rows[0]['bag']
+    for path in bag.iterdir():
+        os.utime(path, (1, 1))
+    assert computed(client, jobs)[0] == 0
+    assert {k: replace(row, seen='') for k, row in stored(output).items()} == {
+        k: replace(row, seen='') for k, row in before.items()}
+    # limits do not touch legs, what a leg must be does
+    assert computed(client, fleet.jobs(output, '--accept', 'scale_ratio=0:9')[:2])[0] == 0
+    assert computed(client, fleet.jobs(tmp_path, '--set', 'leg.min_distance=50')[:2])[0] == 2
+    assert stored(tmp_path)[str(bag)].key != before[str(bag)].key
+
+
+def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, output, capsys):
+    argv = ['fleet', fleet.manifest, '--output', str(output), '--scheduler',
+            client.scheduler.address, '--method', 'two_point', '--reports', 'none', '--quiet']
+    assert main([*argv, '--accept', 'scale_ratio=0.9:1.1']) == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {one['vehicle'] for one in told} == {v['vehicle'] for v in fleet.truth}
+    assert {one['decision'] for one in told} == {'PASS'}
+    assert main([*argv, '--accept', 'scale_ratio=0.9:1.01']) == 1      # the shuttle is at 1.014
+    told = {(one := json.loads(line))['vehicle']: one['decision']
+            for line in capsys.readouterr().out.splitlines()}
+    assert told == {v['vehicle']: 'PASS' if v['scale_ratio'] < 1.01 else 'FAIL'
+                    for v in fleet.truth}
+    table = pd.read_parquet(output / 'vehicles.parquet')
+    assert list(table.decision) == ['FAIL'] * (table.decision == 'FAIL').sum() + ['PASS'] * (
+        table.decision == 'PASS').sum()      # the worst first
+
+
+@contextmanager
+def silent_server():
+    """Give the URL of a bag on a server that takes a call and never says a word."""
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        yield f'ftp://127.0.0.1:{server.getsockname()[1]}/drive.mcap'
+
+
+def test_a_bag_that_hangs_and_one_that_is_none_stop_nobody(fleet, client, tmp_path):
+    (tmp_path / 'no.mcap').write_bytes(b'nothing of a bag')
+    good = find_bags([fleet.manifest], None)[:3]
+    with silent_server() as url:
+        bags = [replace(good[0], bag=url), replace(good[0], bag=str(tmp_path / 'no.mcap')), *good]
+        jobs = fleet.jobs(tmp_path / 'out', bags=bags, seconds=0)
+        jobs[0] = replace(jobs[0], seconds=6.0)
+        assert sorted(computed(client, jobs)[1]) == [DONE] * 3 + [FAILED] * 2
+    rows = stored(tmp_path / 'out')
+    assert rows[url].reason == 'took longer than --task-timeout gives (6 s)'
+    assert 'no.mcap' in rows[bags[1].bag].reason
+    assert {row.status for bag, row in rows.items() if bag in {b.bag for b in good}} == {DONE}
+    # what failed is kept, and tried once more when asked
+    assert computed(client, jobs[1:]) == (0, [DONE] * 3 + [FAILED])
+    assert computed(client, jobs[1:2], again=True) == (1, [FAILED])
+
+
+def test_a_bag_whose_worker_is_killed_is_a_row_that_says_so(fleet, client, tmp_path):
+    good = find_bags([fleet.manifest], None)[:3]
+    with silent_server() as url:
+        jobs = fleet.jobs(tmp_path, bags=[replace(good[0], bag=url), *good], seconds=0)
+        threading.Thread(target=kill_at, args=(client, jobs[0])).start()
+        assert sorted(computed(client, jobs)[1]) == [DONE] * 3 + [FAILED]
+    assert 'its worker was ended 1 times' in stored(tmp_path)[url].reason
+    client.wait_for_workers(2)
+
+
+def kill_at(client, job):
+    """Kill the worker that a job is on."""
+    def at_work():
+        return [address for address, keys in client.processing().items()
+                if any(job.place in str(key) for key in keys)]
+    while not (where := at_work()):
+        time.sleep(0.1)
+    os.kill(client.run(os.getpid, workers=where)[where[0]], signal.SIGKILL)
+
+
+def test_a_bag_that_needs_more_memory_than_it_may_is_a_row_that_says_so(fleet, client, tmp_path):
+    bag = find_bags([fleet.manifest], None)[0]
+    jobs = fleet.jobs(tmp_path, '--method', 'smoother', bags=[bag], memory=2**23)
+    assert computed(client, jobs) == (1, [FAILED])
+    assert 'more memory than --task-memory gives' in stored(tmp_path)[bag.bag].reason
+    # the worker lives, and has its memory back
+    assert computed(client, fleet.jobs(tmp_path / 'b', bags=[bag])) == (1, [DONE])
+
+
+def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
+    manifest = pd.read_csv(fleet.manifest)[['vehicle', 'bag', 'model']].head(2)
+    manifest['bag'] = [str(fleet.folder / bag) for bag in manifest.bag]
+    gone = {'vehicle': 'x', 'bag': str(tmp_path / 'gone'), 'model': ''}
+    frame = calibrate_bags(pd.concat([manifest, pd.DataFrame([gone])]),
+                           {'method': 'two_point', 'odometer.nominal_scale': 0.02}, client=client)
+    assert list(frame.status) == [DONE, DONE, FAILED]
+    assert 'gone' in frame.reason[2]
+    truth = next(v for v in fleet.truth if v['vehicle'] == manifest.vehicle[0])
+    off = frame.scale_factor[:2] - truth['scale_factor'][:2]
+    assert (abs(off) < 4 * frame.scale_factor_sigma[:2]).all()
+
+
+@pytest.mark.parametrize(('argv', 'what'), [
+    (['*.none'], 'no bag is there'),
+    (['{fleet}', '--set', 'leg.min_distance=x'], 'leg.min_distance'),
+    (['{fleet}', '--accept', 'x=1:2'], '--accept'), (['{fleet}', '--leg', '3'], '--leg'),
+    (['{fleet}', '--task-timeout', '0'], '--task-timeout'),
+    (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'nobody answers')])
+def test_wrong_usage_is_told_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [word.format(fleet=fleet.manifest) for word in argv]
+    assert main(['fleet', *words, '--output', str(tmp_path / 'out')]) == 2
+    assert what in capsys.readouterr().err
+    assert not (tmp_path / 'out' / 'fleet.html').exists()

@@ -1,0 +1,186 @@
+"""Reading by columns against reading message by message: the same bytes, or the same words."""
+
+import random
+import shutil
+import sqlite3
+
+import cases
+from lz4 import frame
+import mutations
+import numpy as np
+import pytest
+import ros_bags
+from ros_bags import T0
+import ros_messages as make
+
+from odocal_ros.bagio import chunks, mcap_gather
+from odocal_ros.bagio.channels import Channel
+from odocal_ros.bagio.mcap_file import McapFile
+from odocal_ros.bagio.read import open_bag
+from odocal_ros.bagio.sqlite_file import SqliteFile
+from odocal_ros.errors import OdocalError
+
+MUTATED = 60       # bags in each run
+
+
+def told(path):
+    """Return what a bag gives: each topic's times and messages, notes, or what is wrong."""
+    found = {}
+    try:
+        with open_bag(path) as bag:
+            for batch in bag._batches(bag.topics):
+                for topic, (times, raws) in batch.items():
+                    found.setdefault(topic, []).extend(zip(times.tolist(), raws, strict=True))
+            return bag.topics, found, bag.notes, bag.start_ns, bag.end_ns
+    except OdocalError as error:
+        return found, str(error)
+
+
+def both(path, monkeypatch):
+    """Return what it gives by columns, and one by one."""
+    by_columns = told(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(McapFile, 'batches', lambda *_: None)
+        patch.setattr(SqliteFile, '_indexed', lambda *_: False)
+        return by_columns, told(path)
+
+
+@pytest.fixture(scope='module')
+def clean(tmp_path_factory):
+    return cases.bases(tmp_path_factory.mktemp('clean'))
+
+
+@pytest.fixture
+def walked(monkeypatch):
+    """Count the chunks that had to be walked over."""
+    count = []
+    given = McapFile._walked
+    monkeypatch.setattr(McapFile, '_walked', lambda *args: count.append(1) or given(*args))
+    return count
+
+
+def test_recorded_bags(data_dir, monkeypatch):
+    bags = {p.parent if p.parent.name not in ('reader_bags',) else p
+            for kind in ('mcap', 'db3') for p in data_dir.rglob(f'*.{kind}')}
+    assert len(bags) > 10
+    for path in sorted(bags):
+        by_columns, one_by_one = both(path, monkeypatch)
+        assert by_columns == one_by_one, path
+
+
+@pytest.mark.parametrize('name', cases.BASES)
+def test_simulated_bags(clean, monkeypatch, name):
+    by_columns, one_by_one = both(clean.bag(name), monkeypatch)
+    assert by_columns == one_by_one
+    assert sum(map(len, by_columns[1].values())) > 2000
+
+
+@pytest.mark.parametrize('form', ['zstd', 'lz4', ''])
+@pytest.mark.parametrize('lengths', [1, 7])
+def test_chunks_that_overlap(tmp_path, monkeypatch, walked, form, lengths):
+    """Messages of equal times stand as in the file, those of other chunks behind them."""
+    monkeypatch.setattr(mcap_gather, 'BLOCK', 4000)
+    if form != 'zstd':
+        monkeypatch.setattr(chunks, '_packed', lambda records: (
+            form, frame.compress(records) if form else records))
+    rng = np.random.default_rng(1)
+    channels = {k: Channel(f'/t{k}', 'std_msgs/msg/String') for k in (3, 9, 500)}
+    packed, sent = [], {}
+    for k in range(60):
+        key = (3, 9, 500)[k % 3]
+        times = (T0 + 100 * k + rng.integers(0, 400, 30)).tolist()     # not in order either
+        raws = [b'\0\1\0\0' + rng.bytes(int(n)) for n in rng.integers(9, 9 + lengths, 30)]
+        packed.append(chunks.pack(key, times, raws))
+        sent.setdefault(f'/t{key}', []).append((min(times), list(zip(times, raws, strict=True))))
+    chunks.write_file(tmp_path / 'bag.mcap', channels, packed)
+    (_, found, *_), one_by_one = both(tmp_path / 'bag.mcap', monkeypatch)
+    assert found == one_by_one[1]
+    for topic, parts in sent.items():
+        in_turn = [row for _, some in sorted(parts, key=lambda part: part[0]) for row in some]
+        assert found[topic] == sorted(in_turn, key=lambda row: row[0])
+
+
+def test_sound_chunks_are_not_walked_over(clean, walked):
+    """All but the first, which holds the channels; else every chunk would be, and nobody saw."""
+    with open_bag(clean.bag('mcap')) as bag:
+        messages = sum(len(raws) for batch in bag._batches(bag.topics)
+                       for _, raws in batch.values())
+    assert messages > 2000
+    assert len(walked) <= 1
+
+
+def test_sound_pages_are_read_without_sql(clean, monkeypatch):
+    one_by_one = []
+    monkeypatch.setattr(SqliteFile, 'messages', lambda *_: one_by_one.append(1) or iter(()))
+    assert sum(map(len, told(clean.bag('sqlite3'))[1].values())) > 2000
+    assert not one_by_one
+
+
+@pytest.mark.parametrize('large', [False, True])
+@pytest.mark.parametrize('page', [512, 65536])
+def test_rows_of_any_size_and_order(tmp_path, monkeypatch, large, page):
+    """Written out of order, removed and written again; those beyond a page too."""
+    rng = np.random.default_rng(5)
+    rows = [('/t', T0 + int(rng.integers(0, 50)), b'\0\1\0\0' + rng.bytes(int(n)))
+            for n in rng.integers(0, 60_000 if large else 400, 700)]
+    path = ros_bags.write(tmp_path / 'bag', rows, 'sqlite3', types={'/t': 'std_msgs/msg/String'})
+    db = sqlite3.connect(path / 'bag.db3')
+    db.execute('DELETE FROM messages WHERE id % 7 = 0')
+    db.commit()
+    db.execute(f'PRAGMA page_size = {page}')
+    db.execute('VACUUM')
+    db.execute('DELETE FROM messages WHERE id % 11 = 0')
+    db.execute('UPDATE messages SET timestamp = 5 WHERE id % 13 = 0')
+    db.commit()
+    wanted = db.execute('SELECT timestamp, data FROM messages ORDER BY timestamp, id').fetchall()
+    db.close()
+    by_columns, one_by_one = both(path, monkeypatch)
+    assert by_columns == one_by_one
+    assert by_columns[1]['/t'] == wanted
+
+
+@pytest.mark.parametrize('another', [True, False], ids=['of another', 'of none'])
+def test_a_message_index_that_lies(tmp_path, monkeypatch, walked, another):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(60.0))
+    file = path / 'bag.mcap'
+    data = bytearray(file.read_bytes())
+    records, at = [], 8
+    while data[at] != 2:
+        size = int.from_bytes(data[at + 1:at + 9], 'little')
+        records.append((data[at], at))
+        at += 9 + size
+    rng = np.random.default_rng(3)
+    for op, at in records:
+        if op == 7:                     # a message index: a wrong place, among right ones
+            place = at + 15 + 16 * int(rng.integers(1, 20)) + 8
+            data[place:place + 8] = (data[place - 16:place - 8] if another else
+                                     int(rng.integers(0, 2**20)).to_bytes(8, 'little'))
+    file.write_bytes(data)
+    by_columns, one_by_one = both(path, monkeypatch)
+    assert by_columns == one_by_one
+    assert walked
+    assert by_columns[2] == ()          # nothing is lost by it
+
+
+def test_mutated_bags(clean, tmp_path, monkeypatch):
+    rng = random.Random(20261123)
+    read = 0
+    for number in range(MUTATED):
+        name = rng.choice(['mcap', 'zstd', 'messages', 'sqlite3', 'angle', 'journal'])
+        bag = tmp_path / 'bag'
+        shutil.copytree(clean.bag(name), bag)
+        change = rng.choice(mutations.OF.get(name) or mutations.OF[cases.BASES[name][0]])
+        change(rng, bag)
+        by_columns, one_by_one = both(bag, monkeypatch)
+        assert by_columns == one_by_one, (number, name, change.__name__)
+        read += len(by_columns) > 2
+        shutil.rmtree(bag)
+    assert read > MUTATED / 3
+
+
+def test_types_of_many_layouts_come_as_they_lie(tmp_path, monkeypatch):
+    rows = [('/odometer', T0 + i, make.joints(T0 + i, ['a' * (1 + i % 5)], [float(i)]))
+            for i in range(300)]
+    path = ros_bags.write(tmp_path / 'bag', rows)
+    by_columns, one_by_one = both(path, monkeypatch)
+    assert by_columns == one_by_one

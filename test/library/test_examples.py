@@ -1,0 +1,130 @@
+"""The examples run as they stand, and what they print is true."""
+
+import json
+import os
+from pathlib import Path
+import re
+import runpy
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+
+from odocal_ros.bagio import encode
+from odocal_ros.bagio.write import write_bag
+
+EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
+NUMBER = r'([\d.]+)'
+
+
+def run(name, monkeypatch, folder, *argv):
+    """Run a script in a folder, as a person would."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, 'argv', [name, *map(str, argv)])
+    runpy.run_path(str(EXAMPLES / name), run_name='__main__')
+
+
+def test_each_example_is_run_here():
+    text = Path(__file__).read_text()
+    for path in EXAMPLES.iterdir():
+        assert f"'{path.name}'" in text, path.name
+        assert path.suffix == '.ipynb' or len(path.read_text().splitlines()) < 36
+
+
+def test_calibrate_a_bag(town, tmp_path, monkeypatch, capsys):
+    drive, bag = town
+    run('calibrate_a_bag.py', monkeypatch, tmp_path, bag)
+    out = capsys.readouterr().out
+    scale, sigma = map(float, re.search(rf'scale factor {NUMBER} \+- {NUMBER}', out).groups())
+    assert abs(scale - drive.truth.scale) < 4 * sigma
+    assert (tmp_path / 'result' / 'calibration.json').exists()
+
+
+def test_plan_a_drive(tmp_path, monkeypatch, capsys):
+    run('plan_a_drive.py', monkeypatch, tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    plain, rtk = (float(re.search(rf'scale {NUMBER} ppm', line).group(1)) for line in (
+        lines[2], lines[3]))
+    assert rtk < plain / 3
+    assert lines[0].startswith('0 turns')
+
+
+def test_add_message_type(town, tmp_path, monkeypatch, capsys):
+    """The true speed, claimed 5 % too small: its scale is 1.05."""
+    drive, _ = town
+    bag = write_bag(tmp_path / 'sensors', [encode.imu('/imu/data', drive.imu),
+                                           encode.fix('/fix', drive.fix)], 'sqlite3')
+    types = get_typestore(Stores.ROS2_JAZZY).types
+    stamps = drive.odometer.stamp_ns
+    speed = drive.motion.at((stamps - drive.options.start_ns) * 1e-9).speed / 1.05
+    ours = tmp_path / 'speed'
+    put(ours, types, stamps, speed)
+    merged = tmp_path / 'merged'
+    merged.mkdir()
+    for path in (*bag.glob('*.db3'), *ours.glob('*.db3')):
+        path.rename(merged / path.name)
+    run('add_message_type.py', monkeypatch, tmp_path, merged)
+    scale, sigma = map(float, re.search(
+        rf'claimed {NUMBER} \+- ([\d.e-]+)', capsys.readouterr().out).groups())
+    assert abs(scale - 1.05) < 4 * sigma < 0.02
+
+
+def put(folder, types, stamps, speed):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    name = 'geometry_msgs/msg/Vector3Stamped'
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        topic = writer.add_connection('/wheel_speed', name, typestore=store)
+        for stamp, v in zip(stamps.tolist(), speed.tolist(), strict=True):
+            when = types['builtin_interfaces/msg/Time'](stamp // 10**9, stamp % 10**9)
+            header = types['std_msgs/msg/Header'](when, 'base_link')
+            vector = types['geometry_msgs/msg/Vector3'](v, 0.0, 0.0)
+            writer.write(topic, stamp, store.serialize_cdr(types[name](header, vector), name))
+
+
+def test_custom_report(town, tmp_path, monkeypatch):
+    from matplotlib.image import imread
+    run('custom_report.py', monkeypatch, tmp_path, town[1], 'report.png')
+    picture = imread(tmp_path / 'report.png')
+    assert picture.shape[:2] == (1000, 800)
+    assert 0.01 < np.mean(picture[..., :3].min(axis=-1) < 0.9) < 0.6
+
+
+def test_the_notebook_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('MPLBACKEND', 'agg')
+    cells = json.loads((EXAMPLES / 'first_look.ipynb').read_text())['cells']
+    names: dict = {}
+    for cell in cells:
+        if cell['cell_type'] == 'code':
+            exec(compile(''.join(cell['source']), 'first_look.ipynb', 'exec'), names)   # noqa: S102
+    assert all(abs(off) < 4 for off in names['off'].values())
+    assert {'trajectory.tum', 'track.kml', 'states.csv', 'result'} <= {
+        p.name for p in tmp_path.iterdir()}
+    assert 'ACCEPTED' in capsys.readouterr().out
+
+
+def test_live_result(tmp_path):
+    rclpy = pytest.importorskip('rclpy', reason='no rclpy here: pip install odocal_ros[ros]')
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import Float64
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node('calibrator', context=context)
+    for name, value in (('scale_factor', 0.0213), ('scale_factor_sigma', 2e-6)):
+        node.create_publisher(Float64, f'/calibrator/{name}', latched).publish(Float64(data=value))
+    listener = subprocess.Popen([sys.executable, EXAMPLES / 'live_result.py'], text=True,
+                                stdout=subprocess.PIPE, cwd=tmp_path, env=os.environ)
+    watchdog = threading.Timer(60.0, listener.kill)     # for a machine where nothing is heard
+    watchdog.start()
+    try:
+        assert listener.stdout.readline() == 'scale factor 0.0213 +- 2e-06\n'
+    finally:
+        watchdog.cancel()
+        listener.kill()
+        listener.communicate()
+        rclpy.shutdown(context=context)

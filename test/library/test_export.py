@@ -1,0 +1,109 @@
+"""Each exported file as its own program reads it, or by the rule of its format."""
+
+import csv
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from odocal_ros import OdocalError
+from odocal_ros.library.export import KNOWN
+from odocal_ros.offline.cli import main
+
+
+@pytest.fixture(scope='module')
+def exported(calibration, tmp_path_factory):
+    """Write all that need nothing beyond the package itself."""
+    folder = tmp_path_factory.mktemp('exported')
+    calibration.export(*(folder / name for name in KNOWN if not name.endswith('.parquet')))
+    return folder
+
+
+def test_tum_is_what_evo_reads(calibration, exported):
+    """evo: eight entries a row by single spaces, seconds first, a quaternion x y z w last."""
+    found = calibration.trajectory()
+    text = (exported / 'trajectory.tum').read_text()
+    lines = [line for line in text.splitlines() if not line.startswith('#')]
+    assert all(len(line.split(' ')) == 8 for line in lines)
+    rows = np.array([line.split(' ') for line in lines], float)
+    np.testing.assert_allclose(rows[:, 1], found['east_m'], rtol=1e-8)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, rtol=1e-7)
+    stamps = [int(s.replace('.', '')) for s in re.findall(r'^(\d+\.\d{9}) ', text, re.MULTILINE)]
+    assert stamps == found['stamp_ns'].tolist()
+
+
+def test_evo_itself_reads_it(calibration, exported):
+    files = pytest.importorskip('evo.tools.file_interface', reason='no evo here: pip install evo')
+    found = files.read_tum_trajectory_file(str(exported / 'trajectory.tum'))
+    whole, details = found.check()
+    assert whole, details
+    pose = calibration.trajectory()
+    steps = np.diff([pose['east_m'], pose['north_m'], pose['up_m']], axis=1)
+    assert found.path_length == pytest.approx(np.linalg.norm(steps, axis=0).sum(), rel=1e-6)
+
+
+@pytest.mark.parametrize('name', ['trajectory', 'states', 'residuals'])
+def test_csv_holds_every_digit(calibration, exported, name):
+    with (exported / f'{name}.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    for column, values in getattr(calibration, name)().items():
+        np.testing.assert_array_equal(np.array([float(row[column]) for row in rows]), values)
+
+
+def test_parquet_holds_every_digit(calibration, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet', reason='pip install pandas pyarrow')
+    calibration.export(tmp_path / 'residuals.parquet')
+    table = parquet.read_table(tmp_path / 'residuals.parquet')
+    for column, values in calibration.residuals().items():
+        np.testing.assert_array_equal(table[column].to_numpy(), values)
+
+
+def test_kml_is_a_line_of_the_track(calibration, exported):
+    """OGC 07-147r2: longitude, latitude in degrees, height in m; triples by spaces."""
+    root = ElementTree.parse(exported / 'track.kml').getroot()
+    space = {'k': 'http://www.opengis.net/kml/2.2'}
+    assert root.tag == f'{{{space["k"]}}}kml'
+    line, = root.findall('k:Document/k:Placemark/k:LineString/k:coordinates', space)
+    triples = np.array([triple.split(',') for triple in line.text.split()], float)
+    pose = calibration.trajectory()
+    np.testing.assert_allclose(triples, np.stack(
+        [pose[c] for c in ('longitude_deg', 'latitude_deg', 'height_m')], -1), atol=6e-4)
+    np.testing.assert_allclose(triples[:, 1], pose['latitude_deg'], atol=6e-9)
+
+
+def test_mcap_is_a_bag(calibration, exported):
+    with AnyReader([exported / 'debug.mcap']) as bag:
+        found = {}
+        for connection, stamp, raw in bag.messages():
+            found.setdefault(connection.topic, []).append(
+                (stamp, bag.deserialize(raw, connection.msgtype)))
+    pose, bias, left = calibration.trajectory(), calibration.states(), calibration.residuals()
+    stamps, fixes = zip(*found['/odocal/track'], strict=True)
+    assert list(stamps) == pose['stamp_ns'].tolist()
+    np.testing.assert_allclose([m.latitude for m in fixes], pose['latitude_deg'], rtol=1e-14)
+    rates = [m.angular_velocity.z for _, m in found['/odocal/biases']]
+    np.testing.assert_array_equal(rates, bias['gyro_bias_z'])
+    residuals = [m for _, m in found['/odocal/residuals']]
+    assert list(residuals[0].name) == ['along', 'across']
+    np.testing.assert_array_equal([m.position[1] for m in residuals], left['across_m'])
+
+
+def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
+    out = tmp_path / 'out'
+    argv = ['replay', str(town[1]), '--method', 'two_point', '--leg', '0:', '--output', str(out)]
+    assert main([*argv, '--export', 'residual.csv']) == 2
+    assert 'there are trajectory.tum, track.kml' in capsys.readouterr().err
+    assert not out.exists()
+    assert main([*argv, '--export', 'residuals.csv, trajectory.csv']) == 2
+    assert 'no leg has a fit of the smoother' in capsys.readouterr().err
+    assert (out / 'calibration.json').exists()
+    assert (out / 'residuals.csv').exists()
+
+
+def test_without_pyarrow_the_line_that_installs_it_is_said(calibration, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__('sys').modules, 'pyarrow', None)
+    with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
+        calibration.export(tmp_path / 'residuals.parquet')
+    assert not list(tmp_path.iterdir())

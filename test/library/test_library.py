@@ -1,0 +1,193 @@
+"""The library on a simulated drive: against its truth, and against what the commands print."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from odocal_ros import (
+    calibrate_bag,
+    Calibration,
+    compare,
+    Config,
+    OdocalError,
+    plan,
+    read_bag,
+    simulate,
+)
+from odocal_ros.library.asked import config_of
+from odocal_ros.nav.rotations import matrix_from_quat, rpy_from_matrix
+from odocal_ros.offline.cli import main
+from odocal_ros.settings.config import with_settings
+from odocal_ros.sim.motion import attitude
+
+
+def without_time(content):
+    return {key: value for key, value in content.items() if key != 'created'}
+
+
+def printed(capsys, *argv):
+    assert main([*map(str, argv), '--json']) in (0, 1)
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_command_gives_what_the_function_gives(town, calibration, tmp_path, capsys):
+    bag = town[1]
+    told = printed(capsys, 'replay', bag, '--config', bag.parent / 'calibrator.yaml', '--output',
+                   tmp_path / 'out')
+    assert without_time(told) == json.loads(json.dumps(without_time(calibration.to_dict())))
+    calibration.save(tmp_path / 'saved')
+    saved, out = ({p.name for p in (tmp_path / name).iterdir()} for name in ('saved', 'out'))
+    assert saved == out
+
+
+def test_values_are_those_of_the_drive(town, calibration):
+    truth = town[0].truth
+    for name, true in (('scale_factor', truth.scale), ('yaw_mounting_angle', truth.yaw),
+                       ('pitch_mounting_angle', truth.pitch)):
+        assert abs(calibration.values[name] - true) < 4 * calibration.sigmas[name], name
+    assert calibration.verdict.value == 'accepted'
+    assert 'PARAMETER_NOT_DETERMINED' in {reason.code.name for reason in calibration.reasons}
+    assert str(calibration).startswith('ACCEPTED')
+
+
+def test_the_trajectory_is_the_motion(town, calibration):
+    """A smoothed track errs by less than its fixes of 1.5 m."""
+    drive, found = town[0], calibration.trajectory()
+    state = drive.motion.at((found['stamp_ns'] - drive.options.start_ns) * 1e-9)
+    metres = 6.37e6 * np.hypot(np.deg2rad(found['latitude_deg']) - state.latitude, np.cos(
+        state.latitude) * (np.deg2rad(found['longitude_deg']) - state.longitude))
+    assert metres.max() < 1.5
+    C_nv = matrix_from_quat(np.stack([found[q] for q in ('qx', 'qy', 'qz', 'qw')], -1))
+    off = rpy_from_matrix(np.swapaxes(attitude(state), 1, 2) @ C_nv)
+    assert np.rad2deg(np.abs(off)).max() < 0.5
+    whole = (drive.truth.stop_ns - drive.truth.start_ns) * 1e-9
+    assert len(found['t_s']) == pytest.approx(whole, rel=0.1)
+    assert set(found['leg']) == {1}
+
+
+def test_biases_are_those_of_the_drive(town, calibration):
+    found = calibration.states()
+    for i, axis in enumerate('xyz'):
+        sigma = calibration.sigmas[f'gyro_bias_{axis}']
+        first = found[f'gyro_bias_{axis}'][0]
+        assert abs(first - town[0].truth.gyro_bias[i]) < 5 * sigma, axis
+        assert first == calibration.values[f'gyro_bias_{axis}']
+    assert np.abs(found['roll']).max() < np.deg2rad(1.0)      # the road is level
+
+
+def test_residuals_are_those_of_the_check(calibration):
+    found, check = calibration.residuals(), calibration.to_dict()['check']
+    for name, prefix in (('after', ''), ('before', 'before_')):
+        off = np.hypot(found[f'{prefix}along_m'], found[f'{prefix}across_m'])
+        assert np.sqrt((off**2).mean()) == pytest.approx(check[name]['rms'], rel=0.02)
+    assert len(found['along_m']) == calibration.result.legs[0].evidence.fixes
+
+
+def test_a_table_has_a_row_for_each_value(calibration):
+    pytest.importorskip('pandas', reason='no pandas here: pip install pandas pyarrow')
+    table = calibration.to_frame()
+    assert table['value'].dropna().to_dict() == {
+        name: value for name, value in calibration.values.items() if value is not None}
+    assert table.loc['scale_factor', 'unit'] == 'm/pulse'
+
+
+def test_without_pandas_the_line_that_installs_it_is_said(calibration, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
+        calibration.to_frame()
+
+
+def test_figures_draw_the_leg(calibration):
+    from matplotlib.figure import Figure
+    ax, lower = Figure().subplots(2)
+    assert calibration.plot_track(ax) is ax
+    lines = {line.get_label(): line.get_xydata() for line in ax.get_lines()}
+    track = calibration.result.legs[0].evidence.track_n
+    for end in (0, -1):      # in metres from the start
+        np.testing.assert_allclose(lines['as calibrated'][end], (track[end] - track[0])[:2])
+    calibration.plot_residuals(lower)
+    drawn = next(line for line in lower.get_lines() if line.get_label() == 'across')
+    assert np.abs(drawn.get_ydata()).max() == np.abs(calibration.residuals()['across_m']).max()
+    with pytest.raises(OdocalError, match='legs 1 to 1'):
+        calibration.plot_track(ax, leg=2)
+
+
+def test_a_result_without_a_track_says_so(calibration):
+    from dataclasses import replace
+    empty = Calibration(replace(calibration.result, legs=()))
+    for series in (empty.trajectory, empty.states, empty.residuals):
+        with pytest.raises(OdocalError, match='no leg has'):
+            series()
+
+
+def test_samples_of_a_bag_are_those_sent(town):
+    drive, bag = town
+    found = read_bag(bag)
+    np.testing.assert_array_equal(found.samples('imu').w_i, drive.imu.w_i)
+    np.testing.assert_array_equal(found.samples('odometer').value, drive.odometer.value)
+    assert found.topics == {'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'}
+    leg, = found.legs((100.0, 160.0))
+    assert leg.stop_ns - leg.start_ns == 60 * 10**9
+    assert found.spans([]) == [(found.legs()[0].start_ns, found.legs()[0].stop_ns)]
+
+
+def test_settings_may_come_in_any_form(town):
+    path = town[1].parent / 'calibrator.yaml'
+    names = {'imu.grade': 'tactical', 'leg.standstill': 3.0}
+    assert config_of(names) == with_settings(Config(), names) == config_of(config_of(names))
+    assert config_of(path).odometer.nominal_scale == town[0].options.nominal_scale
+    assert config_of(names, {'leg.standstill': 5.0, 'leg.preroll': 7.0}).leg.preroll == 7.0
+    assert config_of(names, {'leg.standstill': 5.0}).leg.standstill == 3.0
+    with pytest.raises(OdocalError, match='leg.standstill'):
+        config_of({'leg.standstil': 3.0})
+
+
+@pytest.mark.parametrize(('legs', 'seconds'), [
+    ('10:70', [60]), (['10:70', '80:90'], [60, 10]), ((10, 70), [60]), ([(10, 70.5)], [60.5])])
+def test_legs_may_come_in_any_form(town, legs, seconds):
+    from odocal_ros.library.asked import legs_of
+    found = [(leg.stop_ns - leg.start_ns) * 1e-9 for leg in legs_of(legs)]
+    assert found == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize('legs', [[5.0], [(1, 2, 3)], '70:10', ['a:b']])
+def test_legs_that_are_none_are_refused(town, legs):
+    with pytest.raises(OdocalError, match='leg'):
+        calibrate_bag(town[1], legs=legs)
+
+
+def test_what_is_said_on_the_way_is_kept(town):
+    bag = town[1]
+    found = calibrate_bag([bag, bag], config={'method': 'two_point'}, legs='0:')
+    assert found.notes == (f'{bag} is given twice: it is read once',)
+    assert len(found.result.legs) == 1
+
+
+def test_a_plan_is_what_the_command_prints(capsys):
+    told = printed(capsys, 'plan', '--distance', 500, '--speed', 10, '--turns', 2, '--imu-grade',
+                   'tactical', '--fix-sigma', 1, '--set', 'method=two_point')
+    found = plan(distance=500, speed=10, turns=2, fix=1.0, config={
+        'imu.grade': 'tactical', 'method': 'two_point'})
+    assert told == json.loads(json.dumps(found.to_dict()))
+    assert found.sigma('scale_factor') == told['estimates']['scale_factor']['sigma']
+    with pytest.raises(OdocalError, match='one drive'):
+        plan(speed=10)
+
+
+def test_a_comparison_is_what_the_command_prints(calibration, tmp_path, capsys):
+    calibration.save(tmp_path / 'a')
+    calibration.save(tmp_path / 'b')
+    told = printed(capsys, 'compare', tmp_path / 'a', tmp_path / 'b')
+    assert compare(tmp_path / 'a', tmp_path / 'b').to_dict() == told
+    same = compare(calibration, tmp_path / 'b')
+    assert same.changed is False
+    assert [change.parameter for change in same.changes][:1] == ['scale_factor']
+    assert all(entry.to_first is None or entry.to_first.change == 0
+               for change in same.changes for entry in change.entries)
+
+
+def test_an_option_that_is_none_is_told():
+    with pytest.raises(OdocalError, match='durations'):
+        simulate('town', durations=3.0)

@@ -1,0 +1,65 @@
+"""The names that other programs use: they stay, with their arguments."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import odocal_ros
+from odocal_ros.library.calibration import Calibration
+
+SIGNATURES = {
+    'calibrate_bag': '(path, topics=None, config=None, legs=None, *, holdout=False, hearer=None)',
+    'read_bag': '(path, topics=None, config=None, *, hearer=None)',
+    'simulate': "(scenario='town', out=None, *, storage='mcap', compression='none', force=False, "
+                'heading_sigma=None, progress=None, **options)',
+    'plan': '(*, distance=None, speed=None, turns=None, standstill=None, acceleration=1.0, '
+            'scenario=None, duration=None, gpx=None, bag=None, topics=None, config=None, '
+            '**figures)',
+    'compare': '(*calibrations)'}
+METHODS = {
+    'to_dict': '(self)', 'to_frame': '(self)', 'residuals': '(self)', 'trajectory': '(self)',
+    'states': '(self)', 'plot_track': '(self, ax, leg=1)',
+    'plot_residuals': '(self, ax, leg=1)', 'export': '(self, *files)'}
+DATA = {'result', 'config', 'inputs', 'notes', 'created', 'verdict', 'reasons', 'values', 'sigmas'}
+
+
+def untyped(function) -> str:
+    """Return a signature without its annotations, which may become better."""
+    found = inspect.signature(function)
+    bare = [p.replace(annotation=p.empty) for p in found.parameters.values()]
+    return str(found.replace(parameters=bare, return_annotation=found.empty))
+
+
+def test_names_and_arguments_stay():
+    assert set(odocal_ros.__all__) == {*SIGNATURES, 'Calibration', 'Comparison', 'Config',
+                                       'OdocalError', 'Planned', 'Recording'}
+    assert {name: untyped(getattr(odocal_ros, name)) for name in SIGNATURES} == SIGNATURES
+    assert {name: untyped(getattr(Calibration, name)) for name in METHODS} == METHODS
+    assert untyped(Calibration.save).startswith('(self, folder, force=False')
+    assert {*dir(Calibration), *Calibration.__dataclass_fields__} >= DATA
+    assert set(dir(odocal_ros)) >= set(odocal_ros.__all__)
+
+
+def test_each_name_has_an_example_of_its_arguments_in_its_docstring():
+    for name in SIGNATURES:
+        assert 'Raises' in getattr(odocal_ros, name).__doc__, name
+
+
+def test_no_room_takes_the_place_of_a_name():
+    """A room of a name's own name would be set in its place when it is imported."""
+    from test_border import PACKAGE
+    rooms = {p.name for p in PACKAGE.iterdir()} | {p.stem for p in PACKAGE.glob('*.py')}
+    assert not rooms & set(odocal_ros.__all__)
+
+
+def test_a_name_that_is_none_is_an_attribute_error():
+    with pytest.raises(AttributeError, match='calibrate_bags'):
+        _ = odocal_ros.calibrate_bags
+
+
+def test_the_first_page_imports_nothing():
+    probe = 'import odocal_ros, sys; print("numpy" in sys.modules, odocal_ros.Config.__name__)'
+    assert subprocess.check_output([sys.executable, '-c', probe],
+                                   text=True).split() == ['False', 'Config']

@@ -1,0 +1,96 @@
+"""Pass or fail: the rule against the normal law, its limits, and what bars a pass."""
+
+from math import erf, pi, sqrt
+
+import numpy as np
+import pytest
+from scipy.special import ndtri
+
+from odocal_ros.calib.result import Calibration, Estimate
+from odocal_ros.errors import BadConfig, BadUsage
+from odocal_ros.pipeline.acceptance import accept, decide, Decision
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.accept_option import parse_accept
+from odocal_ros.settings.config import Config, with_settings
+
+LIMITS = {'accept.scale_ratio_min': 0.995, 'accept.scale_ratio_max': 1.005}
+CAUTION = Reason(Code.SPEED_TOO_LOW, 'slow')
+
+
+def decided(value, sigma, reasons=(), name='scale_ratio', unit='1', **settings):
+    estimates = {name: Estimate(value, sigma, unit)}
+    return accept(Calibration(tuple(reasons), estimates, {}, ()),
+                  with_settings(Config(), settings or LIMITS))
+
+
+@pytest.mark.parametrize('place', [-4, -2, 0, 1, 4])
+def test_the_shares_that_pass_and_fail_are_those_of_the_normal_law(place):
+    """A result with a sigma of 500 ppm, its true value so many sigma above the upper limit."""
+    draws, sigma = 20_000, 500e-6
+    z = ndtri((np.arange(draws) + 0.5) / draws)        # the law itself: no noise of drawing
+    found = [decide(1.005 + (place + x) * sigma, sigma, 0.995, 1.005) for x in z]
+    below = (1 + erf((-place - 2) / sqrt(2))) / 2
+    # the lower limit is 20 sigma away; one draw is half of the tolerance
+    assert found.count(Decision.PASS) / draws == pytest.approx(below, abs=1e-4)
+    above = (1 + erf((place - 2) / sqrt(2))) / 2
+    assert found.count(Decision.FAIL) / draws == pytest.approx(above, abs=1e-4)
+
+
+def test_a_value_that_is_not_sure_is_open_and_says_what_sigma_would_do():
+    assert decided(1.004, 0.0004).decision is Decision.PASS
+    found = decided(1.004, 0.0006)
+    assert found.decision is Decision.UNDECIDED
+    assert found.values[0].sigma_wanted == pytest.approx(0.0005)
+    assert 'about 2 times as many' in found.why      # (6 / 5)^2 = 1.44
+    assert found.do == Code.SCALE_SIGMA_TOO_LARGE.remedy
+    assert 'beyond its limit' in decided(1.0055, 0.0003).why
+    assert decided(1.0055, 0.0002).decision is Decision.FAIL
+
+
+def test_no_limit_asks_nothing_and_one_side_may_be_open():
+    estimates = {'scale_ratio': Estimate(1.0, 0.1, '1')}
+    assert accept(Calibration((), estimates, {}, ()), Config()) is None
+    one = {'accept.scale_ratio_max': 1.005}
+    assert decided(0.5, 0.001, **one).decision is Decision.PASS
+    assert decided(1.1, 0.001, **one).decision is Decision.FAIL
+    with pytest.raises(BadConfig, match='not below'):
+        with_settings(Config(), one | {'accept.scale_ratio_min': 1.005})
+
+
+def test_an_angle_of_an_imu_that_faces_backwards_is_held_across_the_half_turn():
+    limits = {'accept.yaw_mounting_angle_min': pi - 0.02, 'accept.yaw_mounting_angle_max':
+              pi + 0.02}
+    for value in (pi - 0.01, -pi + 0.01):
+        found = decided(value, 0.001, name='yaw_mounting_angle', unit='rad', **limits)
+        assert found.decision is Decision.PASS
+    found = decided(-pi + 0.05, 0.001, name='yaw_mounting_angle', unit='rad', **limits)
+    assert found.decision is Decision.FAIL
+
+
+def test_nothing_is_decided_by_a_rejected_result_and_strict_lets_no_caution_pass():
+    rejected = decided(1.0, 1e-4, [Reason(Code.ODOMETER_STILL, 'no counts')])
+    assert rejected.decision is Decision.UNDECIDED
+    assert 'ODOMETER_STILL: no counts' in rejected.why
+    assert decided(1.0, 1e-4, [CAUTION]).decision is Decision.PASS
+    strict = LIMITS | {'accept.strict': True}
+    assert decided(1.0, 1e-4, [CAUTION], **strict).decision is Decision.UNDECIDED
+    assert decided(1.0, 1e-4, **strict).decision is Decision.PASS
+    assert decided(2.0, 1e-4, [CAUTION], **strict).decision is Decision.FAIL
+
+
+def test_a_value_that_is_not_determined_says_what_to_drive():
+    why = Reason(Code.YAW_NOT_DETERMINED, 'too little')
+    found = decided(None, None, [why], name='yaw_mounting_angle', unit='rad',
+                    **{'accept.yaw_mounting_angle_max': 0.01})
+    assert (found.decision, found.do) == (Decision.UNDECIDED, why.remedy)
+    assert 'nominal_scale' in decided(None, None).do
+
+
+def test_limits_on_the_command_line_take_degrees():
+    assert parse_accept('scale_ratio=0.995:1.005') == LIMITS
+    assert parse_accept('yaw_mounting_angle_deg=-0.5:') == {
+        'accept.yaw_mounting_angle_min': pytest.approx(-0.5 * pi / 180, rel=1e-15)}
+    for wrong in ('scale_ratio', 'scale_ratio=1', 'scale_ratio=:', 'scale_ratio=a:b',
+                  'scale_ratio_deg=1:2', 'speed=1:2'):
+        with pytest.raises(BadUsage, match='--accept'):
+            parse_accept(wrong)

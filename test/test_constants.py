@@ -1,0 +1,35 @@
+"""One name, one number: a threshold's name says of what it is, so it stands in one module."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+import odocal_ros
+
+PACKAGE = Path(odocal_ros.__file__).parent
+ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'planning', 'foresee',
+         'apply')
+# where a vector's unknowns lie: two vectors may hold the same quantity
+LAYOUTS = ('calib/smoother/state.py', 'calib/wheels/model.py', 'apply/errors.py')
+
+
+def _numbers(tree):
+    """Yield the names that a module gives to a number, or to some of them, at its top level."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and any(
+                isinstance(x, ast.Constant) and type(x.value) in (int, float)
+                for x in ast.walk(node.value)) and not isinstance(node.value, ast.Dict):
+            for target in node.targets:
+                yield from (x.id for x in ast.walk(target) if isinstance(x, ast.Name))
+
+
+def test_no_two_modules_give_one_name_to_two_numbers():
+    homes = defaultdict(list)
+    for room in ROOMS:
+        for path in (PACKAGE / room).rglob('*.py'):
+            where = path.relative_to(PACKAGE).as_posix()
+            if where not in LAYOUTS:
+                for name in _numbers(ast.parse(path.read_text(encoding='utf-8'))):
+                    homes[name].append(where)
+    assert len(homes) > 300
+    assert {name: where for name, where in homes.items() if len(where) > 1} == {}
