@@ -108,8 +108,11 @@ class Health:
         known = stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]
         steps = np.diff(known)
         at = int(np.argmin(steps)) if len(steps) else 0
-        fell = bool(len(steps)) and known[at + 1:].max() < known[at] - JUMP_NS
-        after_wild = steps[at - 1] > JUMP_NS if at else not self.newest_ns
+        after = known[at + 1:].max() if len(steps) else 0
+        fell = bool(len(steps)) and after < known[at] - JUMP_NS
+        # back to where the stamps were before one that was wild
+        after_wild = at and steps[at - 1] > JUMP_NS and after >= known[at - 1] - JUMP_NS
+        after_wild = after_wild or not (at or self.newest_ns)
         behind, self._behind = self._behind, 0
         if not fell or after_wild:
             return int(stamps[-1])

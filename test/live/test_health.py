@@ -118,6 +118,16 @@ def test_lone_wild_stamps_are_no_time_however_they_come(rows_at_once, wild):
         assert travel.still_s() == pytest.approx(3.9, abs=0.25)     # the ends may be wild
 
 
+@pytest.mark.parametrize('rows_behind', [1, 2])
+def test_a_stale_stamp_after_a_pause_is_no_time(rows_behind):
+    health = Health()
+    health.decoded(rows([1000.0, 1000.1]))
+    health.decoded(rows([1000.2, 1002.0, *[1.0] * rows_behind]))
+    assert (health.newest_ns, health.jumped_back) == (1002 * SECOND, False)
+    health.decoded(rows([1002.1, 1002.2]))
+    assert (health.newest_ns * 1e-9, health.jumped_back) == (pytest.approx(1002.2), False)
+
+
 def test_stamps_that_go_on_far_ahead_are_a_time():
     health = Health()
     health.decoded(rows([10.0, 10.1]))
