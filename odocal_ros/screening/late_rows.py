@@ -24,6 +24,8 @@ STEADY_SHARE = 0.005      # by which it is another than the median: rows are los
 EVEN_SHARE = 0.3          # share of the intervals that are within a quarter of the median
 EVEN_BESIDE = 5           # rows to either side that tell where a row should be
 FITTING_SHARE = 0.4       # of what rows are off as sent
+EVENER_SHARE = 0.9        # of it, where all rows that are not late are put on the rhythm
+LEAST_JITTER = 1e-4       # s off the rhythm that is worth it
 ROUNDING_COUNTS = 2.5     # by which a row may be off: rounding
 EVEN_TRAVEL = 1.0         # s within which travel is as good as even
 CATCHING_UP = 3.0         # times the speed beside: no wheel, so rows that catch up
@@ -83,6 +85,10 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
             true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
+    # what is left: a busy machine stamps each row some milliseconds late
+    jitters = ~late & (t - even > LEAST_JITTER)
+    if np.linalg.norm(off_even[jitters]) < EVENER_SHARE * np.linalg.norm(off_sent[jitters]):
+        true[jitters] = even[jitters]
     floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
     return np.where((true > floor) | ~late, true, np.minimum(floor, t))
 

@@ -10,7 +10,7 @@ from odocal_ros.data.samples import OdometerForm, take
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.screening import late_rows
-from odocal_ros.screening.late_rows import ROUNDING_COUNTS
+from odocal_ros.screening.late_rows import LEAST_JITTER, ROUNDING_COUNTS
 from odocal_ros.screening.screen import screen
 
 SLIP_M, SLIP_S = 0.5, 200.0
@@ -61,6 +61,30 @@ def test_late_rows_are_no_slip(made):
     a, b = (m.estimates['scale_factor'] for m in (method, straight))
     assert abs(a.value - b.value) < 0.1 * b.sigma
     assert a.sigma == pytest.approx(b.sigma, rel=0.05)
+
+
+def test_rows_that_are_all_some_milliseconds_late_are_put_on_their_rhythm(made):
+    """A busy machine stamps each row when it comes to it: at 12 m/s a millisecond is 12 mm."""
+    late_s = np.random.default_rng(3).exponential(0.0015, len(made.odometer.stamp_ns)) % 0.0039
+    late = replace(made.odometer, stamp_ns=made.odometer.stamp_ns + np.round(
+        late_s * 1e9).astype(np.int64))
+    inputs, _ = screen(replace(made.leg(), odometer=late), settings(made))
+    sent, _ = screen(made.leg(), settings(made))
+    np.testing.assert_allclose(inputs.travel.t, sent.travel.t, atol=2 * LEAST_JITTER)
+    _, said = of_smoother(made, late)
+    assert Code.WHEEL_SLIP not in said
+
+
+def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
+    """Stamps and counts agree: at no time does a row come out where its rhythm would have it."""
+    even, counts = made.odometer.stamp_ns, made.odometer.value
+    uneven = even + np.round(np.random.default_rng(4).uniform(0.0, 0.0039, len(even)) * 1e9
+                             ).astype(np.int64)
+    taken = replace(made.odometer, stamp_ns=uneven,
+                    value=np.floor(np.interp(uneven, even, counts)).astype(np.int64))
+    inputs, found = screen(replace(made.leg(), odometer=taken), settings(made))
+    np.testing.assert_allclose(inputs.travel.t, (uneven - made.leg().start_ns) * 1e-9, atol=1e-9)
+    assert not found
 
 
 def test_a_slip_between_late_rows_is_found(made):
