@@ -1,6 +1,7 @@
 """Who may import whom: the border is a folder, and this test."""
 
 import ast
+from functools import cache
 from pathlib import Path
 import subprocess
 import sys
@@ -50,14 +51,17 @@ def _part(path):
     return first.removesuffix('.py')
 
 
+@cache
 def _imports(path):
-    """Yield the full name of all that a module imports, inside functions too."""
+    """Return the full name of all that a module imports, inside functions too."""
+    names = []
     for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}: relative import'
-            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+            names += [f'{node.module}.{alias.name}' for alias in node.names]
+    return names
 
 
 def _own_parts(path):

@@ -5,7 +5,7 @@ import time
 import cases
 import pytest
 
-BUDGET = 40.0       # s of this process and its children
+BUDGET = 20.0       # s of this process and its children
 
 
 @pytest.fixture(scope='module')

@@ -196,9 +196,10 @@ def solve(normal: Normal) -> Solved:
             E = W[:, :n].T
             D = diagonal[k + 1] - E @ X[:, :n]
             wide[k + 1, :, n:] -= E @ X[:, n:]
-        lower = np.tril(dpotri(root, lower=1)[0])       # it fills one triangle
-        diagonal[k] = lower + np.tril(lower, -1).T
+        diagonal[k] = dpotri(root, lower=1)[0]
         W[:] = X
+    below = np.tril_indices(n, -1)      # dpotri fills one triangle
+    diagonal[:, below[1], below[0]] = diagonal[:, below[0], below[1]]
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
