@@ -3,8 +3,8 @@ Odometer rows that came late: a pause, then rows in a burst that catch up.
 
 A counter without a header is stamped on the way: what holds a message up (a serial line, a busy
 machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm shows
-in the rows that came soonest; the others are put on it where the counts bear that out, else where
-the travel on both sides of a burst has them.
+in the rows that came soonest; that, later by what all rows are, is where the others are put, where
+the counts bear it out; else where the travel on both sides of a burst has them.
 """
 
 import numpy as np
@@ -23,6 +23,8 @@ INTERVAL_SPAN = 5.0       # s over which the interval is taken
 STEADY_SHARE = 0.005      # by which it is another than the median: rows are lost
 EVEN_SHARE = 0.3          # share of the intervals that are within a quarter of the median
 EVEN_BESIDE = 5           # rows to either side that tell where a row should be
+LINE = (-EVEN_BESIDE, EVEN_BESIDE)
+CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])     # a line takes half the acceleration for lateness
 FITTING_SHARE = 0.4       # of what rows are off as sent
 EVENER_SHARE = 0.9        # of it, where all rows that are not late are put on the rhythm
 LEAST_JITTER = 1e-4       # s off the rhythm that is worth it
@@ -73,8 +75,9 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     ahead = int(ON_TIME_WINDOW / usual) + 1
     # those to come, not those before: a lost row sets the rhythm back
     even = rows + _least_of_next(t - rows, ahead)
+    even += np.median(t - even)         # what all have is a delay, and no lateness
     late = t - even > max(LEAST_LATE, LATE_SHARE * usual)
-    off_sent, off_even = _off(t, travel), _off(even, travel)
+    off_sent, off_even = (_off(x, travel, LINE) for x in (t, even))
     true = t.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
@@ -85,9 +88,11 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
             true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
-    # what is left: a busy machine stamps each row some milliseconds late
-    jitters = ~late & (t - even > LEAST_JITTER)
-    if np.linalg.norm(off_even[jitters]) < EVENER_SHARE * np.linalg.norm(off_sent[jitters]):
+    # what is left: each row is stamped some milliseconds off, as a busy machine comes to it
+    left = np.abs(true - even)
+    jitters = (left > LEAST_JITTER) & (left < usual)
+    off_sent, off_even = (_off(x, travel, CUBIC)[jitters] for x in (t, even))
+    if np.linalg.norm(off_even) < EVENER_SHARE * np.linalg.norm(off_sent):
         true[jitters] = even[jitters]
     floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
     return np.where((true > floor) | ~late, true, np.minimum(floor, t))
@@ -102,12 +107,19 @@ def _least_of_next(x: Floats, count: int) -> Floats:
     return np.minimum(until[:n], since[count - 1:count - 1 + n])
 
 
-def _off(t: Floats, travel: Floats) -> Floats:
-    """Return by how much each row's travel is off that of the rows some way before and after."""
-    k = np.arange(len(t))
-    before, after = np.maximum(k - EVEN_BESIDE, 0), np.minimum(k + EVEN_BESIDE, len(t) - 1)
-    share = (t - t[before]) / np.maximum(t[after] - t[before], 1e-9)
-    return travel - travel[before] - share * (travel[after] - travel[before])
+def _off(t: Floats, travel: Floats, beside: tuple[int, ...]) -> Floats:
+    """Return by how much each row's travel is off the polynomial through rows so far beside it."""
+    k, last = np.arange(len(t)), len(t) - 1
+    nodes = [np.clip(k + step, 0, last) for step in beside]
+    meant = np.zeros(len(t))
+    for at in nodes:
+        weight = np.ones(len(t))
+        for other in nodes:
+            if other is not at:
+                weight *= (t - t[other]) / np.where(at == other, 1.0, t[at] - t[other])
+        meant += weight * (travel[at] - travel)
+    whole = (k + min(beside) >= 0) & (k + max(beside) <= last)
+    return np.where(whole, -meant, 0.0)
 
 
 def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Floats:

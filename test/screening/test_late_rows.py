@@ -70,7 +70,8 @@ def test_rows_that_are_all_some_milliseconds_late_are_put_on_their_rhythm(made):
         late_s * 1e9).astype(np.int64))
     inputs, _ = screen(replace(made.leg(), odometer=late), settings(made))
     sent, _ = screen(made.leg(), settings(made))
-    np.testing.assert_allclose(inputs.travel.t, sent.travel.t, atol=2 * LEAST_JITTER)
+    later = inputs.travel.t - sent.travel.t
+    np.testing.assert_allclose(later, np.median(later), atol=2 * LEAST_JITTER)
     _, said = of_smoother(made, late)
     assert Code.WHEEL_SLIP not in said
 
