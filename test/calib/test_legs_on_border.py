@@ -286,7 +286,6 @@ def test_legs_of_the_smoother_add_up_their_information(legs):
     used = weighed_together([r.border for r in results], np.zeros(2))[0].used
     widest = np.max([r.border.used for r in results], axis=0)
     assert (used < 0.5 * widest).any()       # what one leg alone could not tell from none
-    assert (used <= 1.02 * widest).all()
     C = np.linalg.inv(sum(r.border.information for r in results) + np.diag(1 / used**2))
     sigma = np.hypot(np.sqrt(np.diag(C))[:3], MODEL_FLOOR)
     assert whole.estimates[SCALE].sigma / truth.scale == pytest.approx(sigma[0], rel=1e-3)

@@ -8,7 +8,9 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL, M
+from odocal_ros.calib.smoother.state import ACCEL, M, TYRES
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.real_wheels import G
 
 
 @pytest.fixture(scope='module')
@@ -29,6 +31,27 @@ def test_the_truth_fulfils_the_equations(perfect):
     # the odometer's rounding: two ends of up to one count of 2 cm, less their mean
     assert r[:, 15:18].max() < 0.022
     assert np.abs(parts['fixes'].raw).max() < 5e-4
+
+
+def test_a_turn_is_no_braking():
+    """Tyres that slip by 0.8 % for each m/s^2 of pull, half of it braking: a turn is none."""
+    stiff = 0.04
+    drive, config, leg = made(
+        imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3, nominal_scale=1e-3,
+        real=Real(tyre_slip=stiff, driven=True))
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    c = state.constants.copy()
+    c[TYRES][2:] = 2 * stiff / G, stiff / G
+    state = replace(state, constants=c)
+    along = Equations(problem, state, problem.sums(state)).parts['motion'].raw[:, 15]
+    speed = np.linalg.norm(state.v_n, axis=1)
+    even = (np.abs(np.diff(speed)) < 1e-3) & (speed[1:] > 5.0)
+    turned = np.abs(problem.imu.turned()[:, 2])
+    share = along / np.maximum(speed[1:], 1.0)
+    turns, straight = share[even & (turned > 0.1)], share[even & (turned < 1e-3)]
+    assert len(turns) > 3 < len(straight)
+    # the air's resistance at other speeds: 2e-5 of it; taken for braking, turns were 1e-3 off
+    assert np.abs(turns - np.median(straight)).max() < 1e-4
 
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):

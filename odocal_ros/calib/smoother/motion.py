@@ -67,17 +67,33 @@ def gravity_n(position_n, origin):
 
 
 def accelerations(state):
-    """Return what springs and tyres answer to in each interval, vehicle axes: (K, 3) m/s^2."""
+    """Return what springs and sideslip answer to in each interval, vehicle axes: (K, 3) m/s^2."""
     T = np.diff(state.t)[:, None]
-    accel_v = turn(np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2), np.diff(state.v_n, axis=0) / T)
+    # by the axes at mid interval: those at its begin would take the push of a turn for braking
+    C_vn = np.swapaxes(state.C_nb @ state.C_bv, 1, 2)
+    accel_v = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(state.v_n, axis=0) / T)
     if len(T) > 1:       # a body answers to what accelerates it a moment later
         accel_v -= SPRUNG * np.gradient(accel_v, axis=0) / T
     return accel_v
 
 
-def varies_with(speed, t, accel):
+def forward_speed(state):
+    """Return the speed along the vehicle at each keyframe: (N,) m/s."""
+    return np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
+
+
+def speeding_up(state):
+    """
+    Return by how much the way is driven faster, what tyres pull for, in each interval: (K,) m/s^2.
+
+    Of speeds, since a vehicle that slides in a turn has part of its push ahead.
+    """
+    return np.diff(np.abs(forward_speed(state))) / np.diff(state.t)
+
+
+def varies_with(speed, t, faster):
     """Return what the scale varies with, as TYRES has it: (..., 4)."""
-    force = accel + RESISTANCE + AIR * speed**2
+    force = faster + RESISTANCE + AIR * speed**2
     return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
                      np.minimum(force, 0.0)], -1)
 
@@ -86,7 +102,7 @@ def means_by_way(sums, state):
     """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""
     way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
     t = (state.t[1:] + state.t[:-1]) / 2
-    return way @ varies_with(way / sums.T, t, accelerations(state)[:, 0]) / max(way.sum(), 1e-9)
+    return way @ varies_with(way / sums.T, t, speeding_up(state)) / max(way.sum(), 1e-9)
 
 
 class Motion:
@@ -156,7 +172,7 @@ class Motion:
         self.accel_v = accelerations(state)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
-        self.from_mean = varies_with(speed, t, self.accel_v[:, 0]) - means_by_way(self.sums, state)
+        self.from_mean = varies_with(speed, t, speeding_up(state)) - means_by_way(self.sums, state)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         self.leaned = state.scale * (
             np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
@@ -173,8 +189,7 @@ class Motion:
     def _faster(self):
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
         state = self.state
-        speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward) / state.scale
-        return (self.f_n + self.f_n_end) / 2 * np.diff(speed)[:, None]
+        return (self.f_n + self.f_n_end) / 2 * np.diff(forward_speed(state) / state.scale)[:, None]
 
     def jacobians(self, n):
         """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""

@@ -7,7 +7,7 @@ a cell, for as long as the value stands.
 
 import numpy as np
 
-from odocal_ros.calib.smoother.motion import accelerations, gravity_n, means_by_way, varies_with
+from odocal_ros.calib.smoother.motion import gravity_n, means_by_way, speeding_up, varies_with
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -59,7 +59,7 @@ class SpeedSteps(PointRows):
             'ki,ki->k', np.cross(points.rate, state.forward), self.v_b)
         c = state.constants
         self.from_mean = varies_with(
-            self.speed, state.t[self.k] + points.tau, accelerations(state)[self.k, 0]
+            self.speed, state.t[self.k] + points.tau, speeding_up(state)[self.k]
         ) - means_by_way(here.intervals, state)
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.told.value + self.told.side * c[SPEED_OFFSET]
