@@ -116,7 +116,8 @@ def _off(t: Floats, travel: Floats, beside: tuple[int, ...]) -> Floats:
         weight = np.ones(len(t))
         for other in nodes:
             if other is not at:
-                weight *= (t - t[other]) / np.where(at == other, 1.0, t[at] - t[other])
+                apart = t[at] - t[other]        # none of rows that came at once, or at an end
+                weight *= (t - t[other]) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
         meant += weight * (travel[at] - travel)
     whole = (k + min(beside) >= 0) & (k + max(beside) <= last)
     return np.where(whole, -meant, 0.0)

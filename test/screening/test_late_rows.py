@@ -88,6 +88,23 @@ def test_rows_that_are_taken_at_uneven_times_stay_where_they_are(made):
     assert not found
 
 
+@pytest.mark.filterwarnings('error')
+def test_rows_that_come_at_once_are_spread(made):
+    """A queue that is emptied within a tick of the clock: twenty rows of one stamp."""
+    t = (made.odometer.stamp_ns - made.odometer.stamp_ns[0]) * 1e-9
+    held = t % 15.0 < 0.4
+    wait_s = np.where(held, 0.4 - t % 15.0, 0.0)
+    stamps = made.odometer.stamp_ns + np.round(wait_s * 1e9).astype(np.int64)
+    late = replace(made.odometer, stamp_ns=stamps)
+    usual = late_rows.interval((stamps - stamps[0]) * 1e-9)
+    assert usual == pytest.approx(0.02, rel=1e-6)
+    true = late_rows.on_time(late, (stamps - stamps[0]) * 1e-9, made.leg().form, [])
+    # where it stands nothing tells, and nothing matters
+    speed = np.abs(np.gradient(made.odometer.value.astype(float), t)) * made.truth.scale
+    off = true - t + (stamps[0] - made.odometer.stamp_ns[0]) * 1e-9
+    assert np.abs(off)[held & (speed > 2.0)].max() < 0.003
+
+
 def test_a_slip_between_late_rows_is_found(made):
     late, _ = held_up(spun(made, made.odometer))
     method, said = of_smoother(made, late)
