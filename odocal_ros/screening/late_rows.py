@@ -7,6 +7,8 @@ in the rows that came soonest; that, later by what all rows are, is where the ot
 the counts bear it out; else where the travel on both sides of a burst has them.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
@@ -28,6 +30,7 @@ CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])     # a line takes half the accelerati
 FITTING_SHARE = 0.4       # of what rows are off as sent
 EVENER_SHARE = 0.9        # of it, where all rows that are not late are put on the rhythm
 LEAST_JITTER = 1e-4       # s off the rhythm that is worth it
+MIDDLE_WINDOW = 20.0      # s of rows whose median is the middle: jitter over sqrt(600)
 ROUNDING_COUNTS = 2.5     # by which a row may be off: rounding
 EVEN_TRAVEL = 1.0         # s within which travel is as good as even
 CATCHING_UP = 3.0         # times the speed beside: no wheel, so rows that catch up
@@ -88,14 +91,38 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
             true[begin:end] = _by_travel(t, travel, begin - 1, end, usual)
-    # what is left: each row is stamped some milliseconds off, as a busy machine comes to it
-    left = np.abs(true - even)
-    jitters = (left > LEAST_JITTER) & (left < usual)
-    off_sent, off_even = (_off(x, travel, CUBIC)[jitters] for x in (t, even))
-    if np.linalg.norm(off_even) < EVENER_SHARE * np.linalg.norm(off_sent):
-        true[jitters] = even[jitters]
+    true = _on_rhythm(true, t, travel, [even, *_middle(t, usual)], usual)
     floor = np.maximum.accumulate(np.concatenate([[-np.inf], true[:-1] + 1e-9]))
     return np.where((true > floor) | ~late, true, np.minimum(floor, t))
+
+
+def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
+               usual: float) -> Floats:
+    """
+    Return times on that of several rhythms on which the travel is evenest, as they are if on none.
+
+    What is left off a rhythm is stamped some milliseconds late, as a busy machine comes to it, or
+    both ways, by a sender's clock that ticks seldom.
+    """
+    best, least = true, 1.0
+    for even in rhythms:
+        left = np.abs(true - even)
+        jitters = (left > LEAST_JITTER) & (left < usual)
+        sent, put = (np.linalg.norm(_off(x, travel, CUBIC)[jitters]) for x in (t, even))
+        if put < EVENER_SHARE * least * sent:
+            best, least = np.where(jitters, even, true), put / sent
+    return best
+
+
+def _middle(t: Floats, usual: float) -> list[Floats]:
+    """Return the rhythm in the middle of rows of which some are early, none where rows are lost."""
+    rows = usual * np.arange(len(t))
+    blocks = np.array_split(t - rows, max(1, int(len(t) * usual / MIDDLE_WINDOW)))
+    ends = np.cumsum([len(block) for block in blocks])
+    at = [end - len(block) / 2 for end, block in zip(ends, blocks, strict=True)]
+    off = [float(np.median(block)) for block in blocks]
+    lost = any(abs(b - a) > usual / 4 for a, b in pairwise(off))
+    return [] if lost else [rows + np.interp(np.arange(len(t)), at, off)]
 
 
 def _least_of_next(x: Floats, count: int) -> Floats:
