@@ -110,12 +110,12 @@ def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
         jitters = (left > LEAST_JITTER) & (left < usual)
         sent, put = (np.linalg.norm(_off(x, travel, CUBIC)[jitters]) for x in (t, even))
         if put < EVENER_SHARE * least * sent:
-            best, least = np.where(jitters, even, true), put / sent
+            best, least = np.where(jitters, even, true), float(put / sent)
     return best
 
 
 def _middle(t: Floats, usual: float) -> list[Floats]:
-    """Return the rhythm in the middle of rows of which some are early, none where rows are lost."""
+    """Return the rhythm in the middle of rows, some of them early; none where rows are lost."""
     rows = usual * np.arange(len(t))
     blocks = np.array_split(t - rows, max(1, int(len(t) * usual / MIDDLE_WINDOW)))
     ends = np.cumsum([len(block) for block in blocks])

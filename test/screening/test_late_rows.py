@@ -77,7 +77,7 @@ def test_rows_that_are_all_some_milliseconds_late_are_put_on_their_rhythm(made):
 
 
 def test_rows_that_are_early_or_late_are_put_in_their_middle():
-    """What comes soonest is then no rhythm: of 250 rows it is 2.8 sigma early, give or take 0.4."""
+    """What comes soonest is no rhythm then: of 250 rows it is 2.8 sigma early, by chance 3.2."""
     fine = drive(scenario='town', duration=400.0, odometer_rate=50.0, seed=8, scale=1e-3,
                  nominal_scale=1e-3)
     even_ns, sigma_s = fine.odometer.stamp_ns, 0.003

@@ -32,7 +32,7 @@ LEAST_ARM = 0.3            # m, the same; that of the wheel up is where a body t
 NOISIER_THAN_SAID = 1.5    # of the sigma that fixes state
 NEXT_DRIVE = 1e-3          # by how much the scale of one vehicle differs from drive to drive
 # what the model does not hold (docs/conventions.md): relative, rad
-MODEL_FLOOR = np.array([3e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
 def beside(value, covariance, grade) -> dict:
