@@ -79,8 +79,12 @@ def _stamp(out, stamp_ns):
     out['sec'], out['nanosec'] = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000
 
 
-def imu(name: str, samples, frame: str = 'imu_link') -> Topic:
-    """Return sensor_msgs/Imu of ImuSamples; no orientation where the yaw variance is NaN."""
+def imu(name: str, samples, frame: str = 'imu_link', w_variance=None, f_variance=None) -> Topic:
+    """
+    Return sensor_msgs/Imu of ImuSamples; no orientation where the yaw variance is NaN.
+
+    w_variance, f_variance : (n, 3), optional, of turn rates and forces; else zeros: unknown.
+    """
     layout = _Layout().header(frame)
     for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
                         ('f', VECTOR), ('f_cov', SQUARE)):
@@ -89,6 +93,9 @@ def imu(name: str, samples, frame: str = 'imu_link') -> Topic:
     def fill(out, rows):
         _stamp(out, samples.stamp_ns[rows])
         out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
+        for field, variance in (('w_cov', w_variance), ('f_cov', f_variance)):
+            if variance is not None:
+                out[field][:, ::4] = variance[rows]
         _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
     return Topic(name, 'sensor_msgs/msg/Imu', samples.received_ns,
                  layout.packer(fill, len(samples.stamp_ns)))

@@ -8,7 +8,8 @@ from typing import Any
 
 from odocal_ros.calib import result
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.series import residuals, Series, states, trajectory
+from odocal_ros.library.residuals import residuals
+from odocal_ros.library.series import Series, states, trajectory
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -86,11 +87,11 @@ class Calibration:
         return trajectory(self.result)
 
     def states(self) -> Series:
-        """Return attitude and biases of the Imu over time; see ``series.states``."""
+        """Return attitude, biases of the Imu and their sigmas over time; see ``series.states``."""
         return states(self.result)
 
     def residuals(self) -> Series:
-        """Return dead reckoning less each fix; see ``series.residuals``."""
+        """Return what is left over of each sensor, with its sigma; see ``residuals.residuals``."""
         return residuals(self.result)
 
     def plot_track(self, ax, leg: int = 1):

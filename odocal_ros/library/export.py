@@ -13,10 +13,12 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.series import residuals, Series, states, trajectory
+from odocal_ros.library.residuals import left_in, residuals
+from odocal_ros.library.series import Series, stacked, states, trajectory
 from odocal_ros.outside.whole import whole_file
 
 TABLES = 'pip install pandas pyarrow'
+IN_NAMES = {'m': 'm', 'rad/s': 'rad_per_s', 'm/s^2': 'm_per_s2'}     # units in names of joints
 KML = 'http://www.opengis.net/kml/2.2'
 
 
@@ -33,8 +35,7 @@ def tum(columns: Series) -> str:
 def csv(columns: Series) -> str:
     """Return a series as text with its names at the top, numbers in full."""
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return ','.join(columns) + '\n' + ''.join(
-        f'{",".join(map(repr, row))}\n' for row in rows)
+    return ','.join(columns) + '\n' + ''.join(f'{",".join(map(str, row))}\n' for row in rows)
 
 
 def kml(columns: Series) -> str:
@@ -70,7 +71,8 @@ def mcap(result: Calibration, path: Path) -> None:
     Write all series as one mcap file, for PlotJuggler and Foxglove.
 
     /odocal/track NavSatFix; /odocal/biases Imu: the vehicle's attitude, and the biases in the
-    place of rates and forces; /odocal/residuals JointState: m, along and across.
+    place of rates and forces, their variances in that of those; /odocal/residuals/SENSOR
+    JointState: each component and its sigma, units in the names.
     """
     with tempfile.TemporaryDirectory(prefix='.odocal_', dir=path.parent) as work:
         bag = write_bag(Path(work) / 'debug', _topics(result))
@@ -78,20 +80,40 @@ def mcap(result: Calibration, path: Path) -> None:
 
 
 def _topics(result) -> list[encode.Topic]:
-    pose, bias, left = (_by_time(make(result)) for make in (trajectory, states, residuals))
+    pose, bias = (_by_time(make(result)) for make in (trajectory, states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     whole = np.zeros(n, np.int64)
-    gyro, accelerometer = (np.stack([bias[f'{sensor}_bias_{axis}'] for axis in 'xyz'], -1)
-                           for sensor in ('gyro', 'accelerometer'))
+    (gyro, gyro_sigma), (force, force_sigma) = (
+        [np.stack([bias[f'{sensor}_bias_{axis}{ending}'] for axis in 'xyz'], -1)
+         for ending in ('', '_sigma')] for sensor in ('gyro', 'accelerometer'))
     track = FixSamples(t, t, np.deg2rad(pose['latitude_deg']), np.deg2rad(pose['longitude_deg']),
                        pose['height_m'], np.zeros((n, 3, 3)), whole, whole)
-    biases = ImuSamples(t, t, gyro, accelerometer, np.stack(
+    biases = ImuSamples(t, t, gyro, force, np.stack(
         [pose[q] for q in ('qx', 'qy', 'qz', 'qw')], -1), np.zeros(n))
-    t = left['stamp_ns']
-    off = {name: OdometerSamples(t, t, left[f'{name}_m']) for name in ('along', 'across')}
     return [encode.fix('/odocal/track', track, 'base_link'),
-            encode.imu('/odocal/biases', biases, 'base_link'),
-            encode.joints('/odocal/residuals', off)]
+            encode.imu('/odocal/biases', biases, 'base_link', gyro_sigma**2, force_sigma**2),
+            *_residual_topics(result)]
+
+
+def _residual_topics(result) -> list[encode.Topic]:
+    sensors: dict[str, list] = {}
+    for number, leg in enumerate(result.legs, 1):
+        for left in left_in(leg):
+            sensors.setdefault(left.sensor, []).append((number, leg, _side_by_side(left)))
+    return [encode.joints(f'/odocal/residuals/{sensor}', {
+        name: OdometerSamples(rows['stamp_ns'], rows['stamp_ns'], column)
+        for name, column in rows.items() if name not in ('leg', 'stamp_ns', 't_s')})
+        for sensor, rows in ((sensor, _by_time(stacked(found)))
+                             for sensor, found in sensors.items())]
+
+
+def _side_by_side(left) -> Series:
+    """Return what is left over of a sensor as columns: each component, then its sigma."""
+    columns = {'t': left.t}
+    for name, value, sigma in zip(left.components, left.value.T, left.sigma.T, strict=True):
+        columns |= {f'{name}_{IN_NAMES[left.unit]}': value.astype(float),
+                    f'{name}_sigma_{IN_NAMES[left.unit]}': sigma.astype(float)}
+    return columns
 
 
 def _by_time(columns: Series) -> Series:

@@ -1,8 +1,9 @@
 """
-Time series of a calibration as columns: what was estimated along each leg, and what is left over.
+Time series of a calibration as columns: what was estimated along each leg.
 
 A series is a dict of equally long arrays. Of every row: ``leg``, from 1, and ``stamp_ns``, header
-time. Names tell the unit, but for SI and rad. At most 5000 rows of a leg.
+time. Names tell the unit, but for SI and rad. At most 5000 rows of a leg. What is left over of the
+sensors: residuals.py.
 """
 
 import numpy as np
@@ -41,7 +42,7 @@ def states(result: Calibration) -> Series:
     Return attitude and biases of the Imu, second by second, as the smoother finds them.
 
     roll, pitch, yaw : of the vehicle in n, yaw from east.   gyro_bias_x ... : rad/s, in the body
-    frame b.   accelerometer_bias_x ... : m/s^2.
+    frame b.   accelerometer_bias_x ... : m/s^2.   Each with its sigma: gyro_bias_x_sigma ...
 
     Raises
     ------
@@ -52,34 +53,6 @@ def states(result: Calibration) -> Series:
     return _of_fits(result, _state)
 
 
-def residuals(result: Calibration) -> Series:
-    """
-    Return dead reckoning less each fix that was used.
-
-    distance_m : driven since the start mark.   along_m, across_m : along the vehicle's forward
-    axis and to its left, as calibrated; before_along_m, before_across_m : as configured.
-    sigma_m : of the fix, horizontal, each axis.   status : NavSatStatus.
-
-    Raises
-    ------
-    BadUsage
-        No leg has a track.
-
-    """
-    found = []
-    for number, leg in enumerate(result.legs, 1):
-        if (e := leg.evidence) is not None:
-            found.append((number, leg, {
-                't': e.t_fix, 'distance_m': e.fix_distance,
-                'along_m': e.residual[:, 0], 'across_m': e.residual[:, 1],
-                'before_along_m': e.residual_before[:, 0],
-                'before_across_m': e.residual_before[:, 1],
-                'sigma_m': e.fix_sigma, 'status': e.fix_status}))
-    if not found:
-        raise BadUsage('no leg has a track to hold against its fixes: see the reasons')
-    return _stacked(found)
-
-
 def _of_fits(result: Calibration, columns) -> Series:
     """Return the columns of each leg that the smoother fitted: (leg, its details) to them."""
     found = [(number, leg, columns(leg, leg.methods['smoother'].details))
@@ -87,7 +60,7 @@ def _of_fits(result: Calibration, columns) -> Series:
              if leg.origin and 'key_C_nb' in getattr(leg.methods.get('smoother'), 'details', ())]
     if not found:
         raise BadUsage(NONE)
-    return _stacked(found)
+    return stacked(found)
 
 
 def _rows(smoothed, column):
@@ -114,17 +87,17 @@ def _pose(leg, smoothed) -> Series:
 
 
 def _state(leg: LegResult, smoothed) -> Series:
-    gyro, accelerometer = smoothed['key_biases']
     angles = rpy_from_matrix(_vehicle(leg, smoothed))
-    return {'t': smoothed['track_t'],
-            **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True)),
-            **{f'gyro_bias_{axis}': _rows(smoothed, column)
-               for axis, column in zip('xyz', gyro.T, strict=True)},
-            **{f'accelerometer_bias_{axis}': _rows(smoothed, column)
-               for axis, column in zip('xyz', accelerometer.T, strict=True)}}
+    columns = {'t': smoothed['track_t'],
+               **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True))}
+    for ending, key in (('', 'key_biases'), ('_sigma', 'key_bias_sigmas')):
+        for sensor, rows in zip(('gyro', 'accelerometer'), smoothed[key], strict=True):
+            columns |= {f'{sensor}_bias_{axis}{ending}': _rows(smoothed, column)
+                        for axis, column in zip('xyz', rows.T, strict=True)}
+    return columns
 
 
-def _stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
+def stacked(found: list[tuple[int, LegResult, Series]]) -> Series:
     """Return the series of legs, one under the other, their times as stamps."""
     legs = [{'leg': np.full(len(columns['t']), number),
              'stamp_ns': leg.start_ns + np.round(columns['t'] * 1e9).astype(np.int64),

@@ -49,7 +49,8 @@ def test_csv_holds_every_digit(calibration, exported, name):
     with (exported / f'{name}.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     for column, values in getattr(calibration, name)().items():
-        np.testing.assert_array_equal(np.array([float(row[column]) for row in rows]), values)
+        np.testing.assert_array_equal(
+            np.array([row[column] for row in rows]).astype(values.dtype), values)
 
 
 def test_parquet_holds_every_digit(calibration, tmp_path):
@@ -83,11 +84,24 @@ def test_mcap_is_a_bag(calibration, exported):
     stamps, fixes = zip(*found['/odocal/track'], strict=True)
     assert list(stamps) == pose['stamp_ns'].tolist()
     np.testing.assert_allclose([m.latitude for m in fixes], pose['latitude_deg'], rtol=1e-14)
-    rates = [m.angular_velocity.z for _, m in found['/odocal/biases']]
-    np.testing.assert_array_equal(rates, bias['gyro_bias_z'])
-    residuals = [m for _, m in found['/odocal/residuals']]
-    assert list(residuals[0].name) == ['along', 'across']
-    np.testing.assert_array_equal([m.position[1] for m in residuals], left['across_m'])
+    biases = [m for _, m in found['/odocal/biases']]
+    np.testing.assert_array_equal([m.angular_velocity.z for m in biases], bias['gyro_bias_z'])
+    for field, sensor in (('angular_velocity', 'gyro'), ('linear_acceleration', 'accelerometer')):
+        variance = np.array([getattr(m, f'{field}_covariance') for m in biases])
+        np.testing.assert_array_equal(variance[:, 4], bias[f'{sensor}_bias_y_sigma']**2)
+    sensors = {topic.rpartition('/')[2] for topic in found if 'residuals' in topic}
+    assert sensors == set(left['sensor'])
+    for sensor, joint, component in (('track', 'left_m', 'left'), ('fix', 'up_m', 'up'),
+                                     ('gyro', 'z_rad_per_s', 'z'),
+                                     ('accelerometer', 'x_m_per_s2', 'x')):
+        stamps, rows = zip(*found[f'/odocal/residuals/{sensor}'], strict=True)
+        names = list(rows[0].name)
+        values = np.array([row.position for row in rows])
+        one = (left['sensor'] == sensor) & (left['component'] == component)
+        assert list(stamps) == left['stamp_ns'][one].tolist()
+        np.testing.assert_array_equal(values[:, names.index(joint)], left['value'][one])
+        sigma = joint.replace('_', '_sigma_', 1)
+        np.testing.assert_array_equal(values[:, names.index(sigma)], left['sigma'][one])
 
 
 def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):

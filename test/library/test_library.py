@@ -74,15 +74,49 @@ def test_biases_are_those_of_the_drive(town, calibration):
         first = found[f'gyro_bias_{axis}'][0]
         assert abs(first - town[0].truth.gyro_bias[i]) < 5 * sigma, axis
         assert first == calibration.values[f'gyro_bias_{axis}']
+        assert found[f'gyro_bias_{axis}_sigma'][0] == pytest.approx(sigma, rel=1e-12)
+        force, sigma = (found[f'accelerometer_bias_{axis}{end}'][0] for end in ('', '_sigma'))
+        assert abs(force - town[0].truth.accel_bias[i]) < 5 * sigma, axis
     assert np.abs(found['roll']).max() < np.deg2rad(1.0)      # the road is level
 
 
-def test_residuals_are_those_of_the_check(calibration):
+def of(found, sensor, component):
+    """Return the rows of one component of a sensor."""
+    rows = (found['sensor'] == sensor) & (found['component'] == component)
+    return {name: column[rows] for name, column in found.items()}
+
+
+def test_residuals_of_the_track_are_those_of_the_check(calibration):
     found, check = calibration.residuals(), calibration.to_dict()['check']
-    for name, prefix in (('after', ''), ('before', 'before_')):
-        off = np.hypot(found[f'{prefix}along_m'], found[f'{prefix}across_m'])
+    for name, sensor in (('after', 'track'), ('before', 'track_before')):
+        along, left = (of(found, sensor, component) for component in ('along', 'left'))
+        off = np.hypot(along['value'], left['value'])
         assert np.sqrt((off**2).mean()) == pytest.approx(check[name]['rms'], rel=0.02)
-    assert len(found['along_m']) == calibration.result.legs[0].evidence.fixes
+        assert len(off) == calibration.result.legs[0].evidence.fixes
+        assert np.all(np.diff(along['distance_m']) >= 0)
+
+
+def test_residuals_of_each_sensor_have_stamp_sigma_and_unit(calibration):
+    """Of each second as many; nothing is left over but noise, of which the fit takes a part."""
+    found, seconds = calibration.residuals(), len(calibration.states()['t_s']) - 1
+    said = calibration.result.legs[0].methods['smoother'].details['residuals']
+    for sensor, unit, rows in (('fix', 'm', said['fixes']), ('odometer', 'm', seconds),
+                               ('gyro', 'rad/s', seconds), ('accelerometer', 'm/s^2', seconds)):
+        components = sorted(set(found['component'][found['sensor'] == sensor]))
+        assert len(components) == 3, sensor
+        for component in components:
+            one = of(found, sensor, component)
+            assert set(one['unit']) == {unit}
+            assert len(one['stamp_ns']) == rows
+            assert np.all(np.diff(one['stamp_ns']) > 0)
+            assert 0.05 < np.sqrt(((one['value'] / one['sigma'])**2).mean()) < 1.1
+    one = of(found, 'gyro', 'z')
+    np.testing.assert_array_equal(one['stamp_ns'], calibration.states()['stamp_ns'][1:])
+
+
+def test_of_a_method_without_a_fit_the_track_is_left(town):
+    found = calibrate_bag(town[1], config={'method': 'two_point'}, legs='0:').residuals()
+    assert set(found['sensor']) == {'track', 'track_before'}
 
 
 def test_a_table_has_a_row_for_each_value(calibration):
@@ -109,7 +143,8 @@ def test_figures_draw_the_leg(calibration):
         np.testing.assert_allclose(lines['as calibrated'][end], (track[end] - track[0])[:2])
     calibration.plot_residuals(lower)
     drawn = next(line for line in lower.get_lines() if line.get_label() == 'across')
-    assert np.abs(drawn.get_ydata()).max() == np.abs(calibration.residuals()['across_m']).max()
+    left = of(calibration.residuals(), 'track', 'left')['value']
+    assert np.abs(drawn.get_ydata()).max() == np.abs(left).max()
     with pytest.raises(OdocalError, match='legs 1 to 1'):
         calibration.plot_track(ax, leg=2)
 

@@ -132,6 +132,10 @@ class Neighbours:
         out *= scale[:, None, :]
         return out
 
+    def variances(self) -> Floats:
+        """Return the variance of each unknown of each block: (N, n)."""
+        return np.einsum('kii->ki', self._own) * self._scale**2
+
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
         """Yield all of them, some intervals at a time."""
         for rows in blocks(len(self)):

@@ -8,6 +8,7 @@ from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source, TRACK_ROWS
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
@@ -106,7 +107,9 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                Source('model', np.diag(MODEL_FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
-                        | {'slips': [vars(s) for s in slips],
+                        | left_over(leg, problem, fit)
+                        | {'key_bias_sigmas': bias_sigmas(near, widen),
+                           'slips': [vars(s) for s in slips],
                            'beside': beside(c, covariance, problem.grade),
                            'level_pitch_angle': level_pitch(fit, near, widen)},
                         border_of(fit, configured(leg), problem.grade).widened(widen))

@@ -1,0 +1,71 @@
+"""What a fit leaves over of each sensor, and how well it knows the biases, along the leg."""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.chain import blocks
+from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.motion import D
+from odocal_ros.calib.smoother.motion_rows import MotionRows
+from odocal_ros.calib.smoother.noise import ABSENT_VARIANCE
+from odocal_ros.calib.smoother.state import BA, BG, PHI, V
+from odocal_ros.nav.rotations import transpose
+
+OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
+
+
+def bias_sigmas(near, widen):
+    """Return the sigmas of the biases at the keyframes: (2, N, 3), gyro first, rad/s, m/s^2."""
+    variance = near.variances()
+    return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * widen
+
+
+def left_over(leg, problem, fit):
+    """
+    Return what the fit has less what each sensor says, and the noise it is believed to have.
+
+    Returns
+    -------
+    dict of arrays, a row's three values before their sigmas, NaN where the sensor says nothing.
+    Of an interval, at its end: ``left_odometer`` along, left, up, m; ``left_gyro`` x, y, z, rad/s,
+    and ``left_accelerometer`` x, y, z, m/s^2, means in b. ``left_fix``, of the fixes used, at
+    ``left_fix_t``, s: east, north, up, m, without the slow part of their error. Single precision,
+    for hours have many rows.
+
+    """
+    rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
+    return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
+            for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
+
+
+def _of_intervals(fit):
+    """Return of each sensor of the motion values and sigmas, (K, 3) each."""
+    motion = fit.weighted[MotionRows]
+    found: dict[str, list] = {name: [] for name in OF_INTERVALS}
+    T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
+    for some in blocks(len(motion.r)):
+        raw = np.linalg.solve(motion.whiten[some], motion.r[some, :, None])
+        Q = motion.noise.covariance(motion.levels, some)
+        per_T = 1 / T[some, :, None]
+        for name, own, axes in (('odometer', D, motion.noise.axes[some]),
+                                ('gyro', PHI, transpose(C_end[some]) * per_T),
+                                ('accelerometer', V, transpose(C[some]) * per_T)):
+            variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, own, own], axes)
+            found[name].append(((axes @ raw[:, own])[:, :, 0], np.sqrt(variance)))
+    whole = {name: tuple(map(np.concatenate, zip(*parts, strict=True)))
+             for name, parts in found.items()}
+    absent = whole['odometer'][1]**2 > ABSENT_VARIANCE / 2
+    return whole | {'odometer': tuple(np.where(absent, np.nan, x) for x in whole['odometer'])}
+
+
+def _of_fixes(fit):
+    """Return of the fixes values and sigmas, (m, 3) each."""
+    fixes = fit.weighted[Fixes]
+    covariance_root = np.linalg.inv(fixes.root)
+    factor = np.ones(3)
+    for level, columns in fixes.levels_of.items():
+        factor[columns] = np.sqrt(fixes.levels[level])
+    each = np.sqrt(fixes.weight / fixes.per_effective) / factor
+    value = -(covariance_root @ (fixes.r / each)[:, :, None])[:, :, 0]
+    sigma = np.sqrt(covariance_root**2 @ factor**2)
+    told = fixes.known()
+    return np.where(told, value, np.nan), np.where(told, sigma, np.nan)
