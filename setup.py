@@ -67,6 +67,8 @@ setup(
             'colcon-common-extensions',
             *SITE,
             *FLEET,
+            # GPL-3.0, read by one test, imported by nothing of the package
+            'evo>=1.36',
             'hypothesis>=6',
             'mpmath>=1.3',
             'mypy>=1.8',
