@@ -66,9 +66,23 @@ def pytest_report_header() -> list[str]:
     return [f'ROS domain: {DOMAIN}', f'real drives: {found}']
 
 
+class Recordings:
+    """The folder of real recordings; a test that asks for one that is not there is skipped."""
+
+    def __truediv__(self, name: str) -> Path:
+        first = DATA / Path(name).parts[0]
+        if not first.exists():
+            pytest.skip(f'NO REAL DATA at {first}: set ODOCAL_DATA to the folder of recordings')
+        return DATA / name
+
+    def rglob(self, pattern: str):
+        """Return the files of all recordings that are there."""
+        return DATA.rglob(pattern)
+
+
 @pytest.fixture(scope='session')
-def data_dir() -> Path:
+def data_dir() -> Recordings:
     """Return the folder of real recordings, or skip and say so."""
     if not DATA.is_dir():
         pytest.skip(f'NO REAL DATA at {DATA}: set ODOCAL_DATA to the folder of recordings')
-    return DATA
+    return Recordings()

@@ -6,8 +6,9 @@ import shlex
 import shutil
 
 from drives import drive, settings
-from pages import all_commands, blocks, PAGES, ROOT, yaml_blocks
+from pages import all_commands, blocks, fenced, PAGES, ROOT, yaml_blocks
 import pytest
+import yaml
 
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
@@ -22,11 +23,13 @@ ELSEWHERE = {
     '.ci/run': 'runs these tests',
     '.venv/bin/ruff': '.ci/run runs it',
     '.venv/bin/mypy': '.ci/run runs it',
+    '.venv/bin/python': 'test_comma2k19.py runs that module',
     'export': 'for pip inside rosdep',
     'rosdep': 'needs its database from the network',
     'colcon': 'test_package.py builds with colcon and starts what it installed',
     'source': 'of what colcon installed: test_package.py starts that',
 }
+FLEET = 'docs/first_fleet.md'      # whose commands go on from each other
 RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed
 KNOWN = {'odocal', 'ros2', *ELSEWHERE}
 STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'fix_noise': 'rtk'}
@@ -79,7 +82,8 @@ def meant_to_be_typed(line):
 
 
 @pytest.mark.parametrize(('page', 'line'), [
-    (page, line) for page, line in all_commands('odocal') if meant_to_be_typed(line)],
+    (page, line) for page, line in all_commands('odocal')
+    if meant_to_be_typed(line) and page != FLEET],
     ids=lambda text: text[:60])
 def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch, capfd):
     words = shlex.split(line)[1:]
@@ -110,6 +114,34 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         assert 'try' in out
     else:
         assert out
+
+
+def test_the_walk_through_a_fleet_finds_what_the_page_says(tmp_path, monkeypatch, capfd):
+    pytest.importorskip('distributed')
+    monkeypatch.chdir(tmp_path)
+    page = page_of(FLEET)
+    made, calibrated, replayed, accepted = (
+        shlex.split(line)[1:] for page, line in all_commands('odocal') if page == FLEET)
+    assert cli.main(made) == 0
+    assert '\n'.join((tmp_path / 'fleet' / 'manifest.csv').read_text().splitlines()[:2]) in page
+    assert cli.main(calibrated) == 0
+    out, _ = capfd.readouterr()
+    said = re.findall(r'^  (\w+): \w+; (\w+).* changed .*(between .*)$', out, re.MULTILINE)
+    told = re.findall(r'^  (\w+): \w+; (\w+).* changed .*(between .*)$', page, re.MULTILINE)
+    assert said == told
+    truth = yaml.safe_load((tmp_path / 'fleet' / 'truth.yaml').read_text())['vehicles']
+    assert {(v['vehicle'], change['by'][:10]) for v in truth for change in v['changes']} == {
+        (name, when.split()[-1]) for name, _, when in told}
+    program, = (text for language, text in fenced(page) if language == 'python')
+    exec('\n'.join(program), {})
+    out, _ = capfd.readouterr()
+    assert re.findall(r'^(\w+_\d{3}) ', out, re.MULTILINE) == [name for name, *_ in told]
+    assert cli.main(replayed) == 0
+    assert cli.main(accepted) == 1
+    out, _ = capfd.readouterr()
+    failed = {row['vehicle'] for row in map(json.loads, re.findall(r'^\{.*$', out, re.MULTILINE))
+              if row['decision'] == 'FAIL'}
+    assert failed == {'shuttle_004', 'van_005'}
 
 
 def test_the_figures_of_the_page_are_those_that_are_drawn():

@@ -141,20 +141,21 @@ def twist(name: str, samples, frame: str = 'base_link') -> Topic:
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def joints(name: str, wheels: dict, frame: str = '') -> Topic:
-    """Return sensor_msgs/JointState of OdometerSamples by joint name: positions only."""
+def joints(name: str, wheels: dict, frame: str = '', rates: bool = False) -> Topic:
+    """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
     first = next(iter(wheels.values()))
     layout = _Layout().header(frame).add('names', '<u4')
     for joint in wheels:
         layout.text(f'joint {joint}', joint)
-    layout.add('positions', '<u4')
-    for joint in wheels:
-        layout.add(joint, '<f8')
-    layout.add('velocities', '<u4').add('efforts', '<u4')
+    given = 'velocities' if rates else 'positions'
+    for field in ('positions', 'velocities', 'efforts'):
+        layout.add(field, '<u4')
+        for joint in wheels if field == given else ():
+            layout.add(joint, '<f8')
 
     def fill(out, rows):
         _stamp(out, first.stamp_ns[rows])
-        out['names'] = out['positions'] = len(wheels)
+        out['names'] = out[given] = len(wheels)
         for joint, samples in wheels.items():
             out[joint] = samples.value[rows]
     return Topic(name, 'sensor_msgs/msg/JointState', first.received_ns,

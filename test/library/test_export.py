@@ -35,7 +35,7 @@ def test_tum_is_what_evo_reads(calibration, exported):
 
 
 def test_evo_itself_reads_it(calibration, exported):
-    files = pytest.importorskip('evo.tools.file_interface', reason='no evo here: pip install ".[dev]"')
+    files = pytest.importorskip('evo.tools.file_interface', reason='no evo: pip install ".[dev]"')
     found = files.read_tum_trajectory_file(str(exported / 'trajectory.tum'))
     whole, details = found.check()
     assert whole, details
