@@ -75,6 +75,16 @@ def test_package_xml_names_all_that_is_imported():
     assert XML.findtext('export/build_type') == 'ament_python'
 
 
+def test_the_quality_declaration_tells_of_each_key_how_it_was_checked():
+    page = (ROOT / 'QUALITY_DECLARATION.md').read_text()
+    table = page.partition('| key | Debian')[2].partition('\n\n')[0]
+    rows = [line.split('|') for line in table.splitlines()[2:]]
+    told = [key for row in rows for key in re.findall(r'`(\w[\w-]*)`', row[1])]
+    assert sorted(told) == sorted(e.text for kind in ('depend', 'exec_depend', 'test_depend')
+                                  for e in XML.findall(kind))
+    assert all(row[2].strip() and row[3].strip() for row in rows)
+
+
 def test_setup_requires_all_that_is_imported_but_ros():
     setup = (ROOT / 'setup.py').read_text()
     block = setup.partition('install_requires=[')[2].partition(']')[0]
