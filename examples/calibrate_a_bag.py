@@ -3,17 +3,20 @@
 import math
 import sys
 
-from odocal_ros import calibrate_bag
+from odocal_ros import calibrate_bag, OdocalError
 
-calibration = calibrate_bag(
-    sys.argv[1],
-    topics={'imu': '/imu/data', 'odometer': '/odometer', 'fix': '/fix'},    # found if left away
-    config={'odometer.nominal_scale': 0.02})         # any setting by its name
+try:
+    calibration = calibrate_bag(
+        sys.argv[1],
+        topics={},       # found by their types; else {'imu': '/my_imu', 'odometer': '/ticks'}
+        config={'odometer.nominal_scale': 0.02})     # any setting by its name
+except OdocalError as error:      # a bag that cannot be used: one sentence says why
+    sys.exit(str(error))
 
 print(calibration.verdict.value)
-scale, sigma = (x['scale_factor'] for x in (calibration.values, calibration.sigmas))
-if scale is not None:
-    print(f'scale factor {scale:.7f} +- {sigma:.7f} m/pulse')
+scale = calibration.to_dict()['result']['scale_factor']
+if scale['value'] is not None:
+    print(f'scale factor {scale["value"]:.7f} +- {scale["sigma"]:.7f} {scale["unit"]}')
 yaw = calibration.values['yaw_mounting_angle']
 if yaw is not None:
     print(f'yaw mounting {math.degrees(yaw):+.3f} deg')

@@ -8,6 +8,8 @@ from odocal_ros import calibrate_bag
 
 bag, picture = sys.argv[1:]
 calibration = calibrate_bag(bag, config={'odometer.nominal_scale': 0.02})
+if calibration.values['scale_factor'] is None:      # nothing to draw, but why
+    sys.exit('\n'.join(f'{reason.code.name}: {reason.text}' for reason in calibration.reasons))
 figure = Figure(figsize=(8, 10), layout='constrained')
 track, residuals, table = figure.subplots(3, height_ratios=(5, 3, 2))
 calibration.plot_track(track)

@@ -73,7 +73,8 @@ class Code(Enum):
     IMU_AXES_SKEW = NOTE, ('Nothing: the angles are those of the axes that the Imu measures in; '
                            'set imu.misalignment_sigma to what the Imu has.')
     LEVER_ARM_OFF = CAUTION, ('Measure that lever arm again and set it: from base_link, x '
-                              'forward, y left, z up. A vehicle that slides in turns (skid '
+                              'forward, y left, z up; where both are off alike, it is '
+                              'imu.lever_arm. A vehicle that slides in turns (skid '
                               'steering, tracks) looks so too: then leave it.')
     GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
     BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'

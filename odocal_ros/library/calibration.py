@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib import result
+from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.residuals import residuals
 from odocal_ros.library.series import Series, states, trajectory
@@ -58,12 +59,19 @@ class Calibration:
     @property
     def values(self) -> dict[str, float | None]:
         """Return each value by name, SI and radians; None: not determined."""
-        return {name: e.value for name, e in self.result.estimates.items()}
+        return {name: e.value for name, e in self._estimates().items()}
 
     @property
     def sigmas(self) -> dict[str, float | None]:
         """Return one standard deviation of each value."""
-        return {name: e.sigma for name, e in self.result.estimates.items()}
+        return {name: e.sigma for name, e in self._estimates().items()}
+
+    def _estimates(self) -> dict[str, Estimate]:
+        """Return the estimates, those that each result has to have also where no leg was fit."""
+        from odocal_ros.output.files import ALWAYS
+        told = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
+        told |= self.result.estimates
+        return told
 
     def __str__(self) -> str:
         """Return the result as one screen of text, as ``odocal replay`` prints it."""
@@ -77,7 +85,7 @@ class Calibration:
 
     def to_frame(self):
         """Return a pandas.DataFrame, a row for each value: value, sigma, unit, method."""
-        found = self.result.estimates
+        found = self._estimates()
         columns = {name: [getattr(e, name) for e in found.values()]
                    for name in ('value', 'sigma', 'unit', 'method')}
         return frame_of(columns).set_axis(list(found))

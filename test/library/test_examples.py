@@ -44,6 +44,18 @@ def test_calibrate_a_bag(town, tmp_path, monkeypatch, capsys):
     assert (tmp_path / 'result' / 'calibration.json').exists()
 
 
+def test_a_bag_of_other_names_is_taken_and_what_is_none_is_said_in_a_sentence(
+        town, tmp_path, monkeypatch, capsys):
+    drive, _ = town
+    bag = write_bag(tmp_path / 'own', [
+        encode.imu('/sensors/imu', drive.imu), encode.fix('/ublox/fix', drive.fix),
+        encode.counter('/hall', drive.odometer)])
+    run('calibrate_a_bag.py', monkeypatch, tmp_path, bag)
+    assert re.search(r'scale factor .* m/pulse$', capsys.readouterr().out, re.MULTILINE)
+    with pytest.raises(SystemExit, match='nowhere: no such'):
+        run('calibrate_a_bag.py', monkeypatch, tmp_path, tmp_path / 'nowhere')
+
+
 def test_plan_a_drive(tmp_path, monkeypatch, capsys):
     run('plan_a_drive.py', monkeypatch, tmp_path)
     lines = capsys.readouterr().out.splitlines()

@@ -80,6 +80,16 @@ def test_biases_are_those_of_the_drive(town, calibration):
     assert np.abs(found['roll']).max() < np.deg2rad(1.0)      # the road is level
 
 
+def test_of_a_rejected_drive_the_values_are_there_and_none(town, tmp_path):
+    """An Imu that is turned by a right angle: no leg is computed, so no method gave a value."""
+    turned = calibrate_bag(town[1], config={'imu.mounting_rpy': (0.0, 0.0, np.pi / 2)})
+    assert turned.verdict.value == 'rejected'
+    assert not turned.result.estimates
+    for name in ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle'):
+        assert turned.values[name] is turned.sigmas[name] is None
+    assert set(turned.values) <= set(turned.to_dict()['result'])
+
+
 def of(found, sensor, component):
     """Return the rows of one component of a sensor."""
     rows = (found['sensor'] == sensor) & (found['component'] == component)
