@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 import re
+from types import SimpleNamespace
 
 from drives import changed
 import numpy as np
@@ -16,10 +18,11 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
-from odocal_ros.calib.smoother.state import GYRO_SCALE, YAW
+from odocal_ros.calib.smoother.state import ACCEL, GYRO_SCALE, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 
+smoother = import_module('odocal_ros.calib.smoother.smoother')
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
 
@@ -190,3 +193,20 @@ def test_what_does_not_settle_is_said_with_what_moves_and_what_the_drive_lacks()
         assert method.reasons[0].code is Code.NOT_CONVERGED
         assert 'after 1 passes the yaw mounting angle still moves by' in text
         assert ('; the drive ' in text and 'does not stop' in text) == lacks
+
+
+def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
+    """A false minimum: an out-and-back of the zoo had its pitch 12 sigmas off."""
+    _, config, leg = made(duration=150.0)
+    for off, refused in ((0.19, False), (0.21, True)):
+        c = np.zeros(M)
+        c[ACCEL.start + 1] = -off
+        fit = SimpleNamespace(settled=True, state=SimpleNamespace(constants=c))
+        monkeypatch.setattr(smoother, 'best_fit', lambda *_, fit=fit: fit)
+        monkeypatch.setattr(smoother, 'outcome', lambda *_: None)
+        method = smooth(leg, config)
+        assert (method is not None) == refused
+    assert method.estimates['scale_factor'].value is None
+    reason, = method.reasons
+    assert reason.code is Code.NOT_CONVERGED
+    assert 'accelerometer scale y is -21 % off' in reason.text

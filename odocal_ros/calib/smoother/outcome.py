@@ -12,7 +12,7 @@ from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.remarks import beside, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, MODEL_FLOOR, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
@@ -42,6 +42,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
+NO_IMU = 0.2        # relative, of a scale: twenty times what a consumer's is off
 SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
@@ -66,6 +67,17 @@ def not_settled(leg, problem, fit, config) -> MethodResult:
         text += f'; the drive {" and ".join(lacks)}'
     _, odd = mismatch(problem, fit, config)
     return refused([Reason(Code.NOT_CONVERGED, text), *odd], leg.scale_unit)
+
+
+def no_imu(fit) -> list[Reason]:
+    """Return why a fit is not to be believed whose Imu no maker would sell, empty else."""
+    c = fit.state.constants
+    worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
+    if abs(c[worst]) <= NO_IMU:
+        return []
+    return [Reason(Code.NOT_CONVERGED, 'the fit settled where the '
+                   f'{CONSTANTS[worst].replace("_", " ")} is {100 * c[worst]:+.0f} % off, as no '
+                   'Imu is: a false minimum, or its units, axes or times are not as set')]
 
 
 def _unknown(scale_unit):

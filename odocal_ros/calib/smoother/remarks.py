@@ -24,6 +24,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G, grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
+IMU_SCALES = (*range(GYRO.start, GYRO.start + 3), *range(ACCEL.start, ACCEL.start + 3))
 AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4
 SCALES_OFF = 4.0    # of the grade's sigma: another Imu
 AXES_OFF = 3.0
@@ -95,8 +96,7 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
         said.append(Reason(Code.IMU_AXES_SKEW, 'the axes of the accelerometer are off a right '
                            f'angle by {np.rad2deg(abs(c[worst])):.2f} deg, {off[worst]:.0f} times '
                            f'the {config.imu.grade} grade; the values allow for it'))
-    scales = [*range(GYRO.start, GYRO.start + 3), *range(ACCEL.start, ACCEL.start + 3)]
-    worst = max(scales, key=lambda i: off[i])
+    worst = max(IMU_SCALES, key=lambda i: off[i])
     if off[worst] > SCALES_OFF:
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '

@@ -16,7 +16,10 @@ from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME
 
 RESIDUAL_BIN = 2.0                           # s over which residuals are averaged
-SLOW_CORRELATION, SLOW_SIGMAS = 0.15, 4.0    # correlation of neighbouring bins; its sigmas
+# correlation of neighbouring bins, and its sigmas: a fit with slow errors costs time where there
+# are none, one without them the truth of sigmas; of RTK's centimetre little is left to be seen
+SLOW_CORRELATION, SLOW_SIGMAS = 0.05, 1.5
+HIDDEN_SIGMAS = 4.0
 SMOOTHED_SHARE = 0.2    # of the stated sigma: a fix so much better was filtered
 FIXES_S = 90.0    # s of fixes in which errors that stay for a minute show as alike
 SLOW_SHARE, WHITE_SHARE = 0.9, 0.2           # of the variance, to start from
@@ -63,7 +66,7 @@ def _hidden(t, level) -> bool:
     t : (m,) s.   level : variance of the scatter, of the stated; good to 1 / sqrt(m) of itself,
     two components each.
     """
-    return t[-1] - t[0] < FIXES_S and level < 1 - SLOW_SIGMAS / np.sqrt(len(t))
+    return t[-1] - t[0] < FIXES_S and level < 1 - HIDDEN_SIGMAS / np.sqrt(len(t))
 
 
 def with_slow_errors(problem, first: Outline, trace=None) -> Fit:

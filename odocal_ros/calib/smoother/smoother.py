@@ -9,7 +9,7 @@ from odocal_ros.calib.smoother.estimate import fit
 from odocal_ros.calib.smoother.imperfect import judge_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import not_settled, outcome, refused
+from odocal_ros.calib.smoother.outcome import no_imu, not_settled, outcome, refused
 from odocal_ros.calib.smoother.point_rows import alike
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
@@ -55,6 +55,8 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
                                'samples are missing or wild there')], leg.scale_unit)
     if not best.settled:
         return not_settled(leg, problem, best, config)
+    if astray := no_imu(best):
+        return refused(astray, leg.scale_unit)
     return outcome(leg, problem, best, config)
 
 
