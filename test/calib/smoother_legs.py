@@ -13,7 +13,7 @@ from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
-from odocal_ros.sim import motion, sensors
+from odocal_ros.sim import body, motion, sensors
 from odocal_ros.sim.noise import random_walk, stream
 from odocal_ros.sim.options import SIM_GRADES
 from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -61,7 +61,10 @@ def truth(drive, config, leg) -> State:
     state = drive.motion.at(since)
     to_n = C_en(leg.origin.latitude, leg.origin.longitude).T @ C_en(state.latitude,
                                                                     state.longitude)
-    C_nb = to_n @ motion.attitude(state) @ C_bv(o.yaw, o.pitch).T
+    C_nb = to_n @ motion.attitude(state)
+    if drive.motion.tilt:
+        C_nb = C_nb @ body.rotation(drive.motion, since)
+    C_nb = C_nb @ C_bv(o.yaw, o.pitch).T
     v_n = np.einsum('kij,kj->ki', to_n, motion.velocity_n(state))
     p_n = leg.origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
     constants = np.zeros(M)

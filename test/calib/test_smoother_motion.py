@@ -8,7 +8,7 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL, M, TYRES
+from odocal_ros.calib.smoother.state import ACCEL, BARE, LEAN, M, TYRES
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.real_wheels import G
 
@@ -52,6 +52,25 @@ def test_a_turn_is_no_braking():
     assert len(turns) > 3 < len(straight)
     # the air's resistance at other speeds: 2e-5 of it; taken for braking, turns were 1e-3 off
     assert np.abs(turns - np.median(straight)).max() < 1e-4
+
+
+@pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])
+def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
+    """A third at least of what is left of a lean goes with the change of the push."""
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, scale=1e-3,
+                              nominal_scale=1e-3, real=real)
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    part = Equations(problem, state, problem.sums(state)).parts['motion']
+    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
+    off = (C_vn @ part.raw[:, 15:18, None])[:, axis, 0]
+    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, LEAN])[:, axis]
+
+    def left(columns):
+        c = np.linalg.lstsq(by[:, columns], off, rcond=None)[0]
+        return np.sqrt(((off - by[:, columns] @ c)**2).mean())
+
+    assert left([0, 1]) < 0.3 * left([])
+    assert left([0, 1, 2, 3]) < 0.7 * left([0, 1])
 
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):

@@ -18,7 +18,7 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import not_settled
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
-from odocal_ros.calib.smoother.state import ACCEL, GYRO_SCALE, M, YAW
+from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO_SCALE, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 
@@ -105,8 +105,11 @@ def test_slow_errors_of_fixes_are_seen_and_widen_the_scale():
 def test_stated_sigma_is_the_bound_at_the_truth():
     drive, config, leg = made(**SHORT)
     _, method = result()
-    covariance = bound(leg, config, truth(drive, config, leg),
-                       Levels.of_roots(method.details['noise']))
+    details = method.details
+    believed = np.array([details[name]['sigma'] / details['posterior_to_prior'][name]
+                         for name in CONSTANTS[IMPERFECT]])
+    covariance = bound(leg, config, truth(drive, config, leg), Levels.of_roots(details['noise']),
+                       believed)
     sigma = np.sqrt(np.diag(covariance))
     scale = method.estimates['scale_factor']
     # linearised at the estimate or at the truth: the same but for heavy tails

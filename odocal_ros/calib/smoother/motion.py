@@ -24,6 +24,7 @@ from odocal_ros.calib.smoother.state import (
     GYRO,
     GYRO_AXIS,
     GYRO_SIGNAL,
+    LEAN,
     LN_K,
     M,
     ODO_ARM,
@@ -31,9 +32,7 @@ from odocal_ros.calib.smoother.state import (
     P,
     PHI,
     PITCH,
-    SIDESLIP,
     SPEED_OFFSET,
-    SQUAT,
     TYRES,
     V,
     YAW,
@@ -44,9 +43,8 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 D = slice(15, 18)       # rows of the odometer
 ROWS = 18
 # of Motion, what each interval has
-EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'accel_v',
+EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'pushed',
         'from_mean', 'varied', 'travelled', 'residual')
-SPRUNG = 0.07       # s, 2 z / w of a body on springs: 1.3 Hz, damped by 0.3
 RESISTANCE, AIR = 0.1, 1e-4     # m/s^2, 1/m: what a car's tyres pull at a steady speed
 
 
@@ -66,15 +64,18 @@ def gravity_n(position_n, origin):
     return -gravity(latitude, height)[:, None] * (up_e @ C_en(origin.latitude, origin.longitude))
 
 
-def accelerations(state):
-    """Return what springs and sideslip answer to in each interval, vehicle axes: (K, 3) m/s^2."""
+def pushes(state):
+    """
+    Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
+
+    Acceleration forward and left, m/s^2, and their change, m/s^3.
+    """
     T = np.diff(state.t)[:, None]
     # by the axes at mid interval: those at its begin would take the push of a turn for braking
     C_vn = np.swapaxes(state.C_nb @ state.C_bv, 1, 2)
-    accel_v = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(state.v_n, axis=0) / T)
-    if len(T) > 1:       # a body answers to what accelerates it a moment later
-        accel_v -= SPRUNG * np.gradient(accel_v, axis=0) / T
-    return accel_v
+    accel = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(state.v_n, axis=0) / T)[:, :2]
+    jerk = np.gradient(accel, axis=0) / T if len(T) > 1 else np.zeros_like(accel)
+    return np.concatenate([accel, jerk], axis=1)
 
 
 def forward_speed(state):
@@ -169,14 +170,14 @@ class Motion:
     def _vary(self):
         """Work out how scale and forward axis change with speed, time and acceleration."""
         state, T, c = self.state, self.T, self.state.constants
-        self.accel_v = accelerations(state)
+        self.pushed = pushes(state)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(speed, t, speeding_up(state)) - means_by_way(self.sums, state)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
-        self.leaned = state.scale * (
-            np.outer(c[SQUAT] * self.accel_v[:, 0], self.by_pitch[:, 0])
-            + np.outer(c[SIDESLIP] * self.accel_v[:, 1], self.by_yaw[:, 0]))
+        pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
+        self.leaned = state.scale * (np.outer(pitch, self.by_pitch[:, 0])
+                                     + np.outer(yaw, self.by_yaw[:, 0]))
 
     def _unsaid(self, coarse):
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
@@ -226,11 +227,10 @@ class Motion:
         c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
         c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]
-        for column, gradient, lean, accel in ((YAW, self.by_yaw, SIDESLIP, self.accel_v[:, 1]),
-                                              (PITCH, self.by_pitch, SQUAT, self.accel_v[:, 0])):
+        for i, column, gradient in ((0, PITCH, self.by_pitch), (1, YAW, self.by_yaw)):
             turned = -(C @ s.S @ (state.scale * gradient[:, 0]))
             c[:, D, column] = turned + swing @ gradient @ self.arm_v
-            c[:, D, lean] = turned * accel[:, None]
+            c[:, D, LEAN.start + i:LEAN.stop:2] = turned[:, :, None] * self.pushed[:, None, i::2]
         c[:, D, ODO_ARM] = swing @ state.C_bv
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid

@@ -187,12 +187,12 @@ def imperfect_sigmas(grade, duration):
     Those of the Imu by its grade. A receiver that smooths does so over a second.
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;
-    a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2.
+    a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     return np.repeat([grade.gyro_scale_error, axes, grade.gyro_by_force, grade.accel_scale_error,
-                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING_TIME), 4e-3, 3e-3, 5e-3],
-                     SIZES)
+                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING_TIME), 4e-3, 3e-3, 5e-3,
+                      3e-4, 5e-4], SIZES)
 
 
 def _priors(config, grade, leg) -> Priors:

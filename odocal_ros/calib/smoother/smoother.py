@@ -6,7 +6,7 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import fit
-from odocal_ros.calib.smoother.imperfect import judge_imperfect
+from odocal_ros.calib.smoother.imperfect import judge_imperfect, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import no_imu, not_settled, outcome, refused
@@ -98,7 +98,7 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
                   f'needs {FEWEST_FIXES} in {SHORTEST_LEG:.0f} s at least')
 
 
-def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
+def bound(leg: SmootherLeg, config, truth: State, levels: Levels, imperfect=None):
     """
     Return the covariance of the constants at a given state, covariance only.
 
@@ -110,6 +110,8 @@ def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
         Values of all unknowns, at the times of ``keyframe_times``.
     levels : Levels
         Noise levels.
+    imperfect : (k,) array, optional
+        Sigmas of what is imperfect, as IMPERFECT; None: as usual.
 
     Returns
     -------
@@ -118,6 +120,8 @@ def bound(leg: SmootherLeg, config, truth: State, levels: Levels):
 
     """
     problem = Problem.of(leg, config)
+    if imperfect is not None:
+        problem.priors = with_imperfect(problem.priors, imperfect)
     equations = Equations(problem, truth, problem.sums(truth), fitted=True)
     return solve(equations.at(levels).normal()).covariance
 

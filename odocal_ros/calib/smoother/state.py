@@ -33,7 +33,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'accelerometer_scale_x', 'accelerometer_scale_y', 'accelerometer_scale_z',
              'accelerometer_axis_xy', 'accelerometer_axis_zx', 'accelerometer_axis_zy',
              'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
-             'scale_by_braking', 'squat', 'sideslip', 'speed_offset')
+             'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
+             'speed_offset')
 LN_K, YAW, PITCH = 0, 1, 2
 ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)    # from the Imu, base_link axes, m
 ODO_DELAY, GNSS_DELAY = 9, 10
@@ -55,15 +56,17 @@ FIX_LAG2 = 31    # s^2, square of the time constant by which a receiver smooths
 TYRES = slice(32, 36)
 BY_SPEED, BY_TIME = 32, 33
 FAST_SPEED = 20.0           # m/s
-SQUAT, SIDESLIP = 36, 37    # rad per m/s^2: the forward axis by forward and by left acceleration
+# of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
+# change, rad per m/s^3: a body answers late, tyres at once
+LEAN = slice(36, 40)
 # what a good vehicle has not: all to here, but for the gyro's scale, which every turn tells
-IMPERFECT = slice(13, 38)
+IMPERFECT = slice(13, 40)
 # kinds of these, each there or not, as ``imperfect_sigmas`` has them: gyro scales, axes and by
 # force, accelerometer scales and axes, the others one by one
-SIZES = (2, 4, 6, 3, 3, 1, 1, 1, 2, 1, 1)
+SIZES = (2, 4, 6, 3, 3, 1, 1, 1, 2, 1, 1, 1, 1)
 KINDS = tuple(slice(sum(SIZES[:i]), sum(SIZES[:i + 1])) for i in range(len(SIZES)))
 # of a speed sent in steps, what a value of it lacks: half a step where the sender truncates
-SPEED_OFFSET = 38    # scale units per s
+SPEED_OFFSET = 40    # scale units per s
 M = len(CONSTANTS)
 
 
