@@ -20,9 +20,11 @@ from odocal_ros.pipeline.combination import combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
 from odocal_ros.settings.levels import REMARK_SIGMAS
+from odocal_ros.sim.real import Real
 
 STEPS = np.array([0.02, 0.0, 0.05, 0.01])
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
+ACCEL = (3e-3, 0.0, 0.0, 0.0, -2e-3, 0.0, 0.0, 0.0, 0.0)      # scale errors of x and y
 
 
 @pytest.mark.parametrize('first', [1, 2, 4])
@@ -140,22 +142,38 @@ def test_a_result_on_the_disk_goes_on(session):
         assert alone.estimates[SCALE].value == results[2].estimates[SCALE].value
 
 
-def test_what_is_known_of_an_imu_helps_the_next_calibration(session, tmp_path):
+def imu_of(legs, config, folder):
+    """Return settings with the Imu that a calibration of some legs left, and that Imu."""
+    path = folder / 'calibration.json'
+    path.write_text(json.dumps(as_json(combine(legs, config), config, [], 'now')))
+    own = with_settings(config, {'imu.constants': str(path)})
+    return own, known_imu(own)
+
+
+def test_an_imu_known_by_rtk_tells_the_scale_by_slow_fixes(tmp_path):
+    results = []
+    for seed, noise in ((1, 'rtk'), (2, 'correlated')):
+        drive, config, leg = made(duration=200.0, imu_grade='industrial', seed=seed,
+                                  fix_noise=noise, real=Real(accel_matrix=ACCEL))
+        config = with_settings(config, {'imu.accel_scale_sigma': np.nan, 'method': 'smoother',
+                                        'vehicle': 'van'})
+        results.append(smooth(leg, config))
+    legs = legs_of(results)
+    _, imu = imu_of(legs[:1], config, tmp_path)
+    alone, found, whole = (combine(some, config, imu=of).estimates[SCALE] for some, of in (
+        (legs[1:], None), (legs[1:], imu), (legs, None)))
+    # no scale is taken along: less than both legs together tell, and four times what one does
+    assert 3 * whole.sigma < found.sigma < 0.4 * alone.sigma
+    for e in (alone, found):
+        assert abs(e.value - drive.truth.scale) < 3 * e.sigma
+
+
+def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
     config, results = session
     config = with_settings(config, {'leg.automatic': False, 'vehicle': 'van'})
     legs = legs_of(results)
-    path = tmp_path / 'calibration.json'
-    path.write_text(json.dumps(as_json(combine(legs[:2], config), config, [], 'now')))
-    own = with_settings(config, {'imu.constants': str(path)})
-    imu = known_imu(own)
+    own, imu = imu_of(legs[:2], config, tmp_path)
     assert {name.split('_')[0] for name in imu.border.names} == {'gyro', 'accelerometer'}
-    alone, found, whole = (combine(some, config, imu=of) for some, of in (
-        (legs[2:], None), (legs[2:], imu), (legs, None)))
-    for name in (SCALE, YAW):
-        a, b, c = (x.estimates[name] for x in (alone, found, whole))
-        # no mounting and no scale are taken along: less than all legs together tell
-        assert 0.9 * c.sigma < b.sigma < a.sigma, name
-        assert abs(b.value - a.value) < 2 * a.sigma
     # a leg that is in it already does not count twice, an Imu of another vehicle not at all
     assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
         1].estimates[YAW].sigma
