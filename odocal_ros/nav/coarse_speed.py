@@ -66,6 +66,21 @@ class CoarseSpeed:
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
+    def way_variance(self, t: Floats) -> Floats:
+        """
+        Return the variance of the way between n times, s, by rounding: (n - 1,) scale units^2.
+
+        A run of one value has one error, uniform in its cell, which a cruise does not average: as
+        much white noise as adds up to the same over the run.
+        """
+        first = np.flatnonzero(np.diff(self.value, prepend=np.nan))
+        begin = self.t[first]
+        lasts = np.diff(begin, append=self.t[-1])
+        power = self.step**2 / 12 * lasts * (self.value[first] != 0)
+        total = np.interp(t, np.append(begin, self.t[-1]),
+                          np.append(0.0, np.cumsum(power * lasts)))
+        return np.diff(total)
+
     @cached_property
     def told(self) -> Told:
         """

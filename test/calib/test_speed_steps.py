@@ -104,6 +104,19 @@ def test_steps_too_fine_for_crossings_have_an_offset():
     assert offset['value'] == pytest.approx(0.03 * KMH, abs=4 * offset['sigma'])
 
 
+def test_what_a_robot_at_one_speed_rounds_is_in_its_sigma():
+    errors = []
+    for seed in range(4):
+        drive, result = calibrated('round', 20.0, 0.056 * KMH, scenario='yard', seed=seed,
+                                   imu_grade='industrial', fix_noise='rtk', fix_sigma=0.01)
+        smoother = result.methods['smoother']
+        off, sigma = error(drive, smoother)
+        errors.append(off / sigma)
+        assert 'speed_steps' in {s.name for s in smoother.sources}
+    # of four squares the sum is below 18.5 in 999 of 1000
+    assert (np.array(errors)**2).sum() < 18.5, errors
+
+
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_half_metre_pulses_are_named_and_no_slip(seed):
     drive, result = calibrated(odometer='counts', rate=50.0, step=0.0, scale=0.505,

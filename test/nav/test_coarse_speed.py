@@ -110,3 +110,22 @@ def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
     assert len(told.t) > 800
     assert abs((error / told.sigma).mean()) < 3.3 / np.sqrt(len(told.t))
     assert np.sqrt(((error / told.sigma)**2).mean()) < 1.1
+
+
+def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
+    rng, step = np.random.default_rng(4), 0.02
+    t = np.arange(0.0, 200.0, 0.05)
+    errors, told = [], None
+    for _ in range(200):
+        # two cruises of 60 s, a stop, and a way up that passes a cell in every row
+        speed = np.interp(t, [0, 60, 100, 160, 161], [*[rng.uniform(1, 2)] * 2,
+                                                      *[rng.uniform(6, 7)] * 2, 0.0])
+        sent = np.rint(speed / step) * step
+        found = CoarseSpeed(step, t, sent)
+        told = found.way_variance(np.arange(0.0, 200.0))
+        errors.append(((sent - speed) * 0.05).sum())
+    # nothing while it stands, and of the way up less than of 60 s at a speed
+    assert told[162:].max() == 0.0
+    assert told[60:100].sum() < 0.02 * told.sum()
+    # in all, by 200 drives to 1 / sqrt(400): three of those
+    assert np.var(errors) == pytest.approx(told.sum(), rel=0.15 * 2)

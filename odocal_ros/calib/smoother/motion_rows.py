@@ -8,6 +8,7 @@ from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
 from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
+from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.state import M
 
 FIRST_ROAD = 0.01    # m/sqrt(s), what slip and slide are believed to be at first
@@ -134,10 +135,17 @@ class MotionRows(Part):
 
     def effects(self, near):
         """Yield what the unit noises of each level do."""
-        X = np.concatenate([self.to_told(block) @ self._units(rows)[1]
-                            for rows, block in near.blocks()])
+        units, given = [], []
+        for rows, block in near.blocks():
+            told = self.to_told(block)
+            units.append(told @ self._units(rows)[1])
+            given.append(told @ np.swapaxes(self._J(rows), 1, 2)
+                         @ (self.whiten[rows] @ self.noise.given[rows]))
+        X = np.concatenate(units)
         for name in INTERVAL:
             yield NAMES[name], X[:, :, self.of(name)]
+        if self.noise.given.shape[2]:
+            yield SpeedSteps.source, np.concatenate(given)
 
     def road_noise(self, near):
         """

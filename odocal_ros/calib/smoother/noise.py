@@ -156,15 +156,22 @@ def _given(motion, leg, axes, rest):
     """
     Return noises of a way that is told by speeds in steps: (K, 18, g).
 
-    Along the way itself it says nothing: what it tells is in speed_steps.py. In a turn an error
-    that goes from one end of its cell to the other amid the interval moves the end sideways.
+    Fine steps round. Along the way itself coarse ones say nothing: what they tell is in
+    speed_steps.py. In a turn an error that goes from one end of its cell to the other amid the
+    interval moves the end sideways.
     """
-    if not leg.by_steps:
+    coarse = leg.travel.coarse
+    if coarse is None:
         return np.zeros((len(rest), ROWS, 0))
+    if not leg.by_steps:
+        sigma = motion.state.scale * np.sqrt(coarse.way_variance(motion.state.t))
+        given = np.zeros((len(rest), ROWS, 1))
+        given[:, D, 0] = axes[:, 0] * sigma[:, None]
+        return given * ~rest[:, None, None]
     size = np.linalg.norm(motion.way, axis=1, keepdims=True)
     along = np.where(size > 1e-3, motion.way / np.maximum(size, 1e-3), axes[:, 0])
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
-    most = motion.state.scale * leg.travel.coarse.most * motion.T[:, 0]
+    most = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
     given[:, D, 0] = along * np.sqrt(ABSENT_VARIANCE)
     given[:, D, 1] = axes[:, 1] * (most * turned / 8)[:, None]

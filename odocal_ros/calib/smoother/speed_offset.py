@@ -2,7 +2,7 @@
 Whether a sender of coarse speeds truncates or rounds, where the drive tells.
 
 A leg is fitted with anything between, since the grid does not say. What the drive then finds lies
-at one of the two, many sigmas from the other, and to know it exactly halves the scale's sigma.
+at one of the two, far from the other, and to know it exactly halves the scale's sigma.
 """
 
 from dataclasses import replace
@@ -12,8 +12,8 @@ import numpy as np
 from odocal_ros.calib.smoother.estimate import Fit, fit
 from odocal_ros.calib.smoother.state import SPEED_OFFSET
 
-TELLING_SIGMAS = 8.0    # sigmas between both
-NEAR_SIGMAS = 2.5       # sigmas from one of them
+TELLING_ODDS = 1e3      # of one against the other, by what the drive finds
+NEAR_SIGMAS = 3.5       # sigmas from that one
 EXACT_SHARE = 1e-3      # of a step, sigma of what is known
 OFFSET_PASSES = 6       # passes
 
@@ -30,7 +30,8 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
     sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     found = float(now.state.constants[SPEED_OFFSET])
     known = coarse.step / 2 if found > coarse.step / 4 else 0.0
-    if TELLING_SIGMAS * sigma > coarse.step / 2 or abs(found - known) > NEAR_SIGMAS * sigma:
+    off, other = (abs(found - x) / sigma for x in (known, coarse.step / 2 - known))
+    if off > NEAR_SIGMAS or other**2 - off**2 < 2 * np.log(TELLING_ODDS):
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
