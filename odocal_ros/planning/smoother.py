@@ -5,7 +5,7 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import Fit, ROAD_NOISE
+from odocal_ros.calib.smoother.estimate import Fit, SLIPPING
 from odocal_ros.calib.smoother.imperfect import judged_priors
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.noise import Levels
@@ -78,7 +78,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
     for the correlation time. Never less than the smoother believes in.
     """
     grade = grade_of(sigmas.config.imu)
-    road = dict.fromkeys(ROAD_NOISE, sigmas.sway**2 / SWAY_RATE)
+    road = dict.fromkeys(SLIPPING, sigmas.sway**2 / SWAY_RATE)
     road |= dict.fromkeys(('along', 'along_hard'), sigmas.slip**2)
     tau = sigmas.correlation_time
     white, up = WHITE_SHARE**2 if tau else 1.0, sigmas.covariance_n[2, 2]

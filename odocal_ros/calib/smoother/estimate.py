@@ -15,7 +15,9 @@ from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.part import JUMP, SPREAD
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.state import (
     GYRO_SCALE,
     IMPERFECT,
@@ -46,7 +48,9 @@ LEVEL_INERTIA = 1.0
 # power on the steps of a level: at first (the fixed point is slow where a noise is small), more
 # with each step the same way, less with each that turns back
 RELAXATION, SPEED_UP, SLOW_DOWN, MOST_RELAXATION = 1.6, 1.25, 0.5, 3.0
-ROAD_NOISE = ('along', 'along_hard', 'side', 'side_turn', 'up')
+# levels of rows that slips and jumps are factors on
+SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
+JUMPING = ('slow', 'slow_up', 'correlation_time')
 SLIP_STIRS = 0.05    # relative change of a slip's variance from which it moves
 SLIP_SIGMAS = 3.0    # sigmas beyond which an interval of the odometer is a slip
 PRIOR_GIVES_WAY = 2.0    # sigmas of a prior beyond which it gives way
@@ -63,7 +67,7 @@ class WarmStart:
     levels: Levels
     priors: Priors           # as the data left them
     first: Priors            # as they were before any gave way
-    spread: np.ndarray       # (K, 3) factors on the odometer's variances: slips
+    spread: np.ndarray       # (K, SPREAD) factors on variances: slips, jumps of slow fix errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +123,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, fro
     before, still, settled, fitted = np.ones(3), 0.0, False, about is not None
     was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
-    spread = about.spread if about else np.ones((len(state.t) - 1, 3))
+    spread = about.spread if about else np.ones((len(state.t) - 1, SPREAD))
     tails, slipping = 1 if about else FIRST_TAILS, False
     pace: dict[str, tuple[float, float]] = {}
     count = 0
@@ -148,7 +152,7 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, fro
         if not frozen:
             near = solved.neighbours()
             tail = tails <= count <= LAST_TAILS
-            # slips and the road's levels are factors on the same rows: never both in one pass
+            # slips and the levels of what slips are factors on the same rows: never in one pass
             found = slips(weighted, near, spread) if tail and not slipping else spread
             slipping = bool(np.abs(np.log(found / spread)).max() > SLIP_STIRS)
             levels = update(weighted, near, levels, problem, pace, slipping)
@@ -167,18 +171,19 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
     """
     Return levels moved towards the maximum of the restricted likelihood.
 
-    pace : power and last step of each level, kept up to date.   slipping : leave the road alone.
+    pace : power and last step of each level, kept up to date.   slipping : leave levels alone that
+    slips and jumps are factors on.
     """
     new = {}
     for name, (quadratic, expected) in weighted.components(neighbours).items():
-        if slipping and name in ROAD_NOISE:
+        if slipping and name in SLIPPING + JUMPING:
             continue
         level = levels[name]
         pseudo = SENSOR.get(name, LEVEL_INERTIA)
         pull = pseudo * (problem.first_levels[name] / level if name in SENSOR else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
-        first = RELAXATION if name in ROAD_NOISE or name in SENSOR else 1.0
+        first = RELAXATION if name in SLIPPING or name in SENSOR else 1.0
         relaxation, last = pace.get(name, (first, 0.0))
         relaxation = relaxation * (SLOW_DOWN if step * last < 0 else SPEED_UP if last else 1.0)
         pace[name] = min(relaxation, MOST_RELAXATION), step
@@ -188,12 +193,18 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
 
 
 def slips(weighted, neighbours, spread):
-    """Return factors on the odometer's variances where an interval lies far out: (K, 3)."""
+    """Return factors on variances where an interval lies far out: (K, SPREAD)."""
     noise, found = weighted[MotionRows].road_noise(neighbours)
+    jumps = np.zeros((2, len(noise), 1))
+    if 'slow' in weighted.parts:
+        jumps = weighted[SlowError].jumps(neighbours)
+    noise, found = (np.concatenate(x, axis=1) for x in zip((noise, found), jumps, strict=True))
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
+    wanted = np.clip(spread * z2 / SLIP_SIGMAS**2, 1.0, 1e6)
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
-    return np.sqrt(spread * np.clip(spread * z2 / SLIP_SIGMAS**2, 1.0, 1e6))
+    wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
+    return wanted
 
 
 def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Priors:

@@ -16,6 +16,9 @@ from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
 
+# factors on the odometer's variances along, to the side and up (slips), and on that of what drives
+# the slow fix error (a receiver that jumps)
+SPREAD, JUMP = 4, 3
 WANTED = 3    # constants that the budget is of: ln K, yaw, pitch
 
 
@@ -26,7 +29,7 @@ class Here:
 
     points : sums to the times of the rows, by the name of their part.   gyro_change (K, 3) rad/s,
     odo_later, fix_later s : by what gyro bias and delays exceed those that the sums were made
-    with.   spread : (K, 3) factors on the odometer's variances along, to the side and up (slips).
+    with.   spread : (K, SPREAD) factors on the variances of intervals that lie far out.
     fitted : as for ``Motion``.
     """
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.part import hold, link, Part
+from odocal_ros.calib.smoother.part import hold, JUMP, link, Part
 from odocal_ros.calib.smoother.state import SLOW
 
 LEAST_SLOW = 0.005    # m
@@ -24,6 +24,7 @@ class SlowError(Part):
 
     def __init__(self, problem, here):
         self.state, self.T = here.state, here.intervals.T
+        self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
         self.told = not np.isnan(problem.fix_time)
 
     @classmethod
@@ -43,7 +44,7 @@ class SlowError(Part):
         decay = np.exp(-self.T / levels.correlation_time)
         gain = np.array([levels['slow'], levels['slow'], levels['slow_up']])
         self.power = gain * levels.correlation_time / 2
-        self.drive = np.multiply.outer(1 - decay**2, self.power)
+        self.drive = np.multiply.outer(1 - decay**2, self.power) * self.jump
         self.decay = decay[:, None]
         self.log_R = np.log(self.drive).sum() + np.log(self.power).sum()
 
@@ -64,10 +65,9 @@ class SlowError(Part):
 
     def components(self, near):
         """Return of each level its quadratic sum and what is expected of it."""
-        i, n, s = np.arange(SLOW.start, SLOW.stop), self.n, self.state.slow_n
+        i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
-        before, both, after = (near.entries(*at) for at in ((i, i), (i, n + i), (n + i, n + i)))
-        var = after + a**2 * before - 2 * a * both
+        before, both, var = self._variances(near)
         num, den = r**2 / q, 1 - var / q
         begin, begin_var = s[0]**2 / self.power, near[0][i, i] / self.power
         level = num.sum(axis=0) + begin, den.sum(axis=0) + (1 - begin_var)
@@ -77,6 +77,23 @@ class SlowError(Part):
             found['correlation_time'] = self._time(
                 r * s[:-1] + both - a * before, num - den, begin + begin_var - 1)
         return found
+
+    def _variances(self, near):
+        """Return variances left: of the value before, with that after, of the drive: (K, 3)."""
+        i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
+        before, both, after = (near.entries(*at) for at in ((i, i), (i, n + i), (n + i, n + i)))
+        return before, both, after + a**2 * before - 2 * a * both
+
+    def jumps(self, near):
+        """
+        Return what drives the error in each interval, on the axis that it moves most: (2, K, 1).
+
+        As of the road: the best estimate in its own sigmas, and the variance that it should have.
+        """
+        seen = np.clip(1 - self._variances(near)[2] / self.drive, 1e-12, None)
+        z = self.residual() / np.sqrt(self.drive)
+        most = np.argmax(np.abs(z) / np.sqrt(seen), axis=1)[:, None]
+        return np.stack([np.take_along_axis(x, most, axis=1) for x in (z, seen)])
 
     def _time(self, product, excess, begin):
         """

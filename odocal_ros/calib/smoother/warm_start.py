@@ -14,6 +14,7 @@ from odocal_ros.calib.smoother.imperfect import with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.part import SPREAD
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW
@@ -52,7 +53,7 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     state = State(**{name: value if name == 'constants' else value[at]
                      for name, value in vars(last.state).items()})
     slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
-    spread = np.concatenate([slipped, np.ones((len(t) - n, 3))])
+    spread = np.concatenate([slipped, np.ones((len(t) - n, SPREAD))])
     levels = problem.first_levels.but(**last.levels.values)
     first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
     return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors,
