@@ -74,9 +74,7 @@ def found(args):
         if last is None:      # what a broken counter says is odd
             continue
         invented.update(['odd leg'] * len(row.odd_legs.split()))
-        first = max((change['bag'] - 1 for change in vehicle['changes']), default=0)
-        true = {'scale_factor': vehicle['scale_factor'][last] if args.now else
-                float(np.mean(vehicle['scale_factor'][first:])),
+        true = {'scale_factor': vehicle['scale_factor'][last],
                 'yaw_mounting_angle': np.deg2rad(vehicle['yaw_mounting_deg'][last])}
         for name, values in deviates.items():
             if not pd.isna(row[name]):
@@ -319,8 +317,6 @@ def main():
         sub.add_argument('--port', type=int, default=28786)
         if function is found:
             sub.add_argument('result', type=Path)
-            sub.add_argument('--now', action='store_true', help='compare with the scale of the '
-                             'last leg, as the smoother gives it; else with the mean of the legs')
         if function is kills:
             sub.add_argument('--every', type=float, default=20.0)
             sub.add_argument('--patience', type=float, default=120.0)

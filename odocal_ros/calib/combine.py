@@ -13,7 +13,7 @@ from odocal_ros.reasons import Code, Reason
 DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
 
 
-def combine_method(name, results) -> MethodResult:
+def combine_method(name, results, walked=None) -> MethodResult:
     """
     Combine what one method says of several legs.
 
@@ -23,26 +23,29 @@ def combine_method(name, results) -> MethodResult:
         The method.
     results : list of MethodResult
         One a leg, at least one.
+    walked : (J,) array, optional
+        Variance of the random walk of ln K from each leg to the last; None: it stays.
 
     Returns
     -------
-    MethodResult: each parameter the mean with the least variance; the sigma holds
-    what is shared once. A spread beyond the sigmas widens them (LEGS_DISAGREE).
+    MethodResult: each parameter the mean with the least variance, a scale as the last leg has it;
+    the sigma holds what is shared once. A spread beyond the sigmas widens them (LEGS_DISAGREE).
 
     """
     if len(results) == 1:
         return results[0]
     parameters = results[0].parameters
+    walked = np.zeros(len(results)) if walked is None else walked
     reasons: tuple[Reason, ...] = ()
     estimates: dict[str, Estimate] = {}
     sources: dict[str, list] = {}
     for i, parameter in enumerate(parameters):
-        have = [r for r in results if r.estimates[parameter].value is not None]
+        told = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
         unit = results[0].estimates[parameter].unit
-        if not have:
+        if not told:
             estimates[parameter] = Estimate(None, None, unit)
             continue
-        value, own, shared, why = _combine(parameter, i, have)
+        value, own, shared, why = _combine(parameter, i, [results[k] for k in told], walked[told])
         reasons += why
         relative = value if parameter.startswith('scale_factor') else 1.0
         sigma = abs(relative) * float(np.sqrt(own + sum(v @ v for v in shared.values())))
@@ -81,7 +84,7 @@ def _details(sources, parameters, estimates):
             'correlation': correlations(total_covariance(rows), names)}
 
 
-def _combine(parameter, i, have):
+def _combine(parameter, i, have, walked):
     """Return value, own variance, shared effects by source, reasons of one parameter."""
     relative = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in have])
@@ -91,18 +94,20 @@ def _combine(parameter, i, have):
         y = x - ((x - x[0]) - wrap(x - x[0]))
     own = np.array([sum(s.effects[i] @ s.effects[i] for s in r.sources if not s.shared)
                     for r in have])
-    own = np.maximum(own, 1e-18)
+    own = np.diag(np.maximum(own, 1e-18))
+    if relative:    # back from the last leg, two of them have walked the way of the nearer alike
+        own += np.minimum.outer(walked, walked)
     names = {s.name for r in have for s in r.sources if s.shared}
     by_leg = {n: np.stack([_effect(r, n, i) for r in have]) for n in sorted(names)}
-    weight = _weights(np.diag(own) + sum(g @ g.T for g in by_leg.values()))
+    weight = _weights(own + sum(g @ g.T for g in by_leg.values()))
     mean = weight @ y
     shared = {n: weight @ g for n, g in by_leg.items()}
-    variance = weight**2 @ own
+    variance = weight @ own @ weight
     # what legs may differ by: their own errors, and shared ones that act differently
-    apart = own + sum(((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
-                      for n, g in by_leg.items())
+    apart = own + np.diag(sum((((g if n in DRAWN_ANEW else g - shared[n])**2).sum(axis=1)
+                               for n, g in by_leg.items()), np.zeros(len(y))))
     freedom = len(y) - 1
-    chi2 = float(((y - mean)**2 / apart).sum()) if freedom else 0.0
+    chi2 = float((y - mean) @ np.linalg.solve(apart, y - mean)) if freedom else 0.0
     reasons: tuple[Reason, ...] = ()
     if freedom and deviate(chi2, freedom) > Z95:
         factor = np.sqrt(chi2 / freedom)

@@ -3,13 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.choice import choose, worth_saying
 from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.one_vehicle import unlike_legs
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
-from odocal_ros.calib.smoother.several import combine_legs
+from odocal_ros.calib.smoother.several import combine_legs, DAY
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -131,7 +133,8 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
     if len(results) > 1 and all(r.border for r in results):
         return combine_legs(results, times_ns, config, numbers)
-    return combine_method(name, results)
+    walked = config.verdict.scale_drift_per_day**2 * (max(times_ns) - np.asarray(times_ns)) / DAY
+    return combine_method(name, results, walked)
 
 
 def _combined(name: str, driven: Sequence[tuple[MethodResult, int, int]], config: Config,

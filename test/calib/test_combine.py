@@ -140,6 +140,37 @@ def test_the_combined_sigma_holds_for_drawn_legs():
     assert 0.88 < np.std(z) < 1.11
 
 
+def weekly(scales):
+    """Return legs a week apart."""
+    week = 7 * 86_400 * 10**9
+    return [replace(leg(method(scale=scale)), start_ns=k * week, stop_ns=k * week + 900)
+            for k, scale in enumerate(scales)]
+
+
+WALK = CONFIG.verdict.scale_drift_per_day * 7**0.5      # of ln K in a week, 1 sigma
+
+
+def test_a_scale_that_walks_is_that_of_the_last_leg():
+    """Two legs: the first knows the last one's scale by OWN and the walk, the last by OWN."""
+    first, last = OWN**2 + WALK**2, OWN**2
+    e = combine(weekly([0.02, 0.02 * np.exp(1e-4)]), CONFIG).estimates[SCALE]
+    assert np.log(e.value / 0.02) == pytest.approx(1e-4 * first / (first + last))
+    assert e.sigma / e.value == pytest.approx(np.sqrt(first * last / (first + last)))
+
+
+def test_the_sigma_of_a_walking_scale_holds_for_drawn_legs():
+    """1000 draws of six weeks: variance within 5 * sqrt(2/1000); a twentieth disagrees."""
+    rng, z, named = np.random.default_rng(8), [], 0
+    for _ in range(1000):
+        true = np.cumsum(WALK * rng.standard_normal(6))
+        whole = combine(weekly(0.02 * np.exp(true + OWN * rng.standard_normal(6))), CONFIG)
+        e = whole.estimates[SCALE]
+        z.append((np.log(e.value / 0.02) - true[-1]) * e.value / e.sigma)
+        named += Code.LEGS_DISAGREE in {r.code for r in whole.reasons}
+    assert 0.88 < np.sqrt(np.mean(np.square(z))) < 1.11
+    assert 0.02 < named / 1000 < 0.08     # 5 % +- 3 * 0.7 %, and the approximation's 1 %
+
+
 def test_a_leg_without_a_yaw_still_gives_its_scale():
     whole = combine_method('two_point', [method(refused=[YAW]), method()])
     assert whole.estimates[SCALE].sigma / 0.02 == pytest.approx(OWN / np.sqrt(2))
