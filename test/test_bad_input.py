@@ -397,6 +397,23 @@ def test_an_odometer_that_does_not_count(made, leg, nominal):
     assert said[Code.ODOMETER_STILL] == 'the fixes move, the odometer does not count'
 
 
+def test_an_odometer_that_stops_counting_on_the_way(made, leg):
+    """What a wheel loses as it slides for some metres is slip; more is a counter that stands."""
+    t = seconds(leg, leg.odometer)
+
+    def stands(begin, end):
+        def value(counts):
+            here = counts[(t >= begin) & (t < end)]
+            return np.where(t < end, np.minimum(counts, here[0]), counts - np.ptp(here))
+        return run(replace(leg, odometer=changed(leg.odometer, value=value)), settings(made))
+    result, said = stands(40.0, np.inf)
+    assert rejecting(result) == {Code.ODOMETER_STILL}
+    assert re.fullmatch(r'the fixes move on by \d+ m from t = 40 s to \d+ s, the odometer does '
+                        'not count', said[Code.ODOMETER_STILL])
+    assert Code.ODOMETER_STILL in stands(40.0, 60.0)[1]
+    assert Code.ODOMETER_STILL not in stands(40.0, 41.0)[1]
+
+
 def test_fixes_that_do_not_move(made, leg):
     stuck = changed(leg.fix, latitude=lambda a: a * 0 + a[0], longitude=lambda a: a * 0 + a[0])
     result, said = run(replace(leg, fix=stuck), settings(made))

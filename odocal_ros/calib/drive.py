@@ -10,6 +10,8 @@ from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST
 
 MOVED_SPREAD = 20.0    # m over which fixes must spread to say that the vehicle moved
+STOPPED_SPREAD = 100.0  # m of the same while a counter stands: no wheel slides, no fix strays as far
+STOPPED_SHARE = 0.05    # of the way, least: tyres that differ by less are seen
 EDGE_TIME = 0.5        # s of odometer missing at a mark worth saying
 ASTRAY_FIX = 50.0      # m by which any fix may be off
 TURNS_SHARE = 0.1      # of the distance: more of it in turns is worth saying
@@ -80,24 +82,40 @@ def uncovered(travel, t_stop) -> tuple[Reason, ...]:
 
 def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
     """Return why there is no leg where wheels or fixes show no motion, empty where both do."""
-    first = np.searchsorted(t_fix, -0.5)
-    here = fixes_n[max(0, first - 3):np.searchsorted(t_fix, t_stop + 0.5), :2]
+    rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
+    t_here, here = t_fix[rows], fixes_n[rows, :2]
     if len(here) < 2:
         return (Reason(Code.NO_FIX, f'{len(here)} usable fix{"es" * (len(here) != 1)} between the '
                        'marks'),)
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
+        t_here = t_here[1:-1]
     fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(MOVED_SPREAD, 10 * fix_sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        return ()
+        return _stopped(travel, t_here, here, max(STOPPED_SPREAD, 10 * fix_sigma))
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, the odometer does not count'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the fixes stay in one place while the odometer counts'
                    if wheels_move else 'the vehicle did not move'),)
+
+
+def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
+    """Say where a counter stood while (k, 2) fixes at (k,) s spread by ``least`` m and more."""
+    counts = np.flatnonzero(np.diff(travel.s))
+    begin = travel.t[np.append(0, counts + 1)]
+    end = travel.t[np.append(counts, len(travel.t) - 1)]
+    lost = [(float(np.hypot(*np.ptp(fixes[pick], axis=0))), begin[k], end[k])
+            for k in np.flatnonzero(end - begin > least / FASTEST)
+            if (pick := (t >= begin[k]) & (t <= end[k])).any()]
+    far, since, until = max(lost, default=(0.0, 0.0, 0.0))
+    if far < least or far < STOPPED_SHARE * way_and_chord(t, fixes)[0]:
+        return ()
+    return (Reason(Code.ODOMETER_STILL, f'the fixes move on by {far:.0f} m from t = {since:.0f} s '
+                   f'to {until:.0f} s, the odometer does not count'),)
 
 
 def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
