@@ -82,8 +82,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'Where the Imu shows it, off a stop, that stretch was counted backwards.',
         Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '
         'mean backwards, or the Imu faces backwards. Or speeding up pushes the Imu backwards.',
-        Code.ODOMETER_STILL: 'The fixes move on, the counter stays: from the start, or for 100 m and more of '
-        'the drive.',
+        Code.ODOMETER_STILL: 'The fixes move on, the counter stays: from the start, or for 100 m '
+        'and more of the drive.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro turns much farther or faster than '
         'a vehicle does: g, deg/s or another unit.',
         Code.IMU_LOOKS_Z_DOWN: 'Gravity shows on -z, as on an Imu whose axes are '

@@ -10,8 +10,8 @@ from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST
 
 MOVED_SPREAD = 20.0    # m over which fixes must spread to say that the vehicle moved
-STOPPED_SPREAD = 100.0  # m of the same while a counter stands: no wheel slides, no fix strays as far
-STOPPED_SHARE = 0.05    # of the way, least: tyres that differ by less are seen
+STOPPED_SPREAD = 100.0  # m of it while a counter stands: no wheel slides, no fix strays so far
+STOPPED_SHARE = 0.05   # of the way, least: tyres that differ by less are seen
 EDGE_TIME = 0.5        # s of odometer missing at a mark worth saying
 ASTRAY_FIX = 50.0      # m by which any fix may be off
 TURNS_SHARE = 0.1      # of the distance: more of it in turns is worth saying

@@ -81,7 +81,7 @@ def _frame(client: Any, jobs: Sequence[Any]) -> Any:
 
     from odocal_ros.fleet.jobs import computed_rows
     from odocal_ros.fleet.rows import rows_of, RowStore
-    from odocal_ros.fleet.vehicles import rows_of_legs
+    from odocal_ros.fleet.tables import rows_of_legs
     store = RowStore(jobs[0].folder)
     files = {i: store.path(done.key) for i, done in computed_rows(client, jobs)}
     table = []

@@ -18,9 +18,9 @@ from odocal_ros.fleet.second_stage import (
     file_name,
     flagged,
     vehicle_jobs,
-    VEHICLES,
     vehicles_together,
 )
+from odocal_ros.fleet.tables import VEHICLES
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import write_text
 from odocal_ros.reasons import Verdict

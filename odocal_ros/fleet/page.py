@@ -12,7 +12,8 @@ import numpy as np
 from odocal_ros import __version__
 from odocal_ros.fleet.outcome import file_name, remarks
 from odocal_ros.fleet.population import LEAST, population
-from odocal_ros.fleet.second_stage import COMPARED, LEGS
+from odocal_ros.fleet.second_stage import COMPARED
+from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
 
 DEG = 57.29577951308232

@@ -1,6 +1,6 @@
 """From rows to vehicles on the engine: groups of vehicles, each a task that writes its part."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
 import json
@@ -14,10 +14,17 @@ import numpy as np
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.engine import results
 from odocal_ros.fleet.population import FAR, population
+from odocal_ros.fleet.tables import (
+    batches,
+    in_batches,
+    leg_schema,
+    LEGS,
+    vehicle_schema,
+    VEHICLES,
+    write_table,
+)
 from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
-from odocal_ros.outside.whole import whole_file
 
-LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 TOGETHER = 500       # bags of a group of vehicles, at least
 COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WORST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
@@ -65,8 +72,8 @@ def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, fil
             found[k] = rows
             tell(len(rows))
         vehicles = beside_their_model([row for k in sorted(found) for row in found[k]])
-        _write(folder / LEGS, leg_schema(), _batches(sorted(parts.glob('*.parquet'))))
-        _write(folder / VEHICLES, vehicle_schema(), _in_batches(vehicles))
+        write_table(folder / LEGS, leg_schema(), batches(sorted(parts.glob('*.parquet'))))
+        write_table(folder / VEHICLES, vehicle_schema(), in_batches(vehicles))
         return vehicles
     finally:
         shutil.rmtree(parts, ignore_errors=True)
@@ -152,77 +159,3 @@ def _badness(row: dict[str, Any]) -> tuple:
     return (not row['legs'] and -1 or 0, WORST.index(judged), not row['outlier'],
             row['rejected_since'] is None, -len(json.loads(row['changes'])), -row['bags_failed'],
             not row['rejected_for'], -far, row['vehicle'])
-
-
-def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') -> Any:
-    import pyarrow as pa
-    kinds = ((texts, pa.string()), (times, pa.timestamp('us', 'UTC')), (counts, pa.int64()),
-             (flags, pa.bool_()), (numbers, pa.float64()))
-    return pa.schema([(name, kind) for names, kind in kinds for name in names.split()])
-
-
-VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in (
-    'scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle'))
-
-
-def leg_schema() -> Any:
-    """Return the columns of legs.parquet."""
-    return _schema('vehicle model bag verdict reasons unit',
-                   f'odometer_km duration_s distance_m {VALUE_COLUMNS}',
-                   'leg start_ns stop_ns fixes period', 'start', 'odd')
-
-
-def vehicle_schema() -> Any:
-    """Return the columns of vehicles.parquet."""
-    return _schema(
-        'vehicle model decision verdict unit why remedy reasons changes odd_legs '
-        'outlier failures rejected_for',
-        f'{VALUE_COLUMNS} drift_per_year drift_per_year_sigma drift_per_1000_km '
-        'drift_per_1000_km_sigma distance_km driven_h scale_deviate yaw_deviate pitch_deviate',
-        'bags bags_failed legs legs_good', 'first last since rejected_since')
-
-
-def _in_batches(rows: list[dict[str, Any]]) -> Iterator[Any]:
-    import pyarrow as pa
-    for k in range(0, len(rows), 1000):
-        yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
-
-
-def _batches(parts: Sequence[Path]) -> Iterator[Any]:
-    import pyarrow.parquet as pq
-    for part in parts:
-        yield pq.read_table(part, partitioning=None)
-
-
-def _write(path: Path, schema: Any, tables: Iterable[Any]) -> None:
-    """Write tables one after the other as one file, whole or not at all."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-    with whole_file(path) as file, pq.ParquetWriter(
-            pa.PythonFile(_Sink(file), mode='w'), schema, compression='zstd') as writer:
-        for table in tables:
-            if table.num_rows:
-                writer.write_table(table)
-
-
-class _Sink:
-    """A file that pyarrow may write to and believes it has closed."""
-
-    closed = False
-
-    def __init__(self, file: Any) -> None:
-        self._file, self._at = file, 0
-
-    def write(self, data: bytes) -> int:
-        self._at += len(data)
-        self._file.write(bytes(data))
-        return len(data)
-
-    def tell(self) -> int:
-        return self._at
-
-    def flush(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime, UTC
 import json
 import math
 from pathlib import Path
@@ -18,18 +17,16 @@ from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.changes import Change, covariance, DAY_NS, History, history
 from odocal_ros.fleet.leg_text import legs_from
 from odocal_ros.fleet.rows import DONE, Row, rows_of
+from odocal_ros.fleet.tables import leg_row, utc, VALUES
 from odocal_ros.library.bags import told_apart
 from odocal_ros.nav.angles import wrap
 from odocal_ros.output.acceptance import accept_line
 from odocal_ros.output.stored import known_imu
-from odocal_ros.outside.names import one_line
 from odocal_ros.pipeline.acceptance import accept, Decision
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, with_settings
 
-VALUES = {'scale_factor': '', 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-          'pitch_mounting_angle': 'rad'}
 YEAR = 365.25        # days
 
 
@@ -177,8 +174,8 @@ def _told(calibration: Calibration, config: Config, driven: Sequence[_Driven],
         'legs': len(legs), 'legs_good': sum(g.verdict is not Verdict.REJECTED for g in legs),
         'distance_km': sum(g.distance for g in legs) / 1000,
         'driven_h': sum(g.duration for g in legs) / 3600,
-        'first': _utc(legs[0].start_ns), 'last': _utc(legs[-1].start_ns),
-        'unit': scale.unit if scale else '', 'since': _utc(legs[starts[-1]].start_ns),
+        'first': utc(legs[0].start_ns), 'last': utc(legs[-1].start_ns),
+        'unit': scale.unit if scale else '', 'since': utc(legs[starts[-1]].start_ns),
         'verdict': calibration.verdict.value,
         'decision': acceptance.decision.value if acceptance else '',
         'why': acceptance.why if acceptance else '',
@@ -197,7 +194,7 @@ def _rejected(driven: Sequence[_Driven]) -> dict[str, Any]:
     good = [k for k, leg in enumerate(legs) if leg.verdict is not Verdict.REJECTED]
     since = max(good, default=-1) + 1
     return {'rejected_for': ' '.join(codes),
-            'rejected_since': _utc(legs[since].start_ns) if since < len(legs) else None}
+            'rejected_since': utc(legs[since].start_ns) if since < len(legs) else None}
 
 
 def _changes(histories: dict, driven: Sequence[_Driven]) -> dict[str, Any]:
@@ -230,33 +227,5 @@ def _leg_row(job: VehicleJob, k: int, one: _Driven, starts: Sequence[int],
         'odd': any(k in (number[i] for i in told.odd) for number, told, _ in histories.values())}
 
 
-def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
-            leg: LegResult) -> dict[str, Any]:
-    """Return a leg as a row of a table."""
-    estimates = leg_estimates(leg)
-    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
-    row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
-           'odometer_km': odometer_km, 'start': _utc(leg.start_ns), 'start_ns': leg.start_ns,
-           'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
-           'fixes': leg.fixes, 'verdict': leg.verdict.value,
-           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
-    for name in VALUES:
-        e = estimates.get(name)
-        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
-    return row | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
-
-
-def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
-    """Return the legs of a bag's row as rows of a table; of one that failed a row without."""
-    of_bag = {'status': row.status, 'reason': row.reason}
-    return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
-            for k, leg in enumerate(legs_from(row.legs), 1)] or [
-        {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **of_bag}]
-
-
-def _utc(stamp_ns: int) -> datetime:
-    return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
-
-
 def _iso(stamp_ns: int) -> str:
-    return f'{_utc(stamp_ns):%Y-%m-%dT%H:%M:%SZ}'
+    return f'{utc(stamp_ns):%Y-%m-%dT%H:%M:%SZ}'

@@ -1,0 +1,119 @@
+"""The tables of a fleet: columns of legs.parquet and vehicles.parquet, a leg as a row, writing."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime, UTC
+from pathlib import Path
+from typing import Any
+
+from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.result import LegResult
+from odocal_ros.fleet.bags import FleetBag
+from odocal_ros.fleet.leg_text import legs_from
+from odocal_ros.fleet.rows import Row
+from odocal_ros.outside.names import one_line
+from odocal_ros.outside.whole import whole_file
+
+LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
+VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
+VALUE_COLUMNS = ' '.join(f'{name} {name}_sigma' for name in VALUES)
+
+
+def leg_row(vehicle: str, model: str, number: int, odometer_km: float | None,
+            leg: LegResult) -> dict[str, Any]:
+    """Return a leg as a row of a table."""
+    estimates = leg_estimates(leg)
+    reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons)]
+    row = {'vehicle': vehicle, 'model': model, 'leg': number, 'bag': one_line(leg.bag),
+           'odometer_km': odometer_km, 'start': utc(leg.start_ns), 'start_ns': leg.start_ns,
+           'stop_ns': leg.stop_ns, 'duration_s': leg.duration, 'distance_m': leg.distance,
+           'fixes': leg.fixes, 'verdict': leg.verdict.value,
+           'reasons': ' '.join(dict.fromkeys(r.code.name for r in reasons))}
+    for name in VALUES:
+        e = estimates.get(name)
+        row |= {name: e and e.value, f'{name}_sigma': e and e.sigma}
+    return row | {'unit': estimates['scale_factor'].unit if 'scale_factor' in estimates else ''}
+
+
+def rows_of_legs(bag: FleetBag, row: Row) -> list[dict[str, Any]]:
+    """Return the legs of a bag's row as rows of a table; of one that failed a row without."""
+    of_bag = {'status': row.status, 'reason': row.reason}
+    return [leg_row(bag.vehicle, bag.model, k, bag.odometer_km, leg) | of_bag
+            for k, leg in enumerate(legs_from(row.legs), 1)] or [
+        {'vehicle': bag.vehicle, 'model': bag.model, 'bag': one_line(row.bag), **of_bag}]
+
+
+def utc(stamp_ns: int) -> datetime:
+    """Return a time as tables have it."""
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC)
+
+
+def _schema(texts: str, numbers: str, counts: str, times: str, flags: str = '') -> Any:
+    import pyarrow as pa
+    kinds = ((texts, pa.string()), (times, pa.timestamp('us', 'UTC')), (counts, pa.int64()),
+             (flags, pa.bool_()), (numbers, pa.float64()))
+    return pa.schema([(name, kind) for names, kind in kinds for name in names.split()])
+
+
+def leg_schema() -> Any:
+    """Return the columns of legs.parquet."""
+    return _schema('vehicle model bag verdict reasons unit',
+                   f'odometer_km duration_s distance_m {VALUE_COLUMNS}',
+                   'leg start_ns stop_ns fixes period', 'start', 'odd')
+
+
+def vehicle_schema() -> Any:
+    """Return the columns of vehicles.parquet."""
+    return _schema(
+        'vehicle model decision verdict unit why remedy reasons changes odd_legs '
+        'outlier failures rejected_for',
+        f'{VALUE_COLUMNS} drift_per_year drift_per_year_sigma drift_per_1000_km '
+        'drift_per_1000_km_sigma distance_km driven_h scale_deviate yaw_deviate pitch_deviate',
+        'bags bags_failed legs legs_good', 'first last since rejected_since')
+
+
+def in_batches(rows: Sequence[dict[str, Any]]) -> Iterator[Any]:
+    """Yield the rows of vehicles as tables."""
+    import pyarrow as pa
+    for k in range(0, len(rows), 1000):
+        yield pa.Table.from_pylist(rows[k:k + 1000], schema=vehicle_schema())
+
+
+def batches(parts: Sequence[Path]) -> Iterator[Any]:
+    """Yield the tables of files."""
+    import pyarrow.parquet as pq
+    for part in parts:
+        yield pq.read_table(part, partitioning=None)
+
+
+def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
+    """Write tables one after the other as one file, whole or not at all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    with whole_file(path) as file, pq.ParquetWriter(
+            pa.PythonFile(_Sink(file), mode='w'), schema, compression='zstd') as writer:
+        for table in tables:
+            if table.num_rows:
+                writer.write_table(table)
+
+
+class _Sink:
+    """A file that pyarrow may write to and believes it has closed."""
+
+    closed = False
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._at = file, 0
+
+    def write(self, data: bytes) -> int:
+        self._at += len(data)
+        self._file.write(bytes(data))
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
