@@ -16,10 +16,10 @@ class Verdict(Enum):
     @staticmethod
     def worst(verdicts: Iterable['Verdict']) -> 'Verdict':
         """Return the gravest of many, accepted if there are none."""
-        order = list(Verdict)
-        return max(verdicts, key=order.index, default=Verdict.ACCEPTED)
+        return max(verdicts, key=GRAVITY.index, default=Verdict.ACCEPTED)
 
 
+GRAVITY = tuple(Verdict)      # the gravest last
 NOTE, CAUTION, REJECT = Verdict.ACCEPTED, Verdict.CAUTION, Verdict.REJECTED
 
 

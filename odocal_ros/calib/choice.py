@@ -1,7 +1,6 @@
 """Which method gives which value: the first in order whose verdict allows it."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason, Verdict
@@ -66,7 +65,8 @@ def choose(methods: Mapping[str, MethodResult],
             first = estimates.get(name)
             if first is None or (first.value is None and estimate.value is not None
                                  and (first.method, name) != REFUSED_FOR_ALL):
-                estimates[name] = replace(estimate, method=method.name)
+                estimates[name] = Estimate(estimate.value, estimate.sigma, estimate.unit,
+                                           method.name)
     giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
     return estimates, tuple(giving) or tuple(m.name for m in usable[:1])
 

@@ -5,7 +5,7 @@ import math
 from typing import NamedTuple
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import LegResult
+from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import FAULT_SIGMAS
@@ -21,7 +21,8 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
     numbered : those that are combined, with their numbers.
     """
     found = []
-    scales = [scale for scale in _told('scale_factor', numbered) if scale.value]
+    estimates = [(n, leg_estimates(leg)) for n, leg in numbered]
+    scales = [scale for scale in _told('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
         which = '; '.join(f'{unit} in leg {_numbers(s.leg for s in scales if s.unit == unit)}'
@@ -33,7 +34,7 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         low, high = far
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
-    yaws = _told('yaw_mounting_angle', numbered)
+    yaws = _told('yaw_mounting_angle', estimates)
     # of an Imu that faces backwards they lie about +-180 deg
     far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
     if far and (more := far[1].value - far[0].value) > MOST_YAW:
@@ -53,8 +54,8 @@ class _Told(NamedTuple):
     unit: str
 
 
-def _told(name: str, numbered: Sequence[tuple[int, LegResult]]) -> list[_Told]:
-    every = ((n, leg_estimates(leg).get(name)) for n, leg in numbered)
+def _told(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_Told]:
+    every = ((n, of_leg.get(name)) for n, of_leg in estimates)
     return [_Told(n, e.value, e.sigma, e.unit) for n, e in every
             if e is not None and e.value is not None and e.sigma is not None]
 

@@ -1,6 +1,7 @@
 """What comes out: estimates with sigmas and units, per method, per leg and combined."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.evidence import Evidence
-from odocal_ros.reasons import Reason, Verdict, verdict_of
+from odocal_ros.reasons import GRAVITY, Reason, Verdict, verdict_of
 
 TRACK_ROWS = 5000    # of a track kept in a result
 # what stands in a result beside its estimates (calibration.json)
@@ -59,7 +60,7 @@ class MethodResult:
     details: dict[str, Any] = field(default_factory=dict)
     border: Border | None = None        # of the leg, or of all; None: the method has none
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """Return the gravest verdict of the reasons."""
         return verdict_of(self.reasons)
@@ -118,12 +119,11 @@ class LegResult:
         """Return when it was driven: of parts of a leg the same, no scale walks between them."""
         return self.start_ns if self.cut_from_ns is None else self.cut_from_ns
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """Return the gravest of the leg's reasons and its best deciding method's verdict."""
-        order = list(Verdict)
         best = min((m.verdict for name, m in self.methods.items()
-                    if name in (self.deciding or self.methods)), key=order.index,
+                    if name in (self.deciding or self.methods)), key=GRAVITY.index,
                    default=Verdict.REJECTED)
         return Verdict.worst([verdict_of(self.reasons), best])
 

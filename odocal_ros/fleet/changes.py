@@ -72,13 +72,12 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     if n < 2:
         return History()
     L = np.linalg.cholesky(V)
-    level, *_ = np.linalg.lstsq(L, np.ones(n), rcond=None)
-    z = np.linalg.solve(L, y)
     # all that may be: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
     drifts = t is not None and np.ptp(t) > 0 and n > 2
-    W = np.linalg.solve(L, np.column_stack([
-        np.tril(np.ones((n, n)))[:, 1:], np.eye(n)[:, 1:n - 1],
-        *([t - t[0]] if t is not None and drifts else [])]))
+    z, level, *W = np.linalg.solve(L, np.column_stack([
+        y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
+        *([t - t[0]] if t is not None and drifts else [])])).T
+    W = np.transpose(W)
     slope = W.shape[1] - 1 if drifts else -1
     found = sorted(_selected(z, level[:, None], W, chance(n)))
     known = [k for k in found if k != slope]

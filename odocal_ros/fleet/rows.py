@@ -127,5 +127,5 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
     import pyarrow.parquet as pq
     for path in paths:
         with open(path, 'rb') as file:
-            for entry in pq.read_table(file, schema=row_schema()).to_pylist():
+            for entry in pq.ParquetFile(file).read().to_pylist():
                 yield Row(**entry)

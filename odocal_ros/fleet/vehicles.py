@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 import json
 import math
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.combine import DRAWN_ANEW
-from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.changes import Change, covariance, DAY_NS, History, history
 from odocal_ros.fleet.leg_text import legs_from
@@ -57,6 +58,10 @@ class _Driven:
 
     leg: LegResult
     odometer_km: float | None
+
+    @cached_property
+    def estimates(self) -> dict[str, Estimate]:
+        return leg_estimates(self.leg)
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
@@ -120,7 +125,7 @@ def _history(name: str, driven: Sequence[_Driven], config: Config
     """Return which legs tell of a value, its history over days, and over kilometres."""
     told = []
     for k, one in enumerate(driven):
-        e = leg_estimates(one.leg).get(name)
+        e = one.estimates.get(name)
         if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
             told.append((k, e.value, one.leg.methods[e.method]))
     if not told:

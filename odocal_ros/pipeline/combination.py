@@ -109,14 +109,13 @@ def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
 
 def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
     """Return legs that share more than a tenth of their time with one before: not independent."""
-    twice = []
-    for i, leg in enumerate(legs):
-        for other in legs[:i]:
-            shared = min(leg.stop_ns, other.stop_ns) - max(leg.start_ns, other.start_ns)
-            if other not in twice and shared > 0.1 * (leg.stop_ns - leg.start_ns):
-                twice.append(leg)
-                break
-    return twice
+    start, stop = (np.array([getattr(leg, at) for leg in legs], np.int64)
+                   for at in ('start_ns', 'stop_ns'))
+    twice = np.zeros(len(legs), bool)
+    for i in range(len(legs)):
+        shared = np.minimum(stop[i], stop[:i]) - np.maximum(start[i], start[:i])
+        twice[i] = (~twice[:i] & (shared > 0.1 * (stop[i] - start[i]))).any()
+    return [leg for leg, again in zip(legs, twice.tolist(), strict=True) if again]
 
 
 def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
