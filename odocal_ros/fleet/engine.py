@@ -12,7 +12,10 @@ from odocal_ros.errors import BadUsage, OdocalError
 NEEDS = ('dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 INSTALL = "pip install 'odocal_ros[fleet]'"
 MEMORY = 2 * 2**30       # bytes for a task, unless said
-BATCH = 1000             # tasks given to the scheduler at a time
+PER_WORKER = 2           # tasks at the scheduler from which on it is given as many again
+FEWEST = 50              # of them, least: workers may be on their way
+LOST = ('the Dask scheduler is gone; start it again and give the same command: what is done is '
+        'kept')
 
 
 class EngineLost(OdocalError):
@@ -79,6 +82,8 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
     """
     Yield (number of the job, result, what went wrong) as tasks end, in any order.
 
+    The scheduler is given some tasks for each worker, not all: its memory is bounded.
+
     Raises
     ------
     EngineLost
@@ -86,19 +91,31 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 
     """
     from distributed import as_completed, CancelledError
-    futures = client.map(task, jobs, key=[f'{name}-{key}' for key in keys], pure=True, retries=0,
-                         batch_size=BATCH)
-    number = {future.key: i for i, future in enumerate(futures)}
-    ended = as_completed(futures)
-    del futures
-    for future in ended:
+    ended, number, left, fewest = as_completed(), {}, range(len(jobs)), 0
+    while left or number:
         error, found = None, None
+        if left and len(number) <= fewest:
+            fewest = _ahead(client)
+            now, left = left[:fewest], left[fewest:]
+            futures = client.map(task, [jobs[i] for i in now], pure=True, retries=0,
+                                 key=[f'{name}-{keys[i]}' for i in now])
+            number |= {future.key: i for future, i in zip(futures, now, strict=True)}
+            ended.update(futures)
+            del futures
+        future = next(ended)
         try:
             found = future.result()
         except CancelledError:
-            raise EngineLost('the Dask scheduler is gone; start it again and give the same '
-                             'command: what is done is kept') from None
+            raise EngineLost(LOST) from None
         except Exception as what:     # noqa: BLE001 of the task, or that its workers were ended
             error = what
-        yield number[future.key], found, error
+        yield number.pop(future.key), found, error
         future.release()
+
+
+def _ahead(client: Any) -> int:
+    """Return of how many tasks the scheduler is given as many again."""
+    try:
+        return max(FEWEST, PER_WORKER * sum(client.nthreads().values()))
+    except OSError:
+        raise EngineLost(LOST) from None
