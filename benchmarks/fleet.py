@@ -60,18 +60,16 @@ def found(args):
             what, bag = change['value'], change['bag'] - 1
             if what == 'counter':
                 since = row.rejected_since
-                # legs are rejected from then on, or their scale is no vehicle's
-                near = [one for one in seen if one[0] == 'scale_factor' and abs(one[1] - bag) <= 1]
-                right = bool(near) or not pd.isna(since) and abs(
+                right = row.verdict == 'rejected' and not pd.isna(since) and abs(
                     dates.index(f'{since:%Y-%m-%d}') - bag) <= 1
-                seen, last = [one for one in seen if one[0] != 'scale_factor'], None
+                last = None
             else:
                 near = [one for one in seen if one[0] == what and abs(one[1] - bag) <= 1]
                 right = bool(near)
                 seen = [one for one in seen if one not in near[:1]]
             told[what, 'found' if right else 'MISSED'] += 1
         invented.update(what for what, _ in seen)
-        if last is None:      # what a broken counter says is odd
+        if last is None:
             continue
         invented.update(['odd leg'] * len(row.odd_legs.split()))
         true = {'scale_factor': vehicle['scale_factor'][last],

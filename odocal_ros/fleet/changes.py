@@ -74,10 +74,10 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     L = np.linalg.cholesky(V)
     # all that may be: a step from leg k on, 1 to n - 1; leg k alone, 1 to n - 2; and the slope
     drifts = t is not None and np.ptp(t) > 0 and n > 2
-    z, level, *W = np.linalg.solve(L, np.column_stack([
+    white = np.linalg.solve(L, np.column_stack([
         y, np.tril(np.ones((n, n))), np.eye(n)[:, 1:n - 1],
-        *([t - t[0]] if t is not None and drifts else [])])).T
-    W = np.transpose(W)
+        *([t - t[0]] if t is not None and drifts else [])]))
+    z, level, W = white[:, 0], white[:, 1], white[:, 2:]
     slope = W.shape[1] - 1 if drifts else -1
     found = sorted(_selected(z, level[:, None], W, chance(n)))
     known = [k for k in found if k != slope]

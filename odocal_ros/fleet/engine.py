@@ -91,7 +91,8 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 
     """
     from distributed import as_completed, CancelledError
-    ended, number, left, fewest = as_completed(), {}, range(len(jobs)), 0
+    ended, left, fewest = as_completed(), range(len(jobs)), 0
+    number: dict[str, int] = {}
     while left or number:
         error, found = None, None
         if left and len(number) <= fewest:

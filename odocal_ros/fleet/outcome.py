@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from odocal_ros.calib.one_vehicle import MOST_SCALE
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bag_task import BagJob
 from odocal_ros.fleet.bags import at_hand
@@ -120,8 +121,10 @@ def remarks(row: dict) -> list[str]:
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
                 f'{57.29577951308232 * change["size"]:+.2f} deg')
+        odometer = change['value'] == 'scale_factor' and abs(change['size']) > MOST_SCALE
         out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
-                   f'{change["after"][:10]} and {change["by"][:10]}')
+                   f'{change["after"][:10]} and {change["by"][:10]}'
+                   + ', which no tyres do: look at the odometer' * odometer)
     if row['outlier']:
         out.append(f'{" and ".join(row["outlier"].split())} far from its model')
     if row['odd_legs']:

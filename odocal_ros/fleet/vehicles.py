@@ -2,25 +2,25 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 import json
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.combine import DRAWN_ANEW
-from odocal_ros.calib.result import Calibration, Estimate, LegResult
+from odocal_ros.calib.result import Calibration
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.changes import Change, covariance, DAY_NS, History, history
-from odocal_ros.fleet.leg_text import legs_from
-from odocal_ros.fleet.rows import DONE, Row, rows_of
+from odocal_ros.fleet.changes import Change
+from odocal_ros.fleet.driven import (
+    Driven,
+    driven_legs,
+    gone,
+    history_of,
+    rejected_from,
+    rejecting,
+)
+from odocal_ros.fleet.rows import DONE, rows_of
 from odocal_ros.fleet.tables import leg_row, utc, VALUES
-from odocal_ros.library.bags import told_apart
-from odocal_ros.nav.angles import wrap
 from odocal_ros.output.acceptance import accept_line
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.acceptance import accept, Decision
@@ -28,7 +28,7 @@ from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, with_settings
 
-YEAR = 365.25        # days
+GONE = 2             # last legs that are all rejected: one may be but a drive gone wrong
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,6 @@ class Vehicle:
     inputs: tuple[dict, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _Driven:
-    """A leg with what its bag is known for."""
-
-    leg: LegResult
-    odometer_km: float | None
-
-    @cached_property
-    def estimates(self) -> dict[str, Estimate]:
-        return leg_estimates(self.leg)
-
-
 def vehicle_of(job: VehicleJob) -> Vehicle:
     """Return what the rows of a vehicle's bags say of it."""
     rows = [row for row in rows_of(job.rows) if row.vehicle == job.vehicle]
@@ -73,36 +61,29 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     row = {'vehicle': job.vehicle, 'model': next((b.model for b in job.bags if b.model), ''),
            'bags': len(rows), 'bags_failed': len(failed),
            'failures': '; '.join(f'{Path(r.bag).name}: {r.reason}' for r in failed[:5])}
-    driven = _driven(done, known)
+    driven = driven_legs(done, known)
     if not driven:
         limits = with_settings(Config(), job.settings).accept.limits
         return Vehicle(_undriven(row, Decision.UNDECIDED.value if limits else ''), [])
     config = with_settings(done[-1].config(), job.settings)
-    histories = {name: _history(name, driven, config) for name in (
+    histories = {name: history_of(name, driven, config) for name in (
         'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
     starts = _periods(histories, driven)
     now = driven[starts[-1]:]
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
+    lost = driven[rejected_from(driven):]
+    if len(lost) >= GONE and calibration.verdict is not Verdict.REJECTED:
+        calibration = replace(calibration, reasons=(gone(lost), *calibration.reasons))
     row |= _told(calibration, config, driven, starts) | _changes(histories, driven) \
-        | _rejected(driven)
+        | {'rejected_for': ' '.join(dict.fromkeys(
+            r.code.name for one in driven for r in rejecting(one.leg))),
+           'rejected_since': utc(lost[0].leg.start_ns) if lost else None}
     since = now[0].leg.start_ns
     row |= {'now': [r.bag for r in done if r.start_ns >= since or r is done[-1]], 'report': None}
     legs = [_leg_row(job, k, one, starts, histories) for k, one in enumerate(driven)]
     inputs = tuple({'bag': r.bag, 'sha256': r.sha256, 'topics': json.loads(r.topics)}
                    for r in done)
     return Vehicle(row, legs, calibration, config, inputs)
-
-
-def _driven(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[_Driven]:
-    """Return the legs of rows by time, those of bags of one name told apart as replay does it."""
-    legs = [legs_from(row.legs) for row in rows]
-    entries = [{'bag': next((leg.bag for leg in some), row.bag)}
-               for row, some in zip(rows, legs, strict=True)]
-    named, _ = told_apart([Path(row.bag) for row in rows], legs, entries)
-    km = [known[row.bag].odometer_km if row.bag in known else row.odometer_km
-          for row, some in zip(rows, legs, strict=True) for _ in some]
-    return sorted((_Driven(leg, k) for leg, k in zip(named, km, strict=True)),
-                  key=lambda one: one.leg.start_ns)
 
 
 def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
@@ -120,52 +101,13 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
-def _history(name: str, driven: Sequence[_Driven], config: Config
-             ) -> tuple[list[int], History, History]:
-    """Return which legs tell of a value, its history over days, and over kilometres."""
-    told = []
-    for k, one in enumerate(driven):
-        e = one.estimates.get(name)
-        if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
-            told.append((k, e.value, one.leg.methods[e.method]))
-    if not told:
-        return [], History(), History()
-    scale = name == 'scale_factor'
-    number, values, methods = (list(column) for column in zip(*told, strict=True))
-    value = np.array(values)
-    y = np.log(value / value[0]) if scale else np.asarray(wrap(value - value[0]))
-    own, shared = _errors(name, methods)
-    days = np.array([driven[k].leg.driven_ns for k in number]) / DAY_NS
-    days -= days[0]
-    V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
-    km = [driven[k].odometer_km for k in number]
-    by_way = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
-    return number, history(y, V, days / YEAR), by_way
-
-
-def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the variance of what is each leg's own, and the effects of what legs share."""
-    own = np.zeros(len(methods))
-    shared: dict[tuple, np.ndarray] = {}
-    for k, method in enumerate(methods):
-        i = method.parameters.index(name)
-        for source in method.sources:
-            if not source.shared or source.name in DRAWN_ANEW:
-                own[k] += source.effects[i] @ source.effects[i]
-                continue
-            effects = shared.setdefault((method.name, source.name, source.effects.shape[1]),
-                                        np.zeros((len(methods), source.effects.shape[1])))
-            effects[k] = source.effects[i]
-    return own, list(shared.values())
-
-
-def _periods(histories: dict, driven: Sequence[_Driven]) -> list[int]:
+def _periods(histories: dict, driven: Sequence[Driven]) -> list[int]:
     """Return with which leg each period begins in which nothing changed, the first at 0."""
     return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
                          for change in found.changes})
 
 
-def _told(calibration: Calibration, config: Config, driven: Sequence[_Driven],
+def _told(calibration: Calibration, config: Config, driven: Sequence[Driven],
           starts: Sequence[int]) -> dict[str, Any]:
     """Return what the calibration since the last change says."""
     estimates, legs = calibration.estimates, [one.leg for one in driven]
@@ -189,20 +131,7 @@ def _told(calibration: Calibration, config: Config, driven: Sequence[_Driven],
         'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
 
 
-def _rejected(driven: Sequence[_Driven]) -> dict[str, Any]:
-    """Return why legs are rejected, and since when all of them are."""
-    legs = [one.leg for one in driven]
-    codes = dict.fromkeys(
-        r.code.name for leg in legs if leg.verdict is Verdict.REJECTED
-        for r in (*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons))
-        if r.code.gravity is Verdict.REJECTED)
-    good = [k for k, leg in enumerate(legs) if leg.verdict is not Verdict.REJECTED]
-    since = max(good, default=-1) + 1
-    return {'rejected_for': ' '.join(codes),
-            'rejected_since': utc(legs[since].start_ns) if since < len(legs) else None}
-
-
-def _changes(histories: dict, driven: Sequence[_Driven]) -> dict[str, Any]:
+def _changes(histories: dict, driven: Sequence[Driven]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
     found = []
     for name, (number, told, _) in histories.items():
@@ -224,7 +153,7 @@ def _size(name: str, change: Change) -> float:
     return math.expm1(change.size) if name == 'scale_factor' else change.size
 
 
-def _leg_row(job: VehicleJob, k: int, one: _Driven, starts: Sequence[int],
+def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
              histories: dict) -> dict[str, Any]:
     model = next((b.model for b in job.bags if b.model), '')
     return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
