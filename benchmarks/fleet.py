@@ -1,11 +1,11 @@
 """
-A fleet as it must stand: found changes, kills, workers alike, cost of the engine, many legs.
+A fleet as it must stand: found changes, kills, workers alike, cost of the engine, bad bags.
 
 python benchmarks/fleet.py found FLEET RESULT            what a run found beside the truth
 python benchmarks/fleet.py kills FLEET                   SIGKILL of workers, scheduler, command
 python benchmarks/fleet.py alike FLEET                   1, 2 workers and TCP: the same rows
 python benchmarks/fleet.py cost FLEET                    against plain replay, overhead a bag
-python benchmarks/fleet.py legs --legs 100000            the second stage alone
+python benchmarks/fleet.py spoilt FLEET                  a bag bomb and a bag that hangs
 
 FLEET: a folder of odocal simulate --fleet.
 """
@@ -13,12 +13,13 @@ FLEET: a folder of odocal simulate --fleet.
 import argparse
 from collections import Counter
 from contextlib import contextmanager, suppress
+import csv
 from dataclasses import replace
 import json
 import os
 from pathlib import Path
-import resource
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -196,7 +197,6 @@ def alike(args):
 
 def cost(args):
     """Time two workers against two loops of plain replay, and the engine's own time a bag."""
-    import csv
     folder = Path(tempfile.mkdtemp(prefix='fleet_cost_'))
     with open(args.fleet / 'manifest.csv', newline='') as file:
         bags = [(args.fleet / row['bag'], args.fleet / row['config'])
@@ -235,67 +235,42 @@ def cost(args):
           f'{1e3 * (2 * whole - inside) / n:.1f} ms of a worker a bag')
 
 
-def legs(args):
-    """Time the second stage on synthetic legs: as many vehicles as it takes, 50 legs each."""
-    from dataclasses import asdict
+@contextmanager
+def silent_server():
+    """Give the URL of a bag on a server that takes a call and never says a word."""
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        yield f'ftp://127.0.0.1:{server.getsockname()[1]}/drive.mcap'
 
-    import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    from odocal_ros.calib.result import Estimate, LegResult, MethodResult, Source
-    from odocal_ros.fleet.bags import FleetBag
-    from odocal_ros.fleet.engine import engine
-    from odocal_ros.fleet.leg_text import leg_text
-    from odocal_ros.fleet.rows import Row, row_schema
-    from odocal_ros.fleet.second_stage import vehicle_jobs, vehicles_together
-    each, day = 50, 86_400 * 10**9
-    n = args.legs // each
-    folder = Path(tempfile.mkdtemp(prefix='fleet_legs_', dir=args.scratch))
-    rng = np.random.default_rng(args.seed)
-    bags, files, changed = [], [], 0
-    for v in range(n):
-        scale = 0.0213 * (1 + 0.003 * rng.standard_normal()) * np.exp(
-            np.cumsum(1e-4 * 7**0.5 * rng.standard_normal(each)))
-        if v % 10 == 0:
-            scale[each // 2:] *= 1.01
-            changed += 1
-        rows = []
-        for k in range(each):
-            own, shared = 2e-4 * np.array([[1.0], [0.0]]), 1e-4 * np.array([[1.0], [0.0]])
-            value = float(scale[k] * (1 + 2e-4 * rng.standard_normal()))
-            method = MethodResult('two_point', (), {
-                'scale_factor': Estimate(value, value * 5**0.5 * 1e-4, 'm/pulse'),
-                'scale_ratio': Estimate(value / 0.021, 5**0.5 * 1e-4, '1'),
-                'yaw_mounting_angle': Estimate(None, None, 'rad')},
-                ('scale_factor', 'yaw_mounting_angle'),
-                (Source('fixes', own), Source('antenna lever arm', shared, True)))
-            start = 1_750_000_000 * 10**9 + 7 * k * day
-            leg = LegResult(start, start + 600 * 10**9, 5000.0, 600.0, 60_000, 30_000, 3000, 0, (),
-                            {'two_point': method}, bag=f'{k}', C_bi=np.eye(3))
-            rows.append(Row(key=f'{v}-{k}', bag=f'{v}/{k}', vehicle=f'v{v:06d}', model='synthetic',
-                            start_ns=start, legs=leg_text([leg])))
-            bags.append(FleetBag(f'v{v:06d}', f'{v}/{k}', 'synthetic'))
-            files.append(f'{folder}/{v}.parquet')
-        pq.write_table(pa.Table.from_pylist([asdict(r) for r in rows], schema=row_schema()),
-                       files[-1], compression='zstd')
-    jobs = vehicle_jobs(bags, files, {})
-    del bags, files
-    with engine(None, 2, 2**31, 3) as client:
-        began = time.monotonic()
-        vehicles = vehicles_together(client, jobs, folder / 'out', False)
-        took = time.monotonic() - began
-
-        def peak():
-            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10, time.process_time()
-        workers = list(client.run(peak).values())
-    told = sum(bool(json.loads(row['changes'])) for row in vehicles)
-    size = sum(path.stat().st_size for path in folder.glob('*.parquet'))
-    print(f'{n * each} legs of {n} vehicles: {took:.1f} s, '
-          f'{1e3 * sum(c for _, c in workers) / n:.1f} ms of a core a vehicle; peak memory '
-          f'{max(m for m, _ in workers):.0f} MiB a worker, {peak()[0]:.0f} MiB the command; rows '
-          f'{size / 2**20:.0f} MiB; {told} of {changed} vehicles changed')
-    import shutil
-    shutil.rmtree(folder)
+def spoilt(args):
+    """Put a bag that unpacks to 2 GiB and one that hangs among a fleet's; compare the others."""
+    from odocal_ros.outside.limits import zstd_module
+    folder = Path(tempfile.mkdtemp(prefix='fleet_spoilt_'))
+    packer = zstd_module().ZstdCompressor()
+    (folder / 'bomb.mcap').write_bytes(
+        b''.join([packer.compress(bytes(2**20)) for _ in range(2048)]) + packer.flush())
+    with open(args.fleet / 'manifest.csv', newline='') as file:
+        good = [row | {'bag': str((args.fleet / row['bag']).resolve()), 'config': str(
+            (args.fleet / row['config']).resolve())} for row in csv.DictReader(file)][:198]
+    rows = {}
+    with silent_server() as url:
+        bad = [good[0] | {'bag': str(folder / 'bomb.mcap')}, good[0] | {'bag': url}]
+        for name, bags in (('clean', good), ('spoilt', good[:60] + bad + good[60:])):
+            (folder / name).mkdir()
+            with open(folder / name / 'manifest.csv', 'w', newline='') as file:
+                table = csv.DictWriter(file, list(good[0]))
+                table.writeheader()
+                table.writerows(bags)
+            began = time.monotonic()
+            code = subprocess.run(fleet_command(folder / name, folder / name / 'out', '--workers',
+                                                '2', '--task-timeout', str(args.every))).returncode
+            rows[name] = rows_in(folder / name / 'out')
+            print(f'{name}: {len(bags)} bags, {time.monotonic() - began:.0f} s, exit {code}')
+    failed = [row for row in rows['spoilt'].values() if row.status == 'failed']
+    alike = sum(rows['spoilt'].get(bag) == row for bag, row in rows['clean'].items())
+    print(f'{alike} of {len(rows["clean"])} rows the same to the last bit; {len(failed)} failed:')
+    for row in failed:
+        print(f'  {Path(row.bag).name}: {row.reason}')
 
 
 def main():
@@ -303,19 +278,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_subparsers(required=True)
-    for function in (found, kills, alike, cost, legs):
+    for function in (found, kills, alike, cost, spoilt):
         sub = what.add_parser(function.__name__)
         sub.set_defaults(run=function)
         sub.add_argument('--seed', type=int, default=1)
-        if function is legs:
-            sub.add_argument('--legs', type=int, default=100_000)
-            sub.add_argument('--scratch', default=None)
-            continue
         sub.add_argument('fleet', type=Path)
         sub.add_argument('--port', type=int, default=28786)
         if function is found:
             sub.add_argument('result', type=Path)
-        if function is kills:
+        if function in (kills, spoilt):
             sub.add_argument('--every', type=float, default=20.0)
             sub.add_argument('--patience', type=float, default=120.0)
     args = parser.parse_args()
