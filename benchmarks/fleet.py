@@ -195,44 +195,64 @@ def alike(args):
         print(f'{name}: {len(some)} rows, the same to the last bit: {some == first}')
 
 
+LOOP = """import sys, time
+from odocal_ros.offline.cli import main
+rest = ['--method', 'two_point', '--quiet', '--set', 'output.formats=[legs]']
+bags = [*zip(*[iter(sys.argv[1:])] * 3)]
+main(['replay', bags[0][0], '--config', bags[0][1], '--output', bags[0][2] + 'first', *rest])
+wall, core = time.monotonic(), time.process_time()
+for bag, config, out in bags:
+    main(['replay', bag, '--config', config, '--output', out, *rest])
+print(time.monotonic() - wall, time.process_time() - core)
+"""
+
+
+def by_replay(bags, folder):
+    """Return the time of two loops of replay side by side, and that of cores, s."""
+    loops = [subprocess.Popen([sys.executable, '-c', LOOP, *(
+        str(x) for i, (bag, config) in enumerate(bags) if i % 2 == k
+        for x in (bag, config, folder / f'plain{i}'))], stdout=subprocess.PIPE, text=True)
+        for k in (0, 1)]
+    times = np.array([loop.communicate()[0].split() for loop in loops], float)
+    return times[:, 0].max(), times[:, 1].sum()
+
+
+def by_engine(fleet, folder):
+    """Return the time on two workers, that of cores of workers and of the command, s."""
+    from odocal_ros.fleet.bags import find_bags
+    from odocal_ros.fleet.command import add_arguments
+    from odocal_ros.fleet.engine import engine
+    from odocal_ros.fleet.jobs import bag_jobs, computed_rows
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    asked = parser.parse_args([str(fleet / 'manifest.csv'), '--output', 'x', *QUICK])
+    first, jobs = (bag_jobs(find_bags(asked.bags, None), asked, folder / name, 600.0, 2**31)
+                   for name in ('first', 'out'))
+    with engine(None, 2, 2**31, 3) as client:
+        list(computed_rows(client, first[:4]))      # what is imported once
+        began, own = time.monotonic(), time.process_time()
+        before = sum(client.run(time.process_time).values())
+        done = [one for _, one in computed_rows(client, jobs)]
+        wall, own = time.monotonic() - began, time.process_time() - own
+        assert all(one.computed for one in done)
+        return wall, sum(client.run(time.process_time).values()) - before, own
+
+
 def cost(args):
     """Time two workers against two loops of plain replay, and the engine's own time a bag."""
     folder = Path(tempfile.mkdtemp(prefix='fleet_cost_'))
     with open(args.fleet / 'manifest.csv', newline='') as file:
         bags = [(args.fleet / row['bag'], args.fleet / row['config'])
                 for row in csv.DictReader(file)]
-    code = ('import sys\nfrom odocal_ros.offline.cli import main\n'
-            'for bag, config, out in zip(*[iter(sys.argv[1:])] * 3):\n'
-            "    main(['replay', bag, '--config', config, '--output', out, '--method', "
-            "'two_point', '--quiet', '--set', 'output.formats=[legs]'])\n")
-    began = time.monotonic()
-    halves = [subprocess.Popen([sys.executable, '-c', code, *(
-        str(x) for i, (bag, config) in enumerate(bags) if i % 2 == k
-        for x in (bag, config, folder / f'plain{i}'))]) for k in (0, 1)]
-    for half in halves:
-        half.wait()
-    plain = time.monotonic() - began
-    from odocal_ros.fleet.bags import find_bags
-    from odocal_ros.fleet.command import add_arguments
-    from odocal_ros.fleet.engine import engine
-    from odocal_ros.fleet.jobs import bag_jobs, computed_rows
-    from odocal_ros.fleet.rows import rows_of, RowStore
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    asked = parser.parse_args([str(args.fleet / 'manifest.csv'), '--output', 'x', *QUICK])
-    jobs = bag_jobs(find_bags(asked.bags, None), asked, folder / 'out', 600.0, 2**31)
-    with engine(None, 2, 2**31, 3) as client:
-        list(computed_rows(client, jobs[:4]))      # what is imported once
-        began = time.monotonic()
-        done = [one for _, one in computed_rows(client, jobs)]
-        whole = time.monotonic() - began
-        inside = sum(row.seconds for row in rows_of(
-            RowStore(folder / 'out').path(one.key) for one in done if one.computed))
-    n = sum(one.computed for one in done)
-    print(f'{len(bags)} bags: two loops of replay {plain:.1f} s (imports of two processes in it); '
-          f'two workers {whole:.1f} s for {n} of them; ratio {plain / len(bags) * n / whole:.2f}')
-    print(f'inside the pipeline {inside:.1f} s on two workers: engine and rows take '
-          f'{1e3 * (2 * whole - inside) / n:.1f} ms of a worker a bag')
+    plain, fleet = (np.min(rounds, axis=0) for rounds in zip(*(
+        (by_replay(bags, folder / f'{k}'), by_engine(args.fleet, folder / f'{k}'))
+        for k in range(args.rounds)), strict=True))
+    n = len(bags)
+    print(f'{n} bags, the least of {args.rounds} rounds; two loops of replay: {plain[0]:.1f} s, '
+          f'{1e3 * plain[1] / n:.1f} ms of a core a bag; two workers: {fleet[0]:.1f} s, '
+          f'{1e3 * fleet[1] / n:.1f} ms of a core a bag and {1e3 * fleet[2] / n:.1f} ms the '
+          f'command; efficiency {plain[0] / fleet[0]:.2f} by the wall, '
+          f'{plain[1] / (fleet[1] + fleet[2]):.2f} by cores')
 
 
 @contextmanager
@@ -286,6 +306,8 @@ def main():
         sub.add_argument('--port', type=int, default=28786)
         if function is found:
             sub.add_argument('result', type=Path)
+        if function is cost:
+            sub.add_argument('--rounds', type=int, default=3)
         if function in (kills, spoilt):
             sub.add_argument('--every', type=float, default=20.0)
             sub.add_argument('--patience', type=float, default=120.0)

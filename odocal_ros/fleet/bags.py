@@ -97,10 +97,11 @@ def _of_manifest(name: str) -> list[FleetBag]:
         with fs.open(path, 'rb') as file:
             if name.endswith('.csv'):
                 text = dict.fromkeys(COLUMNS, pa.string())
-                table = csv.read_csv(file, convert_options=csv.ConvertOptions(
-                    column_types=text, strings_can_be_null=True))
+                table = csv.read_csv(
+                    file, csv.ReadOptions(use_threads=False), convert_options=csv.ConvertOptions(
+                        column_types=text, strings_can_be_null=True))
             else:
-                table = parquet.read_table(file)
+                table = parquet.ParquetFile(file).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise BadUsage(f'{name}: cannot be read as a manifest ({said_by(error)})') from None
     lacking = {'vehicle', 'bag'} - set(table.column_names)

@@ -55,7 +55,9 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
             # one bag a worker: what ends it takes no other bag with it
             'distributed.scheduler.worker-saturation': 1.0,
             'distributed.logging.distributed': 'critical',
-            'distributed.worker.memory.terminate': False}
+            'distributed.worker.memory.terminate': False,
+            # a look at the stack each 10 ms costs a core a twentieth
+            'distributed.worker.profile.enabled': False}
     with dask.config.set(ours), LocalCluster(
             n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
             host='127.0.0.1', dashboard_address='127.0.0.1:0', memory_limit=0,

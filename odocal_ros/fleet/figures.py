@@ -117,7 +117,8 @@ def _legs(path: Path, known: set[str], told: set[str]) -> list[tuple[str, float,
     with pq.ParquetFile(path) as file:
         every = max(1, file.metadata.num_rows // MOST_POINTS)
         found, k = [], 0
-        for batch in file.iter_batches(columns=columns, batch_size=10_000):
+        for batch in file.iter_batches(columns=columns, batch_size=10_000,
+                                       use_threads=False):
             for row in batch.to_pylist():
                 k += 1
                 vehicle = row['vehicle']

@@ -62,7 +62,7 @@ def _csv(table: Path) -> str:
     """Return a table as text for a spreadsheet."""
     import pyarrow as pa
     from pyarrow import csv, parquet as pq
-    whole = pq.read_table(table)
+    whole = pq.ParquetFile(table).read(use_threads=False)
     for i, name in enumerate(whole.column_names):
         if pa.types.is_string(whole.schema.types[i]):
             text = [None if x is None else for_table(x) for x in whole[name].to_pylist()]

@@ -127,5 +127,6 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
     import pyarrow.parquet as pq
     for path in paths:
         with open(path, 'rb') as file:
-            for entry in pq.ParquetFile(file).read().to_pylist():
+            # its own threads end the process with an abort, if they still run as it ends
+            for entry in pq.ParquetFile(file).read(use_threads=False).to_pylist():
                 yield Row(**entry)

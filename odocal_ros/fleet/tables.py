@@ -82,7 +82,7 @@ def batches(parts: Sequence[Path]) -> Iterator[Any]:
     """Yield the tables of files."""
     import pyarrow.parquet as pq
     for part in parts:
-        yield pq.read_table(part, partitioning=None)
+        yield pq.ParquetFile(part).read(use_threads=False)
 
 
 def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:

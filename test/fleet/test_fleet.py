@@ -8,6 +8,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 
@@ -228,6 +230,15 @@ def test_the_scheduler_is_given_some_tasks_at_a_time(client):
         found[i], most = (result, error), max(most, len(client.futures))
     assert found == {i: (400 - i, None) for i in range(400)}
     assert most <= 2 * FEWEST      # and given anew when half are left
+
+
+def test_a_process_that_has_read_rows_ends_well(output):
+    """Three processes: with threads of its own pyarrow aborted seven of eight as they ended."""
+    code = ('import sys\nfrom odocal_ros.fleet.rows import rows_of\n'
+            'assert list(rows_of(sys.argv[1:]))')
+    files = [str(path) for path in (output / 'rows').rglob('*.parquet')]
+    for _ in range(3):
+        assert subprocess.run([sys.executable, '-c', code, *files]).returncode == 0
 
 
 def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
