@@ -197,8 +197,8 @@ def alike(args):
 
 LOOP = """import sys, time
 from odocal_ros.offline.cli import main
-rest = ['--method', 'two_point', '--quiet', '--set', 'output.formats=[legs]']
-bags = [*zip(*[iter(sys.argv[1:])] * 3)]
+rest = ['--method', sys.argv[1], '--quiet', '--set', 'output.formats=[legs]']
+bags = [*zip(*[iter(sys.argv[2:])] * 3)]
 main(['replay', bags[0][0], '--config', bags[0][1], '--output', bags[0][2] + 'first', *rest])
 wall, core = time.monotonic(), time.process_time()
 for bag, config, out in bags:
@@ -207,9 +207,9 @@ print(time.monotonic() - wall, time.process_time() - core)
 """
 
 
-def by_replay(bags, folder):
+def by_replay(bags, folder, method):
     """Return the time of two loops of replay side by side, and that of cores, s."""
-    loops = [subprocess.Popen([sys.executable, '-c', LOOP, *(
+    loops = [subprocess.Popen([sys.executable, '-c', LOOP, method, *(
         str(x) for i, (bag, config) in enumerate(bags) if i % 2 == k
         for x in (bag, config, folder / f'plain{i}'))], stdout=subprocess.PIPE, text=True)
         for k in (0, 1)]
@@ -217,7 +217,7 @@ def by_replay(bags, folder):
     return times[:, 0].max(), times[:, 1].sum()
 
 
-def by_engine(fleet, folder):
+def by_engine(fleet, folder, method):
     """Return the time on two workers, that of cores of workers and of the command, s."""
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.command import add_arguments
@@ -225,7 +225,7 @@ def by_engine(fleet, folder):
     from odocal_ros.fleet.jobs import bag_jobs, computed_rows
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    asked = parser.parse_args([str(fleet / 'manifest.csv'), '--output', 'x', *QUICK])
+    asked = parser.parse_args([str(fleet / 'manifest.csv'), '--output', 'x', '--method', method])
     first, jobs = (bag_jobs(find_bags(asked.bags, None), asked, folder / name, 600.0, 2**31)
                    for name in ('first', 'out'))
     with engine(None, 2, 2**31, 3) as client:
@@ -245,7 +245,8 @@ def cost(args):
         bags = [(args.fleet / row['bag'], args.fleet / row['config'])
                 for row in csv.DictReader(file)]
     plain, fleet = (np.min(rounds, axis=0) for rounds in zip(*(
-        (by_replay(bags, folder / f'{k}'), by_engine(args.fleet, folder / f'{k}'))
+        (by_replay(bags, folder / f'{k}', args.method),
+         by_engine(args.fleet, folder / f'{k}', args.method))
         for k in range(args.rounds)), strict=True))
     n = len(bags)
     print(f'{n} bags, the least of {args.rounds} rounds; two loops of replay: {plain[0]:.1f} s, '
@@ -308,6 +309,7 @@ def main():
             sub.add_argument('result', type=Path)
         if function is cost:
             sub.add_argument('--rounds', type=int, default=3)
+            sub.add_argument('--method', default='two_point')
         if function in (kills, spoilt):
             sub.add_argument('--every', type=float, default=20.0)
             sub.add_argument('--patience', type=float, default=120.0)
