@@ -139,6 +139,6 @@ def _bend(legs, curved):
         x, _ = legs.solve()
         way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
         bent = (way**2).sum(axis=1) / 2
-        legs.borders = [b.loosened(dict.fromkeys(curved, size))
-                        for b, size in zip(first, bent, strict=True)]
+        legs.take([b.loosened(dict.fromkeys(curved, size))
+                   for b, size in zip(first, bent, strict=True)])
     return bent

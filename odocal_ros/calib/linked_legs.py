@@ -18,11 +18,11 @@ class LinkedLegs:
     def __init__(self, borders, drifting: str, steps, angles=()):
         """Take legs by time; ``steps`` (J - 1,): sigmas of ``drifting`` between them."""
         self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
-        self.borders = [_on(b, self.names) for b in borders]
+        self.take([_on(b, self.names) for b in borders])
         last = self.borders[-1]
         for name in angles:
             about = last.value[self.names.index(name)]
-            self.borders = [b.turned(name, about) for b in self.borders]
+            self.take([b.turned(name, about) for b in self.borders])
         self.centre = last.centre
         self.sigma, self.used, self.usual = (
             np.max([getattr(b, which) for b in self.borders], axis=0)
@@ -30,6 +30,16 @@ class LinkedLegs:
         self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
         self.steps = np.maximum(steps, LEAST_STEP)
+
+    def take(self, borders):
+        """Take legs in place of those there, on the names of all."""
+        self.borders, self._told = borders, None
+
+    def told(self):
+        """Return of each leg what it tells at least as well as it was believed."""
+        if self._told is None:      # asked for each constant anew
+            self._told = [b.told(self.unit, TELLING_RATIO) for b in self.borders]
+        return self._told
 
     def columns(self, j):
         """Return where the constants of leg j stand among the unknowns: z, then k by leg."""
@@ -116,7 +126,7 @@ class LinkedLegs:
         Of what legs tell at least as well as it was believed: farther off than that their
         equations need not be true.
         """
-        A, b = self.system(spread, [b.told(self.unit, TELLING_RATIO) for b in self.borders])
+        A, b = self.system(spread, self.told())
         # priors hold what no leg tells: else two legs that tell half of the constants each, in
         # directions that are never the same, would have one set of them, however far apart
         prior, centre = self._beliefs(A.shape[1])
@@ -134,8 +144,7 @@ class LinkedLegs:
         """
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
-        for j, border in enumerate(self.borders):
-            border = border.told(self.unit, TELLING_RATIO)
+        for j, border in enumerate(self.told()):
             border = border.loosened(spread) if spread else border
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
