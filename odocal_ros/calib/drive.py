@@ -12,6 +12,7 @@ from odocal_ros.settings.levels import FASTEST
 MOVED_SPREAD = 20.0    # m over which fixes must spread to say that the vehicle moved
 STOPPED_SPREAD = 100.0  # m of it while a counter stands: no wheel slides, no fix strays so far
 STOPPED_SHARE = 0.05   # of the way, least: tyres that differ by less are seen
+STRETCHES = 20         # of fixes while a counter stands: motion is in more than two of them
 EDGE_TIME = 0.5        # s of odometer missing at a mark worth saying
 ASTRAY_FIX = 50.0      # m by which any fix may be off
 TURNS_SHARE = 0.1      # of the distance: more of it in turns is worth saying
@@ -108,14 +109,23 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
-    lost = [(float(np.hypot(*np.ptp(fixes[pick], axis=0))), begin[k], end[k])
-            for k in np.flatnonzero(end - begin > least / FASTEST)
-            if (pick := (t >= begin[k]) & (t <= end[k])).any()]
+    lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])]), begin[k], end[k])
+            for k in np.flatnonzero(end - begin > least / FASTEST)]
     far, since, until = max(lost, default=(0.0, 0.0, 0.0))
     if far < least or far < STOPPED_SHARE * way_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move on by {far:.0f} m from t = {since:.0f} s '
                    f'to {until:.0f} s, the odometer does not count'),)
+
+
+def _gone(fixes) -> float:
+    """Return how far (k, 2) fixes surely move, m: one jump of them is no motion, nor is noise."""
+    if len(fixes) < STRETCHES:
+        return 0.0
+    middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, STRETCHES)])
+    steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
+    # a jump is one step, or two where it is within a stretch: they count as the one after them
+    return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*np.ptp(middle, axis=0))))
 
 
 def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
