@@ -52,12 +52,35 @@ SLOW = ('test_calibrate', 'test_cli', 'test_damage', 'test_damaged_rows', 'test_
 
 
 def pytest_collection_modifyitems(items):
-    """Mark what takes long (slow), runs a node (live), needs the recordings (data)."""
+    """Mark what takes long (slow), runs a node (live), needs the recordings (data); long first."""
     for item in items:
         marks = {'slow': item.path.stem in SLOW, 'live': item.path.parent.name == 'live',
                  'data': 'data_dir' in item.fixturenames}
         for mark in (name for name, there in marks.items() if there):
             item.add_marker(mark)
+    # else a worker ends with a long file while another has nothing left to do
+    items.sort(key=lambda item: ('live' not in item.keywords, 'slow' not in item.keywords))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Of --dist loadfile: the node's tests are one file, since two at a time disturb each other."""
+    if config.option.dist != 'loadfile':
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return 'live' if '/live/' in nodeid else super()._split_scope(nodeid)
+
+    config.option.loadscopereorder = False      # by how many tests a file has
+    return Scheduling(config, log)
+
+
+def pytest_runtest_setup(item):
+    """Let the node's tests, which run in real time, go before what computes on other workers."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and 'live' not in item.keywords:
+        os.setpriority(os.PRIO_PROCESS, 0, 5)
 
 
 def pytest_report_header() -> list[str]:
