@@ -51,7 +51,8 @@ def main() -> int:
     begin, codes, left = time.monotonic(), Counter(), 0
     memory = '/dev/shm' if os.access('/dev/shm', os.W_OK) else None     # no disk is waited for
     with tempfile.TemporaryDirectory(prefix='odocal_fuzz_', dir=memory) as folder:
-        run = partial(cases.run, args.seed, cases.bases(Path(folder) / 'clean'), Path(folder))
+        run = partial(cases.run, args.seed, cases.warm_up(cases.bases(Path(folder) / 'clean')),
+                      Path(folder))
         with closing(outcomes(run, numbers, args.jobs)) as ran:
             for outcome in ran:
                 codes[outcome.code] += 1

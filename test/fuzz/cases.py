@@ -6,6 +6,7 @@ A case is its seed and its number; alone: ``python benchmarks/fuzz.py --seed S -
 
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 import gc
 import hashlib
 import json
@@ -68,11 +69,15 @@ class Bases:
 
 def bases(folder: Path) -> Bases:
     """Write the clean bags: of a short drive with few samples, so that a case costs little."""
-    truth = {}
-    for name, (storage, compression, odometer) in BASES.items():
-        made = simulate(SimOptions(scenario='town', duration=136.0, imu_rate=10.0, seed=3,
+    @cache
+    def drive(odometer):
+        return simulate(SimOptions(scenario='town', duration=136.0, imu_rate=10.0, seed=3,
                                    imu_grade='industrial', odometer_rate=5.0, fix_rate=2.0,
                                    odometer=odometer))
+
+    truth = {}
+    for name, (storage, compression, odometer) in BASES.items():
+        made = drive(odometer)
         (folder / name).mkdir(parents=True)
         path = folder / name / ('bag.bag' if storage == 'rosbag1' else 'bag')
         write_bag(path, drive_topics(made), storage, compression)
@@ -84,13 +89,11 @@ def bases(folder: Path) -> Bases:
     options = [f'alignment.heading={made.truth.heading}', 'alignment.heading_sigma=0.002',
                'alignment.heading_source=fixed', 'verdict.max_scale_sigma=0.005',
                'verdict.max_yaw_sigma=0.05']
-    clean = Bases(folder, truth, [text for option in options for text in ('--set', option)])
-    warm_up(clean)
-    return clean
+    return Bases(folder, truth, [text for option in options for text in ('--set', option)])
 
 
-def warm_up(clean: Bases) -> None:
-    """Import here what every case would import: a forked process has it then."""
+def warm_up(clean: Bases) -> Bases:
+    """Import here what every case would import, that a forked process has it; return the bags."""
     from odocal_ros.offline.cli import main
     os.environ['MPLCONFIGDIR'] = str(clean.folder)      # of matplotlib's list of fonts
     for name, out in (('mcap', 'out'), ('messages', 'odd'), ('sqlite3', 'db'), ('rosbag1', 'one')):
@@ -99,6 +102,7 @@ def warm_up(clean: Bases) -> None:
             main(['replay', str(clean.bag(name)), '--output', str(clean.folder / out)])
     gc.collect()
     gc.freeze()           # else the first collection of every child copies all this memory
+    return clean
 
 
 def run(seed: int, clean: Bases, work: Path, numbers: list[int]) -> list[Outcome]:
