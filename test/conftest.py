@@ -65,7 +65,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Of --dist loadfile: the node's tests are one file, since two at a time disturb each other."""
+    """Of --dist loadfile: the node's tests are one file, as two at a time disturb each other."""
     if config.option.dist != 'loadfile':
         return None
     from xdist.scheduler import LoadFileScheduling
