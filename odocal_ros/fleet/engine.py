@@ -54,8 +54,6 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
     ours = {'distributed.scheduler.allowed-failures': tries - 1,
             # one bag a worker: what ends it takes no other bag with it
             'distributed.scheduler.worker-saturation': 1.0,
-            # Dask would have malloc give back and take again each array: a quarter of a bag's time
-            'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': None,
             'distributed.logging.distributed': 'critical',
             'distributed.worker.memory.terminate': False,
             # a look at the stack each 10 ms costs a core a twentieth
