@@ -49,8 +49,8 @@ def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[Driven]
                   key=lambda one: one.leg.start_ns)
 
 
-def history_of(name: str, driven: Sequence[Driven], config: Config
-             ) -> tuple[list[int], History, History]:
+def history_of(name: str, driven: Sequence[Driven],
+               config: Config) -> tuple[list[int], History, History]:
     """Return which legs tell of a value, its history over days, and over kilometres."""
     told = []
     for k, one in enumerate(driven):
