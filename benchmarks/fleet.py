@@ -3,7 +3,7 @@ A fleet as it must stand: found changes, kills, workers alike, cost of the engin
 
 python benchmarks/fleet.py found FLEET RESULT            what a run found beside the truth
 python benchmarks/fleet.py kills FLEET                   SIGKILL of workers, scheduler, command
-python benchmarks/fleet.py alike FLEET                   1, 2 workers and TCP: the same rows
+python benchmarks/fleet.py alike FLEET                   1, 2, 4 workers and TCP: the same rows
 python benchmarks/fleet.py cost FLEET                    against plain replay, overhead a bag
 python benchmarks/fleet.py spoilt FLEET                  a bag bomb and a bag that hangs
 
@@ -180,10 +180,10 @@ def kills(args):
 
 
 def alike(args):
-    """Compare the rows of one and two local workers, and of two over TCP."""
+    """Compare the rows of one, two and four local workers, and of two over TCP."""
     folder = Path(tempfile.mkdtemp(prefix='fleet_alike_'))
     rows = {}
-    for workers in (1, 2):
+    for workers in (1, 2, 4):
         subprocess.run(fleet_command(args.fleet, folder / f'{workers}', '--workers',
                                      str(workers)))
         rows[f'{workers} local'] = rows_in(folder / f'{workers}')
@@ -191,6 +191,7 @@ def alike(args):
         subprocess.run(fleet_command(args.fleet, folder / 'tcp', '--scheduler', address))
     rows['2 over TCP'] = rows_in(folder / 'tcp')
     first = rows['1 local']
+    assert len(first) == bags_of(args.fleet), 'some bags have no row'
     for name, some in rows.items():
         print(f'{name}: {len(some)} rows, the same to the last bit: {some == first}')
 
