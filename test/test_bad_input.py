@@ -412,10 +412,12 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
                         'not count', said[Code.ODOMETER_STILL])
     assert Code.ODOMETER_STILL in stands(40.0, 65.0)[1]
     assert Code.ODOMETER_STILL not in stands(40.0, 41.0)[1]
-    # nor do fixes move that jump by 200 m while the vehicle waits at the end
-    jumped = leg.fix.latitude + (seconds(leg, leg.fix) > 100.0) * np.deg2rad(200 / 111e3)
-    assert Code.ODOMETER_STILL not in run(replace(leg, fix=replace(leg.fix, latitude=jumped)),
-                                          settings(made))[1]
+    # nor do fixes move that jump by 200 m while the vehicle waits at the end, or stray and come back
+    t = seconds(leg, leg.fix)
+    for knots, north in (([100.0, 100.1], [0, 200]), ([91, 97, 100, 104], [0, 200, 200, 0])):
+        latitude = leg.fix.latitude + np.interp(t, knots, north) * np.deg2rad(1 / 111e3)
+        assert Code.ODOMETER_STILL not in run(
+            replace(leg, fix=replace(leg.fix, latitude=latitude)), settings(made))[1]
 
 
 def test_fixes_that_do_not_move(made, leg):

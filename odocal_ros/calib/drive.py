@@ -119,13 +119,18 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
 
 
 def _gone(fixes) -> float:
-    """Return how far (k, 2) fixes surely move, m: one jump of them is no motion, nor is noise."""
+    """
+    Return how far (k, 2) fixes surely move from begin to end, m.
+
+    One jump of them is no motion, nor is noise, nor what strays and comes back.
+    """
     if len(fixes) < STRETCHES:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, STRETCHES)])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
+    quarters = np.median(middle.reshape(4, -1, 2), axis=1)
     # a jump is one step, or two where it is within a stretch: they count as the one after them
-    return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*np.ptp(middle, axis=0))))
+    return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(quarters[-1] - quarters[0]))))
 
 
 def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
