@@ -1,3 +1,12 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
 """The package as pip and colcon install it: what is declared, and what starts."""
 
 import ast
@@ -53,6 +62,19 @@ def test_one_version_everywhere():
     assert re.search(r'^(\d+\.\d+\.\d+) \(', changes, re.MULTILINE).group(1) == version
     cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
     assert cited['version'] == version
+
+
+def test_each_source_file_says_whose_it_is_and_under_what_licence():
+    """The words by which ament_copyright knows Apache-2.0; it reads them by single blanks."""
+    head = (ROOT / 'setup.py').read_text().split('\n\n')[0]
+    words = ' '.join(head.replace('#', '').split())
+    assert words.startswith('Copyright 2026 odocal_ros maintainers Licensed under the Apache ')
+    assert words.endswith('limitations under the License.')
+    rooms = ('odocal_ros', 'test', 'tools', 'benchmarks', 'examples', 'launch', 'docs')
+    files = [path for room in rooms for path in (ROOT / room).rglob('*.py')]
+    assert len(files) > 500
+    assert [path for path in files if path.stat().st_size
+            and head not in path.read_text(encoding='utf-8')[:1000]] == []
 
 
 def test_the_changelog_is_as_bloom_reads_it():
