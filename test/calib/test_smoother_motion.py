@@ -17,7 +17,8 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL, BARE, LEAN, M, TYRES
+from odocal_ros.calib.smoother.state import ACCEL, BARE, LEAN, M, PITCH, TYRES, YAW
+from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.real_wheels import G
 
@@ -27,6 +28,18 @@ def perfect():
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0)
     leg = replace(leg, t_stop=60.0)
     return Problem.of(leg, config), truth(drive, config, leg)
+
+
+@pytest.mark.parametrize('turned', [-2 * np.pi, np.pi, 2.0, 0.3])
+def test_a_step_that_turns_the_pitch_over_leaves_the_top_up(perfect, turned):
+    _, state = perfect
+    step = np.zeros(M)
+    step[PITCH] = turned
+    moved = state.moved(np.zeros((len(state.t), BARE)), step)
+    assert abs(moved.constants[PITCH]) <= np.pi / 2
+    np.testing.assert_allclose(moved.forward, forward_b(
+        state.constants[YAW], state.constants[PITCH] + turned), atol=1e-12)
+    assert moved.C_bv[2, 2] >= 0
 
 
 def test_the_truth_fulfils_the_equations(perfect):

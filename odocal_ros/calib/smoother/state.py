@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
 
 Floats = NDArray[np.float64]
@@ -122,7 +122,20 @@ class State:
             C_nb=exp_so3(step[:, PHI]) @ self.C_nb, gyro_bias=self.gyro_bias + step[:, BG],
             accel_bias=self.accel_bias + step[:, BA],
             travel_error=self.travel_error + step[:, E], slow_n=slow,
-            constants=self.constants + step_constants)
+            constants=upright(self.constants + step_constants))
+
+
+def upright(constants):
+    """
+    Return constants whose pitch is within a quarter turn: the same forward axis, the top up.
+
+    Far from the answer a step may turn the pitch over, and the lever arms with it.
+    """
+    if abs(constants[PITCH]) <= np.pi / 2:
+        return constants
+    out = constants.copy()
+    out[YAW], out[PITCH] = mounting_from_forward(forward_b(constants[YAW], constants[PITCH]))
+    return out
 
 
 def C_bv(yaw, pitch):
