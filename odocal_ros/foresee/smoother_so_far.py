@@ -32,6 +32,7 @@ from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, 
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.remarks import model_floor
 from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit, too_little
 from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, YAW
 from odocal_ros.calib.smoother.warm_start import carried, rows_of
@@ -232,7 +233,8 @@ def _running(view, problem, best, config) -> Running:
     T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
     moving = steps > 0.5 * T
     way = max(float(steps.sum()), 1.0)
-    covariance = floored(best.solved.covariance * method.details['widened']**2)
+    covariance = floored(best.solved.covariance * method.details['widened']**2,
+                         model_floor(state.constants, problem.grade))
     sigmas = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)

@@ -21,7 +21,7 @@ from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, model_floor, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
@@ -104,7 +104,8 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     slips = find_slips(fit, near, count)
     reasons += slip_reasons(fit, slips, count)
     state, c = fit.state, fit.state.constants
-    covariance = floored(fit.solved.covariance * widen**2)
+    floor = model_floor(c, problem.grade)
+    covariance = floored(fit.solved.covariance * widen**2, floor)
     sigma = np.sqrt(np.diag(covariance))
     reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
@@ -125,7 +126,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
-               Source('model', np.diag(MODEL_FLOOR))]
+               Source('model', np.diag(floor))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
                         | left_over(leg, problem, fit)
@@ -136,10 +137,10 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                         border_of(fit, configured(leg), problem.grade).widened(widen))
 
 
-def floored(covariance):
-    """Return the covariance of the constants with what the model does not hold."""
+def floored(covariance, floor):
+    """Return the covariance of the constants with what the model does not hold, (3,) sigmas."""
     covariance = covariance.copy()
-    covariance[range(len(MODEL_FLOOR)), range(len(MODEL_FLOOR))] += MODEL_FLOOR**2
+    covariance[range(len(floor)), range(len(floor))] += floor**2
     return covariance
 
 

@@ -29,6 +29,7 @@ from odocal_ros.calib.smoother.state import (
     PITCH,
     YAW,
 )
+from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G, grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
@@ -43,6 +44,21 @@ NOISIER_THAN_SAID = 1.5    # of the sigma that fixes state
 NEXT_DRIVE = 1e-3          # by how much the scale of one vehicle differs from drive to drive
 # what the model does not hold (docs/conventions.md): relative, rad
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+
+
+def model_floor(value, grade):
+    """
+    Return what the model does not hold of scale, yaw and pitch, 1 sigma: (3,) relative, rad.
+
+    The z accelerometer of an Imu that is mounted nose up feels a push ahead; what of its signal
+    the y accelerometer has too, elsewhere a bias, is then taken for yaw.
+
+    value : (M,) constants.   grade : Grade that the Imu is taken for.
+    """
+    floor = MODEL_FLOOR.copy()
+    nose_up = forward_b(value[YAW], value[PITCH])[2]
+    floor[YAW] = np.hypot(floor[YAW], np.sqrt(2) * grade.misalignment * nose_up)
+    return floor
 
 
 def beside(value, covariance, grade) -> dict:

@@ -21,7 +21,7 @@ from odocal_ros.calib.smoother.imperfect import weighed_together
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED
-from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
+from odocal_ros.calib.smoother.remarks import beside, model_floor
 from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
@@ -68,7 +68,8 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
         # legs that agree tell together what is imperfect; what they differ in would seem to be it
         found = _joint(weighed_together(borders, steps), steps)
     at = [found.names.index(name) for name in CONSTANTS]
-    C = floored(found.covariance[np.ix_(at, at)])
+    floor = model_floor(found.value[at], grade_of(config.imu))
+    C = floored(found.covariance[np.ix_(at, at)], floor)
     sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
     scale = legs[-1].estimates['scale_factor']
@@ -80,7 +81,7 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     if unsaid:
         why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
                           f'{in_words(unsaid)}; what the settings say of it is kept'))
-    sources = _sources(found.used[at] * found.factor, C)
+    sources = _sources(found.used[at] * found.factor, C, floor)
     said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
     return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
@@ -125,15 +126,15 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
     return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
 
 
-def _sources(used, C) -> tuple[Source, ...]:
+def _sources(used, C, floor) -> tuple[Source, ...]:
     """Return the budget: what is believed of the vehicle, and what is the legs' own."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > ROUNDING]
-    apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
+    apart = np.diag(floor**2) + sum(s.effects @ s.effects.T for s in shared)
     size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
     return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
-            Source('model', np.diag(MODEL_FLOOR)))
+            Source('model', np.diag(floor)))
 
 
 def _details(found: Joint, value, C, sources, legs):
