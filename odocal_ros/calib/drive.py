@@ -137,9 +137,8 @@ def _gone(fixes) -> float:
         return 0.0
     middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, STRETCHES)])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
-    quarters = np.median(middle.reshape(4, -1, 2), axis=1)
     # a jump is one step, or two where it is within a stretch: they count as the one after them
-    return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(quarters[-1] - quarters[0]))))
+    return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
 def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:

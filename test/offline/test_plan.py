@@ -81,8 +81,11 @@ def test_changes_are_computed_not_told(capsys):
     # white fixes alone make the scale: RTK is 75 times better, the rest is below 0.04 ppm
     assert changes['RTK fixes (0.02 m)']['scale_factor'] == pytest.approx(scale / 75, rel=0.05)
     other = changes['a second leg in the other direction']
-    # height is shared and small; the heading is shared and all
-    assert other['scale_factor'] == pytest.approx(scale / math.sqrt(2), rel=1e-3)
+    # height is shared and small; the heading is shared and all; between both the scale walks
+    first = math.hypot(scale, Config().verdict.scale_drift_per_day * math.sqrt(
+        answer['drive']['duration'] / 86400))
+    assert other['scale_factor'] == pytest.approx(scale * first / math.hypot(scale, first),
+                                                  rel=1e-3)
     assert other['yaw_mounting_angle'] == pytest.approx(yaw, rel=1e-3)
     better = next(c for text, c in changes.items() if text.startswith('a heading known'))
     assert better['yaw_mounting_angle'] == pytest.approx(yaw / 2, rel=0.01)
