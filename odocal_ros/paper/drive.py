@@ -26,7 +26,8 @@ from odocal_ros.nav.projection import plane_for
 from odocal_ros.nav.rotations import exp_so3
 from odocal_ros.paper.coefficients import DRIFT, HEADING, LEVEL
 from odocal_ros.paper.error_forms import chord_error, plane_error, SpeedProfile
-from odocal_ros.paper.error_model import Path, planned_path, propagate
+from odocal_ros.paper.error_model import propagate
+from odocal_ros.paper.path import Path, planned_path
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.motion import attitude

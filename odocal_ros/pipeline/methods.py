@@ -18,8 +18,8 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
-from odocal_ros.calib.wheels.slips import WheelSlips
 from odocal_ros.calib.wheels.unseen import with_unseen
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.samples import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps

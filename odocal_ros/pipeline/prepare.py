@@ -17,7 +17,8 @@ import numpy as np
 from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
-from odocal_ros.calib.wheels.slips import NO_SLIPS, wheel_faults, WheelSlips
+from odocal_ros.calib.wheels.slips import wheel_faults
+from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, medians
 from odocal_ros.data.samples import let_go

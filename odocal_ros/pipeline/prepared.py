@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
-from odocal_ros.calib.wheels.slips import WheelSlips
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.nav.alignment import Alignment

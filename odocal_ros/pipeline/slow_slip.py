@@ -18,7 +18,7 @@ drawn out over tens of seconds is no step, and hides in the smoother's road nois
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.wheels.slips import WheelSlips
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, WHEELS, with_scale_error

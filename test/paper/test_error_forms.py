@@ -16,7 +16,8 @@ import pytest
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.projection import Plane
 from odocal_ros.paper.error_forms import chord_error, plane_error, SpeedProfile, straight_leg
-from odocal_ros.paper.error_model import PAPER_RADIUS, planned_path, propagate
+from odocal_ros.paper.error_model import PAPER_RADIUS, propagate
+from odocal_ros.paper.path import planned_path
 
 DRIFT = np.deg2rad(0.01) / 3600     # 0.01 deg/h
 PHI_U = np.deg2rad(0.06)            # 3.6'

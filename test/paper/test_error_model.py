@@ -25,11 +25,10 @@ from odocal_ros.paper.error_model import (
     coefficients,
     in_fixed_axes,
     PAPER_RADIUS,
-    path_of_track,
-    planned_path,
     propagate,
     transition,
 )
+from odocal_ros.paper.path import path_of_track, planned_path
 from odocal_ros.sim.motion import attitude as true_attitude
 from odocal_ros.sim.scenarios import SimOptions, simulate
 

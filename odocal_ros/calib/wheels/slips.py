@@ -15,12 +15,18 @@ difference is rounding and gyro noise, millimetres over seconds; a wheel that sp
 its own stands out of it by centimetres, where the Imu's acceleration alone sees half a metre.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.slip import acceleration, excess_way, PIN_STEPS, SPIN_GRID
+from odocal_ros.calib.wheels.wheel_slips import (
+    NO_SLIPS,
+    SLIP_GRID,
+    slip_reason,
+    slips_of,
+    WheelSlips,
+)
 from odocal_ros.calib.wheels.whole_drive import (
     changed,
     fitted,
@@ -33,10 +39,9 @@ from odocal_ros.calib.wheels.whole_drive import (
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.reasons import Code, Reason
+from odocal_ros.reasons import Reason
 from odocal_ros.screening.wheel_pair import pair, runs
 
-SLIP_GRID = 0.1                        # s, grid
 SLIP_SPANS = (10, 30, 80, 200, 500)    # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
 TYRE_BLUR = 0.005    # m, what two tyres on real ground may do in any window, 1 sigma
 TURN_DOUBT = 0.01    # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
@@ -51,30 +56,7 @@ TELLING_WAY = 0.1                      # m, least way by which going on would ha
 PARTED_SHARE = 4    # of a slip's half, what the mean must at least part from the Imu by
 
 
-@dataclass(frozen=True, eq=False)
-class WheelSlips:
-    """
-    Slips of one wheel, in order of time.
-
-    begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
-    wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
-    change : of the ratio right over left at some place, as much as at half the way does the same.
-    """
-
-    begin: NDArray[np.float64]
-    end: NDArray[np.float64]
-    size: NDArray[np.float64]
-    wheel: NDArray[np.int64]
-    change: float = 0.0
-
-    @property
-    def t(self):
-        """Return the middle of each, s."""
-        return (self.begin + self.end) / 2
-
-
 NO_TIMES = np.empty(0)
-NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
 
 
 def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats],
@@ -137,8 +119,8 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
         return reasons, replace(NO_SLIPS, change=change)
     mean = (two.left * ratio + two.right) / 2 * per_right
     wheel = [_which(two, mean, imu, track, latitude, e) for e in events]
-    slips = replace(_slips(events, wheel), change=change)
-    return reasons + _slip_reason(slips), slips
+    slips = replace(slips_of(events, wheel), change=change)
+    return reasons + slip_reason(slips), slips
 
 
 def _level(two, apart, quantum_m):
@@ -284,24 +266,3 @@ def _which(two, mean, imu, track, latitude, event):
     # where it parts by far less than the half, the slip begins or ends elsewhere
     told = abs(odds) > WHEEL_ODDS and abs(excess[at]) > abs(size) / 2 / PARTED_SHARE
     return int(np.sign(odds)) if told else 0
-
-
-def _slips(events, wheel):
-    begin, end, size = np.array(events).T
-    wheel = np.array(wheel, np.int64)
-    # a left wheel that spins makes right less left negative
-    return WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel)
-
-
-def _slip_reason(slips):
-    n = len(slips.size)
-    worst = int(np.argmax(np.abs(slips.size)))
-    which = ('one of the wheels', 'the right wheel', 'the left wheel')[slips.wheel[worst]]
-    done = 'parts' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
-    other = ' from the other' * (not slips.wheel[worst])
-    return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
-                   f'{100 * abs(slips.size[worst]):.0f} cm against the gyro from '
-                   f't = {slips.begin[worst]:.1f} s for '
-                   f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
-                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
-                      if n > 1 else '')),)

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.wheels.estimate import solve
-from odocal_ros.calib.wheels.slips import TURN_DOUBT, TYRE_BLUR, WheelSlips
+from odocal_ros.calib.wheels.slips import TURN_DOUBT, TYRE_BLUR
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import SIDES

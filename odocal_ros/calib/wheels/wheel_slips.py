@@ -1,0 +1,67 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Slips of the wheels as they are found and said."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.reasons import Code, Reason
+
+SLIP_GRID = 0.1     # s, between the rows in which slips are looked for
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSlips:
+    """
+    Slips of one wheel, in order of time.
+
+    begin, end : (k,) s.   size : (k,) m, > 0 where the wheel ran farther than the ground (for a
+    wheel that is not known: right less left).   wheel : (k,) -1 left, +1 right, 0 one of them.
+    change : of the ratio right over left at some place, as much as at half the way does the same.
+    """
+
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    size: NDArray[np.float64]
+    wheel: NDArray[np.int64]
+    change: float = 0.0
+
+    @property
+    def t(self):
+        """Return the middle of each, s."""
+        return (self.begin + self.end) / 2
+
+
+NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
+
+
+def slips_of(events, wheel) -> WheelSlips:
+    """Return slips by (begin s, end s, size m, right less left) and by wheel, -1, 0 or +1."""
+    begin, end, size = np.array(events).T
+    wheel = np.array(wheel, np.int64)
+    # a left wheel that spins makes right less left negative
+    return WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel)
+
+
+def slip_reason(slips: WheelSlips) -> tuple[Reason]:
+    """Say which wheel slipped most, by how much and when."""
+    n = len(slips.size)
+    worst = int(np.argmax(np.abs(slips.size)))
+    which = ('one of the wheels', 'the right wheel', 'the left wheel')[slips.wheel[worst]]
+    done = 'parts' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
+    other = ' from the other' * (not slips.wheel[worst])
+    return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
+                   f'{100 * abs(slips.size[worst]):.0f} cm against the gyro from '
+                   f't = {slips.begin[worst]:.1f} s for '
+                   f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
+                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
+                      if n > 1 else '')),)

@@ -1,0 +1,103 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A leg as the error model of the paper sees it: recorded, or planned."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.nav.dead_reckoning import Origin, Track
+from odocal_ros.nav.earth import C_en, radii
+from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy, transpose
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """
+    A leg as the error model sees it, recorded or planned.
+
+    t : (m,) s, rising.    latitude, longitude : (m,) rad.    height : (m,) m.
+    velocity_n : (m - 1, 3) mean velocity over ground of each interval, local ENU, m/s.
+    C_nb : (m, 3, 3) attitude against the local level at each epoch.
+    """
+
+    t: NDArray[np.float64]
+    latitude: NDArray[np.float64]
+    longitude: NDArray[np.float64]
+    height: NDArray[np.float64]
+    velocity_n: NDArray[np.float64]
+    C_nb: NDArray[np.float64]
+
+    @property
+    def travel(self) -> NDArray[np.float64]:
+        """Return the metres travelled by each epoch, (m,)."""
+        step = np.linalg.norm(self.velocity_n, axis=-1) * np.diff(self.t)
+        return np.concatenate([[0.0], np.cumsum(step)])
+
+
+def path_of_track(track: Track, forward, origin: Origin, start_n=(0.0, 0.0, 0.0)) -> Path:
+    """
+    Return the path of a dead-reckoned leg.
+
+    Parameters
+    ----------
+    track : Track
+        Attitude and travel in the n of ``origin``.
+    forward : (3,) array
+        Scale times forward axis in b, m per unit of travel.
+    origin : Origin
+        Where n is fixed.
+    start_n : (3,) array
+        Position of the track's first epoch in n, m.
+
+    """
+    position_n = track.P @ np.asarray(forward, dtype=float) + start_n
+    latitude, longitude, height = origin.to_geodetic(position_n).T
+    C_ln = transpose(C_en(latitude, longitude)) @ C_en(origin.latitude, origin.longitude)
+    step_n = np.diff(position_n, axis=0) / np.diff(track.t)[:, None]
+    velocity = np.einsum('mij,mj->mi', (C_ln[:-1] + C_ln[1:]) / 2, step_n)
+    C_nb = C_ln @ matrix_from_quat(track.q_nb)
+    return Path(track.t, latitude, longitude, height, velocity, C_nb)
+
+
+def planned_path(t, speed, yaw, latitude, longitude=0.0, height=0.0) -> Path:
+    """
+    Return the path of a level drive that is not driven yet.
+
+    Parameters
+    ----------
+    t, speed, yaw : (m,) arrays
+        Epochs, s; speed, m/s, and ENU yaw of the vehicle, rad, there (straight in between).
+    latitude, longitude, height : float
+        Start, rad, rad, m (WGS 84).
+
+    Returns
+    -------
+    Path, b lying along the vehicle.
+
+    """
+    t, speed = np.asarray(t, dtype=float), np.asarray(speed, dtype=float)
+    yaw = np.broadcast_to(np.asarray(yaw, dtype=float), t.shape)
+    flat = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], -1) * speed[:, None]
+    velocity = (flat[:-1] + flat[1:]) / 2
+    step = velocity * np.diff(t)[:, None]
+
+    def run(first, steps):
+        return first + np.concatenate([[0.0], np.cumsum(steps)])
+
+    along = np.full(len(t), float(latitude))
+    for _ in range(4):      # the radii change by 1 % per rad: each round gains four digits
+        middle = (along[1:] + along[:-1]) / 2
+        meridian, normal = radii(middle)
+        along = run(latitude, step[:, 1] / (meridian + height))
+    east = step[:, 0] / ((normal + height) * np.cos(middle))
+    C_nb = matrix_from_rpy(np.stack([0 * yaw, 0 * yaw, yaw], -1))
+    return Path(t, along, run(longitude, east), np.full(len(t), float(height)), velocity, C_nb)
