@@ -20,7 +20,7 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
-COARSE_STEP = 0.05    # m/s: a speed in finer steps errs as if by chance
+COARSE_STEP = 0.05    # m/s: a speed in finer steps is added up, what it rounds a noise
 BEFORE_MARK = 30.0    # s: a standstill that ended longer before the start mark is another drive
 
 

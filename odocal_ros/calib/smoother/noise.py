@@ -140,7 +140,7 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
 
     rest : (K,) bool, intervals that stand: their odometer has a small noise that is given, for
         what stands says nothing of what moves.
-    spread : (K, 3) factors on the odometer's variances along, to the side and up (slips).
+    spread : (K, 3 or more) factors on the odometer's variances along, to the side and up first.
     """
     K, T = len(motion.T), motion.T[:, 0]
     axes = np.swapaxes(motion.C_end @ motion.state.C_bv, 1, 2)      # rows: forward, left, up

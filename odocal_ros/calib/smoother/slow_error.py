@@ -90,7 +90,8 @@ class SlowError(Part):
     def _variances(self, near):
         """Return variances left: of the value before, with that after, of the drive: (K, 3)."""
         i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
-        before, both, after = (near.entries(*at) for at in ((i, i), (i, n + i), (n + i, n + i)))
+        before, both, after = np.split(near.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i]), 3,
+                                       axis=1)
         return before, both, after + a**2 * before - 2 * a * both
 
     def jumps(self, near):
