@@ -234,7 +234,7 @@ def _running(view, problem, best, config) -> Running:
     moving = steps > 0.5 * T
     way = max(float(steps.sum()), 1.0)
     covariance = floored(best.solved.covariance * method.details['widened']**2,
-                         model_floor(state.constants, problem.grade))
+                         model_floor(state.constants, best.priors.constants))
     sigmas = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)

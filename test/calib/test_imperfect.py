@@ -138,6 +138,24 @@ def test_angles_are_those_of_the_axes_that_the_imu_measures_in(noise):
     assert abs(blind.value - truth.pitch) > 3.0 * blind.sigma
 
 
+@pytest.mark.parametrize('skew', [SKEW, 0.0])
+def test_nose_up_the_yaw_holds_what_y_has_of_z_where_axes_are_off(skew):
+    # z feels a push ahead by the nose's rise, y what it has of z; whether axes are off at all is
+    # told by the other two
+    drive, config, leg = made(scenario='town', duration=300.0, imu_grade='consumer', seed=4,
+                              fix_noise='rtk', yaw=0.02, pitch=0.12,
+                              real=Real(accel_matrix=(0.0, 0.0, 0.0, skew, 0.0, skew,
+                                                      skew, 0.0, 0.0)))
+    found = smooth(leg, with_settings(config, {'imu.misalignment_sigma': np.nan}))
+    e = found.estimates['yaw_mounting_angle']
+    error = abs(e.value - drive.truth.yaw)
+    assert error < 3.0 * e.sigma
+    if skew:
+        assert error > 0.5 * 0.12 * skew                # 45 mdeg, where 10 would be stated
+    else:
+        assert e.sigma < 0.25 * 0.12 * SKEW             # 10 mdeg: no such axes, no such floor
+
+
 def test_a_straight_drive_does_not_pull_the_yaw_to_zero():
     # with derivatives by the force as measured, its noise: 0.15 +- 0.22 deg, 1.7 is true
     drive, config, leg = made(scenario='straight', duration=600.0, imu_grade='consumer', seed=4,

@@ -104,7 +104,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     slips = find_slips(fit, near, count)
     reasons += slip_reasons(fit, slips, count)
     state, c = fit.state, fit.state.constants
-    floor = model_floor(c, problem.grade)
+    floor = model_floor(c, fit.priors.constants)
     covariance = floored(fit.solved.covariance * widen**2, floor)
     sigma = np.sqrt(np.diag(covariance))
     reasons += remarks(problem, fit, sigma, config)

@@ -46,18 +46,19 @@ NEXT_DRIVE = 1e-3          # by how much the scale of one vehicle differs from d
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
-def model_floor(value, grade):
+def model_floor(value, believed):
     """
     Return what the model does not hold of scale, yaw and pitch, 1 sigma: (3,) relative, rad.
 
     The z accelerometer of an Imu that is mounted nose up feels a push ahead; what of its signal
-    the y accelerometer has too, elsewhere a bias, is then taken for yaw.
+    the y accelerometer has too, elsewhere a bias, is then taken for yaw. It is as far off a right
+    angle as the drive left to be believed of the other axes.
 
-    value : (M,) constants.   grade : Grade that the Imu is taken for.
+    value : (M,) constants.   believed : (M,) their prior sigmas, as the drive left them.
     """
     floor = MODEL_FLOOR.copy()
     nose_up = forward_b(value[YAW], value[PITCH])[2]
-    floor[YAW] = np.hypot(floor[YAW], np.sqrt(2) * grade.misalignment * nose_up)
+    floor[YAW] = np.hypot(floor[YAW], believed[[AXIS_XY, AXIS_ZX]].max() * nose_up)
     return floor
 
 

@@ -68,7 +68,7 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
         # legs that agree tell together what is imperfect; what they differ in would seem to be it
         found = _joint(weighed_together(borders, steps), steps)
     at = [found.names.index(name) for name in CONSTANTS]
-    floor = model_floor(found.value[at], grade_of(config.imu))
+    floor = model_floor(found.value[at], found.used[at])
     C = floored(found.covariance[np.ix_(at, at)], floor)
     sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
