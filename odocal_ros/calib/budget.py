@@ -27,6 +27,7 @@ import numpy as np
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Source
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import skew
@@ -102,9 +103,10 @@ def _late_odometer(f: Floats, t: Floats, D: Floats, C_nb: Floats, start: MarkFix
     Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
     track has at one end and lacks at the other, v(end) - v(start).
     """
-    middle = (C_nb[:-1] + C_nb[1:]) @ f / 2
+    middle = by_step(lambda C_nb: (C_nb[:-1] + C_nb[1:]) @ f / 2, C_nb)
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
-    turned: Floats = (np.diff(C_nb, axis=0) @ f * speed[:, None]).sum(axis=0)
+    change = by_step(lambda C_nb: np.diff(C_nb, axis=0) @ f, C_nb)
+    turned: Floats = (change * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
     v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
     turned -= v_end - v_start

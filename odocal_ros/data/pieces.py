@@ -21,39 +21,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import let_go
+from odocal_ros.data.mapped import let_go, room
 
 Array = NDArray[Any]
 PIECE_ROWS = 2**16    # rows
 
 
-def chunks(n: int, *columns: Array) -> Iterator[slice]:
-    """Yield slices of n rows; what is mapped of the columns is let go after each."""
+def chunks(n: int) -> Iterator[slice]:
+    """Yield slices of n rows; what lies in files is let go after each."""
     for first in range(0, n, PIECE_ROWS):
         yield slice(first, min(first + PIECE_ROWS, n))
-        let_go(*columns)
+        let_go()
 
 
 def by_row(function: Callable[..., Array], *columns: Array) -> Array:
     """Return what a function makes of each row of arrays, (n, ...) to (n,)."""
-    parts = [function(*(x[rows] for x in columns)) for rows in chunks(len(columns[0]), *columns)]
-    return np.concatenate(parts) if parts else function(*columns)
+    return by_step(function, *columns, steps=0)
 
 
 def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
     """Return what a function of rows side by side, (m, ...) to (m - steps,), makes of them all."""
-    n = len(columns[0])
-    if n < 1 + steps:
+    n = len(columns[0]) - steps
+    if n <= PIECE_ROWS:
         return function(*columns)
-    return np.concatenate([function(*(x[rows.start:rows.stop + steps] for x in columns))
-                           for rows in chunks(n - steps, *columns)])
+    for rows in chunks(n):
+        part = function(*(x[rows.start:rows.stop + steps] for x in columns))
+        if not rows.start:
+            found = room(n, *part.shape[1:], dtype=part.dtype)
+        found[rows] = part
+    return found
 
 
 def medians(x: Floats) -> Floats:
     """Return the median of each column: (n, k) to (k,)."""
-    column, found = np.empty(len(x)), []
+    column, found = room(len(x)), []
     for k in range(x.shape[1]):
-        for rows in chunks(len(x), x):
+        for rows in chunks(len(x)):
             column[rows] = x[rows, k]
         found.append(np.median(column, overwrite_input=True))
     return np.array(found)
@@ -62,7 +65,7 @@ def medians(x: Floats) -> Floats:
 def pieces(times: Array, t: Array, *columns: Array) -> Iterator[tuple[slice, slice]]:
     """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
     done = 0
-    for rows in chunks(len(t) - 1, *columns):
+    for rows in chunks(len(t) - 1):
         rows = slice(rows.start, rows.stop + 1)
         last = rows.stop == len(t)
         end = len(times) if last else np.searchsorted(times, t[rows.stop - 1])

@@ -18,7 +18,6 @@ is used to compare clocks and never enters a result.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-import mmap
 from typing import Any, TypeVar
 
 import numpy as np
@@ -166,18 +165,6 @@ def of_columns(kind: type[SomeSamples], columns: Mapping[str, NDArray[Any]]) -> 
         array.setflags(write=False)
         object.__setattr__(samples, name, array)
     return samples
-
-
-def let_go(*arrays: NDArray[Any]) -> None:
-    """Give back the memory of arrays that are mapped from a file; they can be read as before."""
-    for array in arrays:
-        owner: Any = array
-        while isinstance(owner, np.ndarray):
-            owner = owner.base
-        if isinstance(owner, memoryview):
-            owner = owner.obj
-        if isinstance(owner, mmap.mmap):
-            owner.madvise(mmap.MADV_DONTNEED)
 
 
 def no_imu() -> ImuSamples:

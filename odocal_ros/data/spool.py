@@ -11,7 +11,7 @@
 Rows of a topic: up to MEMORY_BYTES in memory, hours of them in a file without a name.
 
 Two hours of an Imu at 1 kHz are 0.8 GB. What lies in the file is mapped: whoever reads it sees
-arrays like any others, and ``samples.let_go`` gives their memory back. Where the disk takes no
+arrays like any others, and ``mapped.let_go`` gives their memory back. Where the disk takes no
 more, rows stay in memory.
 """
 
@@ -19,15 +19,15 @@ from collections.abc import Callable
 from dataclasses import fields
 import mmap
 import os
-import tempfile
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from odocal_ros.data.arrays import Bools
+from odocal_ros.data.mapped import mapped, nameless
 from odocal_ros.data.samples import join, of_columns, Samples, take
 
-MEMORY_BYTES = 2**26    # bytes of a topic's rows from which they go to the file
+MEMORY_BYTES = 2**24    # bytes of a topic's rows from which they go to the file
 TAIL_BYTES = 2**23      # bytes after those of the file, the same
 MERGED_BYTES = 2**20    # bytes: so much of small blocks is made one
 MOVED_BYTES = 2**20     # bytes moved at a time
@@ -130,8 +130,7 @@ class _Columns:
         self._files: dict[str, tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = {}
         for field in fields(like):
             column = getattr(like, field.name)
-            file = tempfile.TemporaryFile(prefix='odocal_')      # noqa: SIM115 while rows are
-            self._files[field.name] = file, column.dtype, column.shape[1:]
+            self._files[field.name] = nameless(), column.dtype, column.shape[1:]
 
     def write(self, block: Samples, at: int) -> int:
         """Write a block's rows from row ``at`` on; return the row after the last."""
@@ -146,7 +145,7 @@ class _Columns:
     def rows(self, stop: int) -> Samples:
         """Return the rows before one, mapped."""
         return of_columns(self._kind, {
-            name: np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype,
+            name: np.frombuffer(mapped(file, 0, mmap.ACCESS_READ), dtype,
                                 stop * int(np.prod(shape))).reshape(stop, *shape)
             for name, (file, dtype, shape) in self._files.items()})
 

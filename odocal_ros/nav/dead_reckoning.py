@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks
 from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 from odocal_ros.nav.odometer import Travel
@@ -98,7 +99,7 @@ def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
 
     """
     s = travel.at(t)
-    half, P = (np.diff(s) / 2)[:, None, None], np.zeros((len(t), 3, 3))
+    half, P = (np.diff(s) / 2)[:, None, None], room(len(t), 3, 3)
     for rows in chunks(len(t) - 1):
         C_nb = matrix_from_quat(q_nb[rows.start:rows.stop + 1])
         sums = (C_nb[:-1] + C_nb[1:]) * half[rows]

@@ -12,6 +12,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
@@ -88,13 +89,13 @@ def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Boo
 
 def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     """Return the mean turn rate about each cell, (m, 3), and where it is steady to REST_TURN."""
-    dt = np.diff(t_imu)
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
     reach = round(REST_WINDOW / REST_GRID)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
     seen = np.ones(len(rate), bool)
-    if (dt > REST_WINDOW).any():
+    if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
+        dt = np.diff(t_imu)
         unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
         seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing known within a gap
     return windows.mean(axis=-1), (windows.std(axis=-1) < REST_TURN).all(axis=-1) & seen

@@ -18,7 +18,8 @@ without any per-sample loop.
 import numpy as np
 
 from odocal_ros.data.arrays import Complexes, Floats
-from odocal_ros.data.samples import let_go
+from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import by_row
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
 SCAN_BLOCK = 64    # quaternions a scan multiplies up in step; 40 to 800 make no difference
@@ -44,7 +45,7 @@ def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None 
     for first in range(begin, end, SAMPLES_AT_A_TIME):
         last = min(first + SAMPLES_AT_A_TIME, end)
         phi[:, first - begin:last - begin] = _increments(t, w_b, first, last)
-        let_go(w_b)
+        let_go()
     return phi
 
 
@@ -160,7 +161,7 @@ def _products(t: Floats, w_b: Floats, every: int, bias: float | Floats) -> Pairs
         for k in range(1, every):
             c, d = _times(c, d, C[:, k], D[:, k])
         a[g:g + step], b[g:g + step] = c, d
-        let_go(w_b)
+        let_go()
     return a, b
 
 
@@ -195,7 +196,8 @@ def attitude(t: Floats, w_b: Floats, q_nb0: Floats, earth_rate_n: Floats, every:
     t, w_b = np.asarray(t, dtype=float), np.asarray(w_b, dtype=float)
     if not len(t):
         return t, np.empty((0, 4))
-    t_out = np.append(t[:-1:every], t[-1])
+    kept = np.append(np.arange(0, len(t) - 1, every), len(t) - 1)
+    t_out = by_row(lambda k: t[k], kept)
     a0, b0 = _pairs(q_nb0)
     a, b = _products(t, w_b, every, bias)
     a, b = _scan(np.append(a0, a), np.append(b0, b))

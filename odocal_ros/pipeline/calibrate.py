@@ -22,7 +22,7 @@ from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.result import LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.samples import let_go
+from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
@@ -107,7 +107,7 @@ def _screened(leg: Leg, config: Config,
         return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
     sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)
     reasons += tuple(with_axes(sanity, inputs))
-    let_go(*vars(leg.imu).values())
+    let_go()
     if z_down:
         inputs = turned_over(inputs)
     return inputs, reasons, not UNUSABLE & {r.code for r in sanity}

@@ -20,7 +20,7 @@ from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.result import refused as wheels_refused
 from odocal_ros.calib.wheels.unseen import with_unseen
 from odocal_ros.calib.wheels.wheel_slips import WheelSlips
-from odocal_ros.data.samples import let_go
+from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
 from odocal_ros.pipeline.delay_note import delay_notes
@@ -62,7 +62,7 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
     runs = {}
     for name in names:
         passed = begun(name)
-        let_go(*vars(prepared.leg.imu).values())
+        let_go()
         runs[name] = _guarded(name, prepared, partial(METHODS[name], prepared, passed))
     slips = prepared.wheel_slips
     for run in runs.values():

@@ -20,8 +20,8 @@ from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.slips import wheel_faults
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row, medians
-from odocal_ros.data.samples import let_go
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.standstill import standstills
@@ -62,7 +62,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
 
     """
     placed = place(inputs, config)
-    let_go(*vars(leg.imu).values())
+    let_go()
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
@@ -89,7 +89,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
     if alignment is None:
         alignment, about = align(inputs, spans, placed.rough, placed.fixes_n, placed.origin,
                                  config)
-    let_go(*vars(leg.imu).values())
+    let_go()
     gap = imu_gap(inputs.t_imu, min(alignment.t, 0.0), inputs.t_stop, config.leg.max_gap)
     epochs = attitude_of(inputs, placed.origin.latitude, alignment.t, alignment.q_nb,
                          alignment.gyro_bias)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import medians
-from odocal_ros.data.samples import let_go
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
@@ -93,7 +93,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
         cell = np.repeat(np.arange(len(count[bins])), count[bins])
         for k, column in enumerate((*f[rows].T, w[rows] @ up)):
             means[bins, k] = np.bincount(cell, column, len(count[bins]))
-        let_go(f, w)
+        let_go()
     means /= np.maximum(count, 1)[:, None]
     f, turn_rate = means[:, :3].copy(), means[:, 3].copy()
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN_S

@@ -16,6 +16,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.mapped import room
+from odocal_ros.data.pieces import chunks
 from odocal_ros.data.samples import OdometerForm, Samples, take
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import (
@@ -46,7 +48,9 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     clean = sent if good.all() else take(sent, good)
     order = _rising(clean, slot, leg, found)
     clean = clean if order is None else take(clean, order)
-    t = (clean.stamp_ns - leg.start_ns) * 1e-9 + offset
+    t = room(len(clean.stamp_ns))
+    for some in chunks(len(t)):
+        t[some] = (clean.stamp_ns[some] - leg.start_ns) * 1e-9 + offset
     form = leg.form_right or leg.form if slot == 'odometer_right' else leg.form
     spikes = _spikes(slot, clean, t, form, config)
     if spikes.any():

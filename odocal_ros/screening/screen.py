@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_step
-from odocal_ros.data.samples import let_go
 from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -102,7 +102,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
     imu, heading = oriented(imu), oriented(heading)
-    let_go(*vars(leg.imu).values())
+    let_go()
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
     found += [Reason(Code.ODOMETER_CHOSEN, form.chosen)
@@ -122,7 +122,7 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
     if travelled.left is not None and travelled.right is not None and not unfelt:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
-    let_go(*vars(leg.imu).values())
+    let_go()
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning
         travelled = replace(travelled, left=None, right=None)
     inputs = Inputs(

@@ -16,9 +16,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from odocal_ros.data import spool
+from odocal_ros.data import mapped, spool
 from odocal_ros.data.leg import LegRecorder
-from odocal_ros.data.samples import ImuSamples, let_go, take
+from odocal_ros.data.mapped import let_go
+from odocal_ros.data.samples import ImuSamples, take
 
 ROW = 104      # bytes of an Imu row
 N = 20_000
@@ -57,13 +58,32 @@ def test_rows_of_a_file_are_those_that_came(imu):
     fed(recorder, imu, 9_050, 15_000)
     rows = copy.rows('imu')
     assert_same(rows, imu, 0, 9_050)
-    let_go(*vars(rows).values())
+    let_go()
     assert_same(rows, imu, 0, 9_050)
     assert_same(recorder.rows('imu'), imu, 0, 15_000)
     # the pre-roll of the next leg is what is left, and the copy is as it was
     recorder.forget_before(int(imu.stamp_ns[14_000]))
     assert_same(fed(recorder, imu, 15_000, N).rows('imu'), imu, 14_000, N)
     assert_same(copy.rows('imu'), imu, 0, 9_050)
+
+
+def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
+    monkeypatch.setattr(mapped, 'ROOM_BYTES', 4_000)
+    for dtype in (float, bool, np.int64):
+        array = mapped.room(1000, 5, dtype=dtype)
+        assert array.dtype == dtype
+        assert not array.any()
+        assert not array.flags.owndata
+        array[3:] = 1
+        let_go()
+        assert array.sum() == 997 * 5
+    whole = mapped.room(10)
+    assert whole.flags.owndata
+
+    def full(*_):
+        raise OSError(28, 'no space left on device')
+    monkeypatch.setattr(mapped.os, 'posix_fallocate', full)
+    assert mapped.room(1000, 5).sum() == 0.0        # in memory, then
 
 
 def test_a_leg_takes_no_more_memory_as_it_grows(imu):

@@ -15,7 +15,7 @@ the other by Cholesky; the way back gives the step, and the covariance of each p
 with the border. Unknowns are scaled to a unit diagonal first: they differ by 1e20 in size.
 
 An hour has thousands of blocks: the equations, their elimination and the covariances stand one
-after the other in the same memory.
+after the other in the same memory, which lies in files for hours.
 """
 
 from collections.abc import Iterator
@@ -26,10 +26,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.mapped import let_go, room
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
 INTERVALS_AT_A_TIME = 64    # intervals worked on at a time: their matrices stay in the cache
+LET_GO_AFTER = 512          # intervals worked on, the same of what lies in a file
 SHORT_LEG = 1200            # intervals of a leg so short that what is made of them may be kept
 
 
@@ -46,8 +48,8 @@ class Normal:
     """
 
     def __init__(self, N, n, m):
-        self.diagonal = np.zeros((N, n, n))
-        self.wide = np.zeros((N, n, n + m + 1))     # what elimination carries, side by side
+        self.diagonal = room(N, n, n)
+        self.wide = room(N, n, n + m + 1)           # what elimination carries, side by side
         self.beside = self.wide[:-1, :, :n]
         self.border = self.wide[:, :, n:n + m]
         self.g = self.wide[:, :, n + m]
@@ -83,6 +85,8 @@ class Solved:
         z[:n, :n] = own[N - 1] - z[:n, n:] @ H.T
         own[N - 1], wide[N - 1, :, n:n + m] = z[:n, :n], z[:n, n:]
         for k in range(N - 2, -1, -1):
+            if k % LET_GO_AFTER == 0:
+                let_go()
             G = wide[k][:, :n + m]
             across = -G @ z
             own[k] -= across @ G.T
@@ -143,7 +147,8 @@ class Neighbours:
 
     def variances(self) -> Floats:
         """Return the variance of each unknown of each block: (N, n)."""
-        return np.einsum('kii->ki', self._own) * self._scale**2
+        own = [np.einsum('kii->ki', self._own[rows]) for rows in blocks(len(self._own))]
+        return np.concatenate(own) * self._scale**2
 
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
         """Yield all of them, some intervals at a time."""
@@ -164,11 +169,14 @@ def blocks(n: int) -> Iterator[slice]:
     Yield slices of n rows, as even as can be.
 
     None of one row, where there are more: numpy multiplies a single matrix by another way than
-    those of a stack, and results are to be the same whatever the chunks.
+    those of a stack, and results are to be the same whatever the chunks. What lies in files is let
+    go now and then.
     """
     edges = np.linspace(0, n, max(1, -(-n // INTERVALS_AT_A_TIME)) + 1).astype(int)
     for first, last in pairwise(edges.tolist()):
         yield slice(first, last)
+        if last // LET_GO_AFTER > first // LET_GO_AFTER or last == n:
+            let_go()
 
 
 def solve(normal: Normal) -> Solved:
@@ -185,19 +193,25 @@ def solve(normal: Normal) -> Solved:
     diagonal, wide = normal.diagonal, normal.wide
     N, n = normal.g.shape
     m = len(normal.g_border)
-    s = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal), 1e-300))
+    s = np.ones((N + 1, n))     # and what the last one's missing neighbour is scaled by
+    for rows in blocks(N):
+        s[rows] = 1 / np.sqrt(np.maximum(np.einsum('kii->ki', diagonal[rows]), 1e-300))
     s_c = 1 / np.sqrt(np.maximum(np.diag(normal.corner), 1e-300))
-    for block in (diagonal, wide):
-        block *= s[:, :, None]
-    diagonal *= s[:, None, :]
-    normal.beside *= s[1:, None, :]
-    normal.border *= s_c
+    for rows in blocks(N):
+        diagonal[rows] *= s[rows, :, None]
+        diagonal[rows] *= s[rows, None, :]
+        wide[rows] *= s[rows, :, None]
+        wide[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
+        normal.border[rows] *= s_c
+    s = s[:N]
     corner = np.zeros((m + 1, m + 1))
     corner[:m, :m] = normal.corner * np.multiply.outer(s_c, s_c)
     corner[:m, m] = corner[m, :m] = normal.g_border * s_c
     logdet = -2 * np.log(s).sum() - 2 * np.log(s_c).sum()
     D = diagonal[0]
     for k in range(N):
+        if k % LET_GO_AFTER == 0:
+            let_go()
         root, info = dpotrf(D, lower=1)
         if info:
             raise NotPositive(f'nothing holds keyframe {k} of {N}')
@@ -212,7 +226,8 @@ def solve(normal: Normal) -> Solved:
         diagonal[k] = dpotri(root, lower=1)[0]
         W[:] = X
     below = np.tril_indices(n, -1)      # dpotri fills one triangle
-    diagonal[:, below[1], below[0]] = diagonal[:, below[0], below[1]]
+    for rows in blocks(N):
+        diagonal[rows, below[1], below[0]] = diagonal[rows, below[0], below[1]]
     root, info = dpotrf(corner[:m, :m], lower=1)
     if info:
         raise NotPositive('the constants are not determined')
@@ -220,8 +235,11 @@ def solve(normal: Normal) -> Solved:
     reduced = (corner[:m, :m] + corner[:m, :m].T) / 2 / np.multiply.outer(s_c, s_c)
     c = dpotrs(root, corner[:m, m], lower=1)[0].ravel()
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
-    x = wide[:, :, n + m] - wide[:, :, n:n + m] @ c
+    x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
+                        for rows in blocks(N)])
     for k in range(N - 2, -1, -1):
+        if k % LET_GO_AFTER == 0:
+            let_go()
         x[k] -= wide[k][:, :n] @ x[k + 1]
     return Solved(x * s, c * s_c, covariance * np.multiply.outer(s_c, s_c), float(logdet),
                   reduced, corner[:m, m] / s_c, (wide, diagonal), s, s_c)

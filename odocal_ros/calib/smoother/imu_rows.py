@@ -22,7 +22,7 @@ from odocal_ros.calib.smoother.state import (
     GYRO_AXIS,
     GYRO_SIGNAL,
 )
-from odocal_ros.data.samples import let_go
+from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.strapdown import rotation_increments
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ class ImuRows:
         for first in range(0, K, per):
             last = min(first + per, K)
             yield first, last, self.between(first, last)
-            let_go(self.f_b)
+            let_go()
 
     def between(self, first, last) -> SomeRows:
         """Return the rows from one keyframe to another."""

@@ -19,6 +19,7 @@ from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.state import M
+from odocal_ros.data.mapped import room
 
 FIRST_ROAD = 0.01    # m/sqrt(s), what slip and slide are believed to be at first
 LEAST_ROAD = 2e-4    # m/sqrt(s) along
@@ -62,14 +63,16 @@ class MotionRows(Part):
     def weigh(self, levels):
         """Whiten the rows by the Cholesky root of their covariance."""
         self._kept: dict = {}
-        self.whiten = np.empty((len(self.raw), ROWS, ROWS))
+        self.whiten = room(len(self.raw), ROWS, ROWS)
+        self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
             Q = self.noise.covariance(levels, rows)
             scale = 1 / np.sqrt(np.einsum('kii->ki', Q))
             root = np.linalg.cholesky(Q * scale[:, :, None] * scale[:, None, :])
             self.whiten[rows] = np.linalg.inv(root) * scale[:, None, :]
-        self.log_R = -2 * np.log(np.einsum('kii->ki', self.whiten)).sum()
-        self.r = np.einsum('kij,kj->ki', self.whiten, self.raw)
+            logs[rows] = np.log(np.einsum('kii->ki', self.whiten[rows]))
+            self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
+        self.log_R = -2 * logs.sum()
 
     def after(self, step, constants, reached):
         """Bring the residuals to where the step leads."""

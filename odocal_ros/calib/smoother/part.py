@@ -21,6 +21,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import blocks
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
@@ -144,17 +145,29 @@ class Total:
 
 
 def hold(out, k, columns, variance, residual, weight=1.0):
-    """Add rows that are an unknown each: those of columns at keyframes k."""
+    """Add rows that are an unknown each: those of columns at keyframes k, a slice or one."""
     i = np.arange(out.g.shape[1])[columns]
-    out.diagonal[k, i, i] += weight / variance
-    out.g[k, i] -= weight * residual / variance
+    k = np.atleast_1d(np.arange(len(out.g))[k])
+    weight, pull = (np.broadcast_to(x, (len(k), len(i)))
+                    for x in (weight / variance, weight * residual / variance))
+    for rows in blocks(len(k)):
+        at = k[rows, None]
+        out.diagonal[at, i, i] += weight[rows]
+        out.g[at, i] -= pull[rows]
 
 
 def link(out, columns, decay, weight, residual):
     """Add rows of all intervals, (K, c): an unknown at the end less its decayed one before."""
     i = np.arange(out.g.shape[1])[columns]
-    out.diagonal[:-1, i, i] += decay**2 * weight
-    out.diagonal[1:, i, i] += weight
-    out.beside[:, i, i] -= decay * weight
-    out.g[:-1, i] += decay * weight * residual
-    out.g[1:, i] -= weight * residual
+    all_of = np.broadcast_shapes(np.shape(residual), (len(out.beside), len(i)))
+    terms = (decay**2 * weight, weight, decay * weight, decay * weight * residual,
+             weight * residual)
+    own, end, across, pull, pull_end = (np.broadcast_to(x, all_of) for x in terms)
+    for rows in blocks(len(out.beside)):
+        out.diagonal[rows, i, i] += own[rows]
+        out.beside[rows, i, i] -= across[rows]
+        out.g[rows, i] += pull[rows]
+    for rows in blocks(len(out.beside)):
+        ends = slice(rows.start + 1, rows.stop + 1)
+        out.diagonal[ends, i, i] += end[rows]
+        out.g[ends, i] -= pull_end[rows]

@@ -22,6 +22,7 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import blocks
 from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
+from odocal_ros.data.mapped import room
 
 TAIL_SIGMAS = 3.0    # sigmas beyond which a row loses weight as a heavy tail has it
 FEWEST_JUDGED = 5    # of which one may be an outlier
@@ -83,7 +84,7 @@ class PointRows(Part):
     def J(self):
         """Return the whitened derivatives: (m, d, n + M)."""
         rows, constants = self.jacobians(self.n)
-        out = np.empty((*self.raw.shape, self.n + M))
+        out = room(*self.raw.shape, self.n + M)
         out[:, :, :self.n] = self.stated(rows)
         del rows
         out[:, :, self.n:] = self.stated(constants)

@@ -40,7 +40,7 @@ def turned(leg, imu) -> float:
     T = np.diff(t)
     turn = imu.turned() - rest_bias(leg, imu)[0] * T[:, None]
     total = Total()
-    for some in chunks(len(imu.t), imu.f_b):
+    for some in chunks(len(imu.t)):
         total.add(imu.f_b[some])
     up = total.sum / len(imu.t)
     angle = np.abs(turn @ up) / np.linalg.norm(up)

@@ -25,7 +25,7 @@ from odocal_ros.calib.check import pieces, steady
 from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.state import LN_K, M, PITCH, State, YAW
-from odocal_ros.data.pieces import chunks
+from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
@@ -48,17 +48,20 @@ class Start:
 
 def standing(leg, t):
     """Tell which of the times lie well inside a standstill: (N,) bool."""
-    inside = np.zeros(len(t), bool)
-    for begin, end in leg.standstills:
-        inside |= (t >= begin + START_EDGE) & (t <= end - START_EDGE)
-    return inside
+    def within(t):
+        inside = np.zeros(len(t), bool)
+        for begin, end in leg.standstills:
+            inside |= (t >= begin + START_EDGE) & (t <= end - START_EDGE)
+        return inside
+    return by_row(within, t)
 
 
 def rest_bias(leg, imu):
     """Return the mean turn rate of all standstills, (3,), and how long they last, s."""
     inside = standing(leg, imu.t)
     still = inside[:-1] & inside[1:]
-    length = float(np.diff(imu.t)[still].sum())
+    length = float(np.concatenate([np.diff(imu.t[some.start:some.stop + 1])[still[some]]
+                                   for some in chunks(len(still))]).sum())
     if length < 1.0:
         return np.zeros(3), 0.0
     turned = Total()

@@ -1,0 +1,62 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Arrays that lie in files without a name: hours of samples, and what is worked in for so long.
+
+Whoever reads them sees arrays like any others. ``let_go`` gives back the memory of all of them:
+what is wanted again is read again. Where the disk takes no more, arrays are in memory.
+"""
+
+import contextlib
+import math
+import mmap
+import os
+import tempfile
+from threading import Lock
+from typing import Any, BinaryIO
+from weakref import WeakSet
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+ROOM_BYTES = 2**24      # bytes of an array to work in from which it lies in a file
+_maps: WeakSet[mmap.mmap] = WeakSet()
+_lock = Lock()
+
+
+def nameless() -> BinaryIO:
+    """Return a file that goes with whoever holds it."""
+    return tempfile.TemporaryFile(prefix='odocal_')
+
+
+def mapped(file: BinaryIO, size: int, access: int = mmap.ACCESS_WRITE) -> mmap.mmap:
+    """Return a file's bytes as memory that ``let_go`` gives back; a size of 0: all of them."""
+    pages = mmap.mmap(file.fileno(), size, access=access)
+    with _lock:
+        _maps.add(pages)
+    return pages
+
+
+def room(*shape: int, dtype: DTypeLike = float) -> NDArray[Any]:
+    """Return zeros to work in: many of them in a file, as far as the disk has room."""
+    size = np.dtype(dtype).itemsize * math.prod(shape)
+    if size >= ROOM_BYTES:
+        with contextlib.suppress(OSError), nameless() as file:
+            os.posix_fallocate(file.fileno(), 0, size)      # a page that finds no place kills
+            return np.frombuffer(mapped(file, size), dtype).reshape(shape)
+    return np.zeros(shape, dtype)
+
+
+def let_go() -> None:
+    """Give back the memory of all arrays that lie in files; they can be used as before."""
+    with _lock:
+        maps = list(_maps)
+    for pages in maps:
+        pages.madvise(mmap.MADV_DONTNEED)
