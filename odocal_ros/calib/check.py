@@ -15,6 +15,7 @@ import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import TrackCheck
+from odocal_ros.calib.slow_errors import SLOW_WINDOW
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
@@ -23,6 +24,7 @@ DIRECTION_CHORD = 10.0           # m, least length of a piece whose direction is
 CLEAR_SIGMAS = 20.0    # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
 AS_FAR_BACKWARDS = (0.6, 1.6)    # of a piece driven backwards, track beside fixes
 MISMATCH_SIGMAS = 4.0            # sigmas of disagreement that name a mismatch
+FEWEST_WINDOWS = 3               # of SLOW_WINDOW, to tell a bend by
 SLOP_OF_WAY = 0.002              # of the distance: slip, suspension, road
 
 
@@ -90,6 +92,45 @@ def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
         return ()
     return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
                    f'fixes, {allowed:.1f} m would be believable'),)
+
+
+def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: float,
+         distance: float) -> tuple[Reason, ...]:
+    """
+    Return MODEL_MISMATCH where a pinned track bends as neither its gyros nor the fixes would.
+
+    The ends alone tell nothing of a turn in between that was not there, or was and is not told.
+    Means over windows show it, across the chord; how far slow errors of the fixes may take them
+    is what they do along it.
+
+    Parameters
+    ----------
+    t, residual : (n,), (n, 3) arrays
+        Times, s, and corrected track less fixes, m.
+    chord_n : (3,) array
+        From mark to mark, m.
+    fix_sigma, drift : float
+        Of a fix, and what the gyros may have bent the track by, m.
+    distance : float
+        Of the leg, m.
+
+    """
+    window = ((t - t[0]) / SLOW_WINDOW).astype(int)
+    count = np.bincount(window)
+    full = count >= max(5, 0.5 * count.max())
+    x, y = chord_n[:2] / np.hypot(*chord_n[:2])
+    along, across = (np.bincount(window, residual[:, :2] @ axis)[full] / count[full]
+                     for axis in ((x, y), (-y, x)))
+    if len(across) < FEWEST_WINDOWS:
+        return ()
+    sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count[full]) + drift**2)
+    allowed, most = MISMATCH_SIGMAS * sigma + SLOP_OF_WAY * distance, np.abs(across).max()
+    if most <= allowed:
+        return ()
+    return (Reason(Code.MODEL_MISMATCH, f'the track bends {most:.1f} m away from the fixes, '
+                   f'{allowed:.1f} m would be believable: a gyro that errs more than its grade, '
+                   'or rows of it that are wrong', 'Take the method smoother, which fits the gyro '
+                   'too; mend what drops or spoils rows, or copy the recording again.'),)
 
 
 def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,

@@ -17,6 +17,7 @@ import numpy as np
 from odocal_ros.calib.budget import drift_sources
 from odocal_ros.calib.check import (
     against_travel,
+    bent,
     fix_noise_factor,
     mismatch,
     pieces,
@@ -179,8 +180,11 @@ class TwoPointRun:
         found = against_travel(direction, course, stretch, self.config.odometer.signed)
         self.found += found
         if not found:
-            check = track_check(stray(ready.path(f), chord.start, fixes), ready.distance)
-            self.reasons += mismatch(check, ready.fix_sigma, drift, ready.distance)
+            off = stray(ready.path(f), chord.start, fixes)
+            wrong = mismatch(track_check(off, ready.distance), ready.fix_sigma, drift,
+                             ready.distance)
+            self.reasons += wrong or bent(t, off, chord.M @ f, ready.fix_sigma, drift,
+                                          ready.distance)
 
     def _reversed(self, chord: Chord) -> None:
         """Say that the odometer counts down where nothing tells how the Imu is pushed."""

@@ -27,7 +27,7 @@ BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni
 LARGEST_VALUE = 1e300     # of any other value: sums and products with it stay finite
 UNIT_LENGTH = 2.0         # times one, either way: a quaternion of another length is no attitude
 WIDEST_VARIANCE = 1e12    # rad^2, no driver's way of saying unknown is beyond it
-LEAST_VALUE = 1e-100      # nor does any sensor mean this, but zero
+LEAST_VALUE = 1e-50       # nor does any mean less than a float32 can hold, but zero
 # rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
 CLUMP_ROWS = 5
 CLUMP_REACH = 50          # rows: a page or a packed block of a recording is about so many

@@ -14,6 +14,7 @@ import pytest
 
 from odocal_ros.calib.check import (
     against_travel,
+    bent,
     fix_noise_factor,
     mismatch,
     pieces,
@@ -248,3 +249,22 @@ def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():
         fixes = np.cumsum(step, axis=0)[::5]
         ratio = turn_ratio(t, np.gradient(faces, t), t[::5], fixes, 1.5)
         assert gyro_reasons(ratio, 1.0) == ()
+
+
+def test_a_track_that_bends_where_neither_gyro_nor_fixes_do_is_said():
+    t = np.arange(0.0, 200.0, 0.5)
+    rng, chord = np.random.default_rng(5), np.array([300.0, 400.0, 0.0])
+    white = np.c_[rng.normal(0.0, 1.5, (len(t), 2)), np.zeros(len(t))]
+    across = np.array([-0.8, 0.6, 0.0])
+    bow = np.where(np.abs(t - 100.0) < 40.0, 6.0, 0.0)[:, None]     # four windows of 20 s
+    # 4 sigma of the mean of 40 fixes, 0.24 m each and as much seen along, and 0.2 % of the way
+    found, = bent(t, white + bow * across, chord, 1.5, 0.0, 500.0)
+    assert found.code is Code.MODEL_MISMATCH
+    assert 'bends 6.' in found.text
+    assert not bent(t, white, chord, 1.5, 0.0, 500.0)
+    # gyros that may, or fixes that are as far off along the way
+    assert not bent(t, white + bow * across, chord, 1.5, 2.0, 500.0)
+    slow = bow * across + np.roll(bow, 60) * chord / 500.0
+    assert not bent(t, white + slow, chord, 1.5, 0.0, 500.0)
+    # too few windows to tell
+    assert not bent(t[:100], (white + bow * across)[:100], chord, 1.5, 0.0, 500.0)
