@@ -175,7 +175,9 @@ def _run(command, clock):
     """Run a command; return what it printed, its seconds and its peak RSS, KiB."""
     read, write = os.pipe()
     began = time.perf_counter()
-    pid = os.posix_spawn(command[0], command, os.environ, file_actions=[
+    # what is installed has its bytecode beside it
+    own = {k: v for k, v in os.environ.items() if k != 'PYTHONDONTWRITEBYTECODE'}
+    pid = os.posix_spawn(command[0], command, own, file_actions=[
         (os.POSIX_SPAWN_DUP2, write, 1), (os.POSIX_SPAWN_CLOSE, read)])
     os.close(write)
     with os.fdopen(read) as pipe:
