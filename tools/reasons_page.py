@@ -200,7 +200,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.PARAMETER_NOT_DETERMINED: 'A further value, such as a lever arm or a delay, cannot '
         'be told from this drive; it stays as configured.',
         Code.MODEL_MISMATCH: 'What is left over after the fit is larger, or more regular, than '
-        'the noise that was assumed.',
+        'the noise that was assumed. Of the two-point method: between its ends the track bends '
+        "away from the fixes, by more than the gyro's grade and slow errors of the fixes would "
+        'have it.',
         Code.METHOD_REJECTED: 'A method that goes before another, or alone tells left from right '
         'wheel, found that its values are not to be used; its first reason is given. The result '
         'is by the others.',
