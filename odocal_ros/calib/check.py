@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import TrackCheck
-from odocal_ros.calib.slow_errors import SLOW_WINDOW
+from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
@@ -24,7 +24,7 @@ DIRECTION_CHORD = 10.0           # m, least length of a piece whose direction is
 CLEAR_SIGMAS = 20.0    # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
 AS_FAR_BACKWARDS = (0.6, 1.6)    # of a piece driven backwards, track beside fixes
 MISMATCH_SIGMAS = 4.0            # sigmas of disagreement that name a mismatch
-FEWEST_WINDOWS = 3               # of SLOW_WINDOW, to tell a bend by
+BEND_WINDOWS = 3                 # fewest to tell a bend by
 SLOP_OF_WAY = 0.002              # of the distance: slip, suspension, road
 
 
@@ -115,15 +115,12 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
         Of the leg, m.
 
     """
-    window = ((t - t[0]) / SLOW_WINDOW).astype(int)
-    count = np.bincount(window)
-    full = count >= max(5, 0.5 * count.max())
     x, y = chord_n[:2] / np.hypot(*chord_n[:2])
-    along, across = (np.bincount(window, residual[:, :2] @ axis)[full] / count[full]
-                     for axis in ((x, y), (-y, x)))
-    if len(across) < FEWEST_WINDOWS:
+    count, _, (along, across) = window_means(t, *(residual[:, :2] @ axis
+                                                  for axis in ((x, y), (-y, x))))
+    if len(count) < BEND_WINDOWS:
         return ()
-    sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count[full]) + drift**2)
+    sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
     allowed, most = MISMATCH_SIGMAS * sigma + SLOP_OF_WAY * distance, np.abs(across).max()
     if most <= allowed:
         return ()

@@ -18,6 +18,21 @@ CHI2_MEDIAN = 0.4549                               # of one squared normal
 UNCLEAR_RATIO = 2.0    # of a variance: nearer, neither of two estimates is the better
 TIME_CONSTANTS = np.geomspace(2.0, 2000.0, 100)    # s, time constants that SLOW_WINDOW can tell
 SLOW_WINDOW = 20.0                                 # s, window in which white errors average down
+ROWS_IN_WINDOW = 5                                 # fewest, for a mean
+WINDOWS_FOR_VARIANCE = 5                           # fewest, the same
+
+
+def window_means(t, *columns):
+    """
+    Return the means of columns over windows of SLOW_WINDOW that hold enough rows, and how many.
+
+    t : (n,) s, from the first of which windows are counted.   columns : (n,) each.   Returns
+    (k,) rows in a window, (k,) window numbers, and a list of (k,) means.
+    """
+    window = ((t - t[0]) / SLOW_WINDOW).astype(int)
+    count = np.bincount(window)
+    full = np.flatnonzero(count >= max(ROWS_IN_WINDOW, 0.5 * count.max()))
+    return count[full], full, [np.bincount(window, x)[full] / count[full] for x in columns]
 
 
 def slow_variance(t, along, way, variance, drift):
@@ -39,22 +54,19 @@ def slow_variance(t, along, way, variance, drift):
         What the gyros may have done along it, m: no error of the fixes.
 
     """
-    window = ((t - t[0]) / SLOW_WINDOW).astype(int)
-    count = np.bincount(window)
-    full = count >= max(5, 0.5 * count.max())
-    if full.sum() < 5:
+    count, number, (means, places) = window_means(t, along, way)
+    if len(count) < WINDOWS_FOR_VARIANCE:
         return 0.0, np.inf
-    means, places = (np.bincount(window, x)[full] / count[full] for x in (along, way))
     means, places = means - means.mean(), places - places.mean()
     means = means - places * (places @ means) / max(places @ places, 1e-9)
-    free = full.sum() - 2
+    free = len(count) - 2
     jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
-    white = min(jump, np.median(variance)) / np.median(count[full])
+    white = min(jump, np.median(variance)) / np.median(count)
     seen = (means**2).sum() / free - drift**2
     # within three sigmas of the mean square of so many windows, white errors alone may do it
     if seen <= white * (1 + 3 * np.sqrt(2 / free)):
         return 0.0, np.inf
-    next_to = (means[1:] * means[:-1])[np.diff(np.flatnonzero(full)) == 1]
+    next_to = (means[1:] * means[:-1])[np.diff(number) == 1]
     alike = (next_to.mean() - drift**2) / (seen - white) if len(next_to) else 1.0
     return float(seen - white), _lasting(alike)
 

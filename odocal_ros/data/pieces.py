@@ -62,7 +62,7 @@ def medians(x: Floats) -> Floats:
     return np.array(found)
 
 
-def pieces(times: Array, t: Array, *columns: Array) -> Iterator[tuple[slice, slice]]:
+def pieces(times: Array, t: Array) -> Iterator[tuple[slice, slice]]:
     """Yield slices of rising times, and of the rows of t that they lie between; all of each."""
     done = 0
     for rows in chunks(len(t) - 1):

@@ -122,6 +122,11 @@ class Forecast:
         """Return what to drive besides metres."""
         return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
 
+    def age_s(self, stamp_ns: int) -> float:
+        """Return how long it lies before a stamp, s; NaN where that is no time after it."""
+        age = (stamp_ns - self.until_ns) * 1e-9
+        return age if age >= 0 else math.nan       # the stamps were wild, or the Imu's are gone
+
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
     """

@@ -142,7 +142,7 @@ class LegCompletion:
             config=session.config if session.busy else self._config(), lost=self._lost_leg(),
             ability=self._ability if recording else None, forecast=forecast,
             faults=self._watch.faults(self._recording.imu_silent_s()) if recording else (),
-            forecast_age_s=age_s(forecast, end_ns),
+            forecast_age_s=forecast.age_s(end_ns) if forecast else nan,
             journal=self._journal.folder, journal_trouble=self._journal.trouble,
             duration_s=max(0, end_ns - session.start_ns) * 1e-9 if session.start_ns else 0.0)
 
@@ -283,9 +283,3 @@ class LegCompletion:
         return self._filing.save(calibration, self.session.config, inputs.topics,
                                  inputs.by_slot['imu'].frame, self._clock.now().nanoseconds,
                                  asked)
-
-
-def age_s(forecast, end_ns: int) -> float:
-    """Return how long a forecast lies before a stamp, s; NaN where that is no time after it."""
-    age = (end_ns - forecast.until_ns) * 1e-9 if forecast else nan
-    return age if age >= 0 else nan       # the stamps were wild, or the Imu's are gone

@@ -39,7 +39,7 @@ def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     times : (m,) array, rising.   t : (n,) array, n > 1.   Returns (m, ...).
     """
     integral, out = Integral(), np.empty((len(times), *x.shape[1:]))
-    for where, rows in pieces(times, t, x):
+    for where, rows in pieces(times, t):
         interpolated(times[where], t[rows], integral.over(t[rows], x[rows]), out[where])
     return out
 
@@ -56,7 +56,7 @@ def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
 def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
     """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
     once, twice, out = Integral(), Integral(), np.empty(len(times))
-    for where, rows in pieces(times, t, x):
+    for where, rows in pieces(times, t):
         interpolated(times[where], t[rows], twice.over(t[rows], once.over(t[rows], x[rows])),
                      out[where])
     return out

@@ -93,7 +93,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         return np.interp(seconds(arrival_ns), arrival, lag)
     order = np.argsort(arrival_ns, kind='stable')
     times_ns, found = arrival_ns[order], np.empty(len(order))
-    for where, rows in pieces(times_ns, imu.received_ns, imu.received_ns, imu.stamp_ns):
+    for where, rows in pieces(times_ns, imu.received_ns):
         found[order[where]] = np.interp(seconds(times_ns[where]), seconds(imu.received_ns[rows]),
                                         _lag(take(imu, rows)))
     return found

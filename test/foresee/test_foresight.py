@@ -516,3 +516,11 @@ def test_keys_are_bare_numbers_and_empty_where_nothing_is_foreseen():
     none = as_keys(None)
     assert set(none) == set(keys) | set(running) | {'estimate_method'}
     assert {none[key] for key in keys} == {''}
+
+
+def test_an_estimate_is_never_of_a_time_to_come():
+    forecast = Forecast(GOOD, GOOD, until_ns=1_750_000_671_800_000_000)
+    assert forecast.age_s(forecast.until_ns + 2_500_000_000) == pytest.approx(2.5)
+    # wild stamps, or none: -1750000671.8 s stood in the status
+    for stamp_ns in (0, forecast.until_ns - 1):
+        assert math.isnan(forecast.age_s(stamp_ns))

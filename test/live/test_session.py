@@ -11,14 +11,11 @@
 
 from dataclasses import replace
 import json
-from types import SimpleNamespace
 
 from drives import drive, settings
-import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.live.leg_completion import age_s
 from odocal_ros.live.session import MOST_DRAWN, Refused, Session, State
 from odocal_ros.output.files import as_json
 from odocal_ros.output.geojson import geojson
@@ -181,12 +178,3 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
     assert 'No figures here of leg 1, ' in report_html(both, config, content[1])
     track, = geojson(both, config, content[1]).values()
     assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}
-
-
-def test_an_estimate_is_never_of_a_time_to_come():
-    forecast = SimpleNamespace(until_ns=1_750_000_671_800_000_000)
-    assert age_s(forecast, forecast.until_ns + 2_500_000_000) == pytest.approx(2.5)
-    # wild stamps, or none: -1750000671.8 s stood in the status
-    for end_ns in (0, forecast.until_ns - 1):
-        assert np.isnan(age_s(forecast, end_ns))
-    assert np.isnan(age_s(None, 5))

@@ -84,9 +84,7 @@ class Solved:
         z[n:, :n] = z[:n, n:].T
         z[:n, :n] = own[N - 1] - z[:n, n:] @ H.T
         own[N - 1], wide[N - 1, :, n:n + m] = z[:n, :n], z[:n, n:]
-        for k in range(N - 2, -1, -1):
-            if k % LET_GO_AFTER == 0:
-                let_go()
+        for k in stepping(range(N - 2, -1, -1)):
             G = wide[k][:, :n + m]
             across = -G @ z
             own[k] -= across @ G.T
@@ -179,6 +177,14 @@ def blocks(n: int) -> Iterator[slice]:
             let_go()
 
 
+def stepping(numbers: range) -> Iterator[int]:
+    """Yield numbers; what lies in files is let go now and then."""
+    for k in numbers:
+        yield k
+        if k % LET_GO_AFTER == 0:
+            let_go()
+
+
 def solve(normal: Normal) -> Solved:
     """
     Solve the normal equations, which are used up by it.
@@ -209,9 +215,7 @@ def solve(normal: Normal) -> Solved:
     corner[:m, m] = corner[m, :m] = normal.g_border * s_c
     logdet = -2 * np.log(s).sum() - 2 * np.log(s_c).sum()
     D = diagonal[0]
-    for k in range(N):
-        if k % LET_GO_AFTER == 0:
-            let_go()
+    for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
             raise NotPositive(f'nothing holds keyframe {k} of {N}')
@@ -237,9 +241,7 @@ def solve(normal: Normal) -> Solved:
     covariance = dpotrs(root, np.eye(m), lower=1)[0]
     x = np.concatenate([wide[rows, :, n + m] - wide[rows, :, n:n + m] @ c
                         for rows in blocks(N)])
-    for k in range(N - 2, -1, -1):
-        if k % LET_GO_AFTER == 0:
-            let_go()
+    for k in stepping(range(N - 2, -1, -1)):
         x[k] -= wide[k][:, :n] @ x[k + 1]
     return Solved(x * s, c * s_c, covariance * np.multiply.outer(s_c, s_c), float(logdet),
                   reduced, corner[:m, m] / s_c, (wide, diagonal), s, s_c)
