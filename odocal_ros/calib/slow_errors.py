@@ -12,7 +12,7 @@
 import numpy as np
 
 from odocal_ros.calib.marks import MarkFix, standing_at
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 
 CHI2_MEDIAN = 0.4549                               # of one squared normal
 UNCLEAR_RATIO = 2.0    # of a variance: nearer, neither of two estimates is the better
@@ -22,7 +22,7 @@ ROWS_IN_WINDOW = 5                                 # fewest, for a mean
 WINDOWS_FOR_VARIANCE = 5                           # fewest, the same
 
 
-def window_means(t, *columns):
+def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:
     """
     Return the means of columns over windows of SLOW_WINDOW that hold enough rows, and how many.
 
