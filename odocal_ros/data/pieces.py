@@ -15,6 +15,7 @@ is as much again.
 """
 
 from collections.abc import Callable, Iterator
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,16 @@ def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> 
             found = room(n, *part.shape[1:], dtype=part.dtype)
         found[rows] = part
     return found
+
+
+def across(ufunc: np.ufunc, x: Array) -> Array:
+    """Return ``ufunc.reduce(x, axis=1)``, (n, k) to (n,); numpy's own takes ten times as long."""
+    return reduce(ufunc, x.T)
+
+
+def lengths(x: Floats) -> Floats:
+    """Return ``np.linalg.norm(x, axis=1)``, (n, k) to (n,), likewise."""
+    return np.sqrt(across(np.add, x * x))
 
 
 def medians(x: Floats) -> Floats:

@@ -9,6 +9,8 @@
 
 """Integrals of long columns, some rows at a time; to the last bit as if at once."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
@@ -38,10 +40,34 @@ def integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
 
     times : (m,) array, rising.   t : (n,) array, n > 1.   Returns (m, ...).
     """
-    integral, out = Integral(), np.empty((len(times), *x.shape[1:]))
-    for where, rows in pieces(times, t):
-        interpolated(times[where], t[rows], integral.over(t[rows], x[rows]), out[where])
-    return out
+    return integrals_at([times], t, x)[0]
+
+
+def integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
+    """Return the same at each of several arrays of times."""
+    return _at(times, t, x, Integral().over)
+
+
+def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
+    """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
+    return twice_integrals_at([times], t, x)[0]
+
+
+def twice_integrals_at(times: Sequence[Floats], t: Floats, x: Floats) -> list[Floats]:
+    """Return the same at each of several arrays of times."""
+    once, twice = Integral(), Integral()
+    return _at(times, t, x, lambda t, x: twice.over(t, once.over(t, x)))
+
+
+def _at(times: Sequence[Floats], t: Floats, x: Floats,
+        over: Callable[[Floats, Floats], Floats]) -> list[Floats]:
+    found = [np.empty((len(each), *x.shape[1:])) for each in times]
+    for parts in zip(*(pieces(each, t) for each in times), strict=True):
+        rows = parts[0][1]
+        integral = over(t[rows], x[rows])
+        for each, (where, _), out in zip(times, parts, found, strict=True):
+            interpolated(each[where], t[rows], integral, out[where])
+    return found
 
 
 def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
@@ -51,12 +77,3 @@ def interpolated(times: Floats, t: Floats, x: Floats, out: Floats) -> None:
         return
     for k in range(x.shape[1]):
         out[:, k] = np.interp(times, t, x[:, k])
-
-
-def twice_integral_at(times: Floats, t: Floats, x: Floats) -> Floats:
-    """Return the integral of the integral of x, (n,), at times, rising: (m,)."""
-    once, twice, out = Integral(), Integral(), np.empty(len(times))
-    for where, rows in pieces(times, t):
-        interpolated(times[where], t[rows], twice.over(t[rows], once.over(t[rows], x[rows])),
-                     out[where])
-    return out

@@ -9,10 +9,12 @@
 
 """Standstill: when the vehicle stands, from odometer and gyro."""
 
+from functools import reduce
+
 import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import by_step
+from odocal_ros.data.pieces import across, by_step
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
@@ -92,13 +94,15 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
     rate = np.diff(integral_at(edges, t_imu, w_b), axis=0) / np.diff(edges)[:, None]
     reach = round(REST_WINDOW / REST_GRID)
     padded = np.pad(rate, ((reach, reach), (0, 0)), mode='edge')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
+    beside = [padded[k:k + len(rate)] for k in range(2 * reach + 1)]
+    mean = reduce(np.add, beside) / len(beside)
+    spread = np.sqrt(reduce(np.add, [(x - mean)**2 for x in beside]) / len(beside))
     seen = np.ones(len(rate), bool)
     if by_step(lambda t: np.diff(t) > REST_WINDOW, t_imu).any():
         dt = np.diff(t_imu)
         unseen = np.concatenate([[0.0], np.cumsum(np.where(dt > REST_WINDOW, dt, 0.0))])
         seen = np.diff(np.interp(edges, t_imu, unseen)) == 0      # nothing known within a gap
-    return windows.mean(axis=-1), (windows.std(axis=-1) < REST_TURN).all(axis=-1) & seen
+    return mean, across(np.logical_and, spread < REST_TURN) & seen
 
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
@@ -116,5 +120,5 @@ def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> 
     rest = min(means, key=np.linalg.norm)
     if np.abs(rest).max() > MOST_BIAS:
         return np.zeros_like(quiet)
-    as_at_rest: Bools = (np.abs(rate - rest) < REST_TURN).all(axis=-1)
+    as_at_rest: Bools = across(np.logical_and, np.abs(rate - rest) < REST_TURN)
     return as_at_rest

@@ -10,13 +10,14 @@
 """Values no sensor means: beyond any range, or alone against all their neighbours."""
 
 from dataclasses import replace
+from functools import reduce
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import by_row, by_step
+from odocal_ros.data.pieces import across, by_row, by_step, lengths
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -60,7 +61,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
     def odd(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
         usable = (size <= most) & ((size >= LEAST_VALUE) | (size == 0))
-        odd: Bools = ~usable.all(axis=tuple(range(1, x.ndim)))
+        odd: Bools = ~(usable if x.ndim == 1 else across(np.logical_and, usable))
         return odd
     with np.errstate(invalid='ignore'):
         return by_row(odd, column)
@@ -69,7 +70,7 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
 def oriented(samples: Oriented) -> Oriented:
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
-        length = np.linalg.norm(np.where(wild[:, None], 0.0, q_ni), axis=1)
+        length = lengths(np.where(wild[:, None], 0.0, q_ni))
         none: Bools = ((length < 1 / UNIT_LENGTH) | (length > UNIT_LENGTH)
                        | (np.abs(variance) > WIDEST_VARIANCE))
         return none
@@ -120,7 +121,7 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
 
     """
     found = np.zeros(len(x), bool)
-    bound = by_step(lambda x: np.abs(np.diff(x, axis=0)).max(axis=1, initial=0.0), x)
+    bound = by_step(lambda x: across(np.maximum, np.abs(np.diff(x, axis=0))), x)
     far = np.flatnonzero(bound > least)
     if not len(far):
         return found
@@ -150,14 +151,16 @@ def single(x: Floats, least: float) -> Bools:
     def off(x: Floats) -> Bools:
         m = len(x) - 2 * edge
         far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
+        if not (far > least).any():
+            return np.zeros(m, bool)
         # a false row shows in those at it, too
-        beside = np.max([far[ROWS_BESIDE + k:][:m] for d in range(2, edge) for k in (-d, d)],
-                        axis=0)
+        beside = reduce(np.maximum, (far[ROWS_BESIDE + k:][:m]
+                                     for d in range(2, edge) for k in (-d, d)))
         at = far[ROWS_BESIDE:][:m]
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
         is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
                          & (apart < NEIGHBOURS_ALIKE * at))
-        alone: Bools = np.any(is_off, axis=1)
+        alone: Bools = across(np.logical_or, is_off)
         return alone
 
     found = np.zeros(len(x), bool)
@@ -191,7 +194,8 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     """
     if len(t) < 2 or len(travel.t) < 2:
         return ()
-    same = by_step(lambda w: (w[1:] == w[:-1]).all(axis=1) & w[1:].any(axis=1), w)
+    same = by_step(lambda w: across(np.logical_and, w[1:] == w[:-1])
+                   & across(np.logical_or, w[1:] != 0), w)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     begin, end = t[edges[::2]], t[edges[1::2]]
     speed = np.abs(np.diff(travel.s)) / np.maximum(np.diff(travel.t), 1e-6)

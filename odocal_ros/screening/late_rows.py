@@ -20,7 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
@@ -89,12 +89,11 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     even = rows + _least_of_next(t - rows, ahead)
     even += np.median(t - even)         # what all have is a delay, and no lateness
     late = t - even > max(LEAST_LATE, LATE_SHARE * usual)
-    off_sent, off_even = (_off(x, travel, LINE) for x in (t, even))
     true = t.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        about = slice(max(begin - EVEN_BESIDE, 0), end + EVEN_BESIDE)
-        sent, put = off_sent[about], off_even[about]
+        about = np.arange(max(begin - EVEN_BESIDE, 0), min(end + EVEN_BESIDE, len(t)))
+        sent, put = (_off(x, travel, LINE, about) for x in (t, even))
         fits = np.linalg.norm(put) < FITTING_SHARE * np.linalg.norm(sent)
         if np.abs(put).max() <= least or fits:
             true[begin:end] = even[begin:end]
@@ -117,7 +116,8 @@ def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
     for even in rhythms:
         left = np.abs(true - even)
         jitters = (left > LEAST_JITTER) & (left < usual)
-        sent, put = (np.linalg.norm(_off(x, travel, CUBIC)[jitters]) for x in (t, even))
+        rows = np.flatnonzero(jitters)
+        sent, put = (np.linalg.norm(_off(x, travel, CUBIC, rows)) for x in (t, even))
         if put < EVENER_SHARE * least * sent:
             best, least = np.where(jitters, even, true), float(put / sent)
     return best
@@ -143,19 +143,20 @@ def _least_of_next(x: Floats, count: int) -> Floats:
     return np.minimum(until[:n], since[count - 1:count - 1 + n])
 
 
-def _off(t: Floats, travel: Floats, beside: tuple[int, ...]) -> Floats:
-    """Return by how much each row's travel is off the polynomial through rows so far beside it."""
-    k, last = np.arange(len(t)), len(t) - 1
-    nodes = [np.clip(k + step, 0, last) for step in beside]
-    meant = np.zeros(len(t))
-    for at in nodes:
-        weight = np.ones(len(t))
-        for other in nodes:
-            if other is not at:
-                apart = t[at] - t[other]        # none of rows that came at once, or at an end
-                weight *= (t - t[other]) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
-        meant += weight * (travel[at] - travel)
-    whole = (k + min(beside) >= 0) & (k + max(beside) <= last)
+def _off(t: Floats, travel: Floats, beside: tuple[int, ...], rows: Ints) -> Floats:
+    """Return by how much rows' travel is off the polynomial through rows so far beside: (m,)."""
+    last = len(t) - 1
+    nodes = [np.clip(rows + step, 0, last) for step in beside]
+    times, here = [t[at] for at in nodes], t[rows]
+    meant = np.zeros(len(rows))
+    for at, time in zip(nodes, times, strict=True):
+        weight = np.ones(len(rows))
+        for other in times:
+            if other is not time:
+                apart = time - other        # none of rows that came at once, or at an end
+                weight *= (here - other) / np.where(np.abs(apart) > 1e-9, apart, 1e-9)
+        meant += weight * (travel[at] - travel[rows])
+    whole = (rows + min(beside) >= 0) & (rows + max(beside) <= last)
     return np.where(whole, -meant, 0.0)
 
 

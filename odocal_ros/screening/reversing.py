@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.nav.integral import integral_at, twice_integral_at
+from odocal_ros.nav.integral import integral_at, integrals_at, twice_integrals_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
@@ -159,9 +159,9 @@ class _Forces:
 
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
         self.turned = integral_at(t, t_imu, w_b)
-        self.speed_before, self.speed = (integral_at(t + d, t_imu, f_b) for d in (-PUSH_TIME, 0.0))
-        before, here, after = (twice_integral_at(t + d, t_imu, f_b[:, 0])
-                               for d in (-PUSH_TIME, 0.0, PUSH_TIME))
+        times = [t + d for d in (-PUSH_TIME, 0.0, PUSH_TIME)]
+        self.speed_before, self.speed = integrals_at(times[:2], t_imu, f_b)
+        before, here, after = twice_integrals_at(times, t_imu, f_b[:, 0])
         self.push = (before - 2 * here + after) / PUSH_TIME**2
 
 

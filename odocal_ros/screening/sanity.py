@@ -12,7 +12,7 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_row, medians
+from odocal_ros.data.pieces import by_row, chunks, lengths, medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
@@ -48,10 +48,10 @@ def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats,
     """
     mean, rest = medians(f_b), medians(w_b)
     size = float(np.linalg.norm(mean))
-    fast = float(np.percentile(by_row(lambda w: np.linalg.norm(w - rest, axis=1), w_b), 99.9,
+    fast = float(np.percentile(by_row(lambda w: lengths(w - rest), w_b), 99.9,
                                overwrite_input=True))
     reasons = []
-    if not by_row(lambda w: w.any(axis=1), w_b).any():       # what messages hold that have none
+    if not any(w_b[some].any() for some in chunks(len(w_b))):   # what messages hold that have none
         reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '
                               'imu.gyro_scale is 0'))
     if size < NO_GRAVITY:
