@@ -62,7 +62,7 @@ class Cell:
         self.imu, self.fix = sensors.imu(self.motion, clean), sensors.fixes(self.motion, clean)
         self.covariance = sensors.fixes(self.motion, self.options).covariance_n
         ns, t = sensors.stamps(self.motion.duration, self.options.odometer_rate,
-                               sensors.ODOMETER_PHASE)
+                               sensors.PHASE['odometer'])
         self.odometer_ns = self.options.start_ns + ns
         self.pulses = contact_travel(self.motion.at(t), (0.0, 0.0, 0.0)) / self.options.scale
         self.truth = scenarios._truth(self.motion, self.options, self.imu)

@@ -15,7 +15,7 @@ with them states the whole error; their scatter shows what part of it changes fr
 that part averages down, unless the data show that the slow part moved on within the window too.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,7 +140,8 @@ def _correlation_time(t, z, fast, slow):
     return float(np.median(t[lag:] - t[:-lag]) / -np.log1p(-moved))
 
 
-def standing_at(t_mark: float, spans: Floats, slack: float = 0.5) -> tuple[float, float] | None:
+def standing_at(t_mark: float, spans: Floats | Sequence[tuple[float, float]],
+                slack: float = 0.5) -> tuple[float, float] | None:
     """Return the standstill (begin, end) that contains or touches a mark, or None."""
     for begin, end in spans:
         if begin - slack <= t_mark <= end + slack:

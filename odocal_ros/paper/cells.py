@@ -74,9 +74,10 @@ class Cell:
         """Return ours over the printed one, both in our sense."""
         return self.value / (self.sense * self.printed) if self.printed else None
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, float | str | None]:
         """Return the entry of --json."""
-        entry: dict = {'printed': self.printed, 'value': self.value, 'ratio': self.ratio}
+        entry: dict[str, float | str | None] = {
+            'printed': self.printed, 'value': self.value, 'ratio': self.ratio}
         if self.sign is not None:
             entry['sign'] = self.sign
         return entry | ({'remark': self.remark} if self.remark else {})

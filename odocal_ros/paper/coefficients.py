@@ -42,11 +42,11 @@ def table_1() -> dict[str, dict[str, Cell]]:
     """Return the coefficient of each error in the rate of each state: {rate of: {by: Cell}}."""
     F = coefficients(LATITUDE, 0.0, VELOCITY_N, PAPER_RADIUS)
 
-    def entry(row, column):
+    def entry(row: str, column: str) -> float:
         return -1.0 if OWN_DRIFT.get(row) == column else float(
             F[STATES.index(row), STATES.index(column)])
 
-    def cell(row, column, printed):
+    def cell(row: str, column: str, printed: float) -> Cell:
         value = entry(row, column)
         cut = '' if float(f'{abs(value):.1e}') == printed else CUT
         return _cell(printed, value, REMARKS_1.get((row, column), cut))
@@ -59,7 +59,7 @@ def table_2() -> dict[str, dict[str, Cell]]:
     """Return table 1 times the sizes of the errors, 1/s and rad/s."""
     first = table_1()
 
-    def cell(row, column, printed):
+    def cell(row: str, column: str, printed: float) -> Cell:
         own = first[row][column]
         value = own.value * SIZES[column] * own.sign
         remark = REMARKS_2.get((row, column), '')
@@ -71,5 +71,5 @@ def table_2() -> dict[str, dict[str, Cell]]:
             for row, cells in TABLE_2.items()}
 
 
-def _cell(printed, value, remark):
+def _cell(printed: float, value: float, remark: str) -> Cell:
     return Cell(printed, abs(value), sign=1 if value > 0 else -1, remark=remark)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import LegResult
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.projection import plane_for
 from odocal_ros.nav.rotations import exp_so3
@@ -51,7 +52,7 @@ SOURCES = {
 RIGHT_FORWARD_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def errors_of(source):
+def errors_of(source: str) -> tuple[Floats, Floats]:
     """Return phi_n (3,), rad, and eps_b (3,), rad/s in forward-left-up, of a row of table 3."""
     phi, eps = SOURCES[source]
     return np.multiply(phi, (LEVEL, LEVEL, HEADING)), RIGHT_FORWARD_UP @ eps * DRIFT

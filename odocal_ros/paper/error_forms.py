@@ -19,11 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
+
 # Krassovsky's ellipsoid as in eq. (1)-(5): m, m, m
 C, C0, C1 = 6399698.9018, 6367558.49686, 32005.79642
 
 
-def plane_error(latitude, longitude, central_meridian, dL, dlam):
+def plane_error(latitude: Floats | float, longitude: Floats | float, central_meridian: float,
+                dL: Floats | float, dlam: Floats | float) -> tuple[Floats | float, Floats | float]:
     """
     Return northing and easting error dx, dy, m, of dL, dlam, rad: eq. (13), (14), corrected.
 
@@ -37,7 +40,8 @@ def plane_error(latitude, longitude, central_meridian, dL, dlam):
     return dx, C * s * off * dL + C * c * dlam
 
 
-def chord_error(x, y, dx, dy, S1, K0):
+def chord_error(x: Floats | float, y: Floats | float, dx: Floats | float, dy: Floats | float,
+                S1: Floats | float, K0: float) -> tuple[Floats | float, Floats | float]:
     """
     Return dK (unit of K0) and dalpha (rad) of an error of the dead-reckoned end: eq. (11), (12).
 
@@ -59,7 +63,8 @@ class StraightLeg:
     dK: float
 
 
-def straight_leg(phi_U0, eps_z, duration, velocity_E, velocity_N, latitude, radius):
+def straight_leg(phi_U0: float, eps_z: float, duration: float, velocity_E: float,
+                 velocity_N: float, latitude: float, radius: float) -> StraightLeg:
     """
     Return eq. (29)-(33) in closed form: constant velocity, m/s, for ``duration``, s.
 
@@ -85,20 +90,20 @@ class SpeedProfile:
     t: NDArray[np.float64]
     s: NDArray[np.float64]
 
-    def mean(self, x):
+    def mean(self, x: Floats) -> float:
         """Return the distance-weighted mean of (m,) values, straight between epochs."""
         return float(self._weight @ (x[1:] + x[:-1]) / 2)
 
-    def mean_square(self, x):
+    def mean_square(self, x: Floats) -> float:
         """Return the distance-weighted mean of the square."""
         a, b = x[:-1], x[1:]
         return float(self._weight @ (a * a + a * b + b * b) / 3)
 
-    def variance(self, x):
+    def variance(self, x: Floats) -> float:
         """Return the distance-weighted variance."""
         return self.mean_square(x - self.mean(x))
 
-    def mounting_error(self, phi_U, tilt=None):
+    def mounting_error(self, phi_U: Floats, tilt: Floats | None = None) -> tuple[float, float]:
         """
         Return dalpha (rad) and dK / K of a straight leg of this profile: (29)-(33) generalised.
 
@@ -110,11 +115,11 @@ class SpeedProfile:
         spread = self.variance(phi_U) + (0.0 if tilt is None else self.mean_square(tilt))
         return -self.mean(phi_U), spread / 2
 
-    def heading_and_drift(self, phi_U0, eps_z):
+    def heading_and_drift(self, phi_U0: float, eps_z: float) -> tuple[float, float]:
         """Return dalpha (rad) and dK / K of an initial heading error, rad, and a drift, rad/s."""
         return self.mounting_error(phi_U0 - eps_z * (self.t - self.t[0]))
 
-    def noise_sigma(self, gyro_noise):
+    def noise_sigma(self, gyro_noise: float) -> float:
         """
         Return the yaw error, rad, 1 sigma, of white gyro noise, rad/s/sqrt(Hz).
 
@@ -125,6 +130,7 @@ class SpeedProfile:
         return float(gyro_noise * np.sqrt(np.diff(self.t) @ (a * a + a * b + b * b) / 3))
 
     @property
-    def _weight(self):
+    def _weight(self) -> Floats:
         ds = np.diff(self.s)
-        return ds / ds.sum()
+        weight: Floats = ds / ds.sum()
+        return weight

@@ -39,6 +39,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, E2, OMEGA, radii
 from odocal_ros.nav.rotations import transpose
@@ -51,7 +52,9 @@ CHUNK = 4096      # steps made at a time
 PAPER_RADIUS = 6378137.0    # m, R_e of Shi et al. 2015
 
 
-def coefficients(latitude, height, velocity_n, radius=None):
+def coefficients(latitude: Floats | float, height: Floats | float,
+                 velocity_n: Floats | tuple[float, float, float],
+                 radius: float | None = None) -> Floats:
     """
     Return F, the rates of the states by the states: (...), (...), (..., 3) to (..., 6, 6).
 
@@ -61,6 +64,10 @@ def coefficients(latitude, height, velocity_n, radius=None):
     vE, vN, vU = np.moveaxis(np.asarray(velocity_n, dtype=float), -1, 0)
     s, c = np.sin(latitude), np.cos(latitude)
     tan, sec = s / c, 1 / c
+    RM: Floats | float
+    RN: Floats | float
+    dRM: Floats | float
+    dRN: Floats | float
     if radius is None:
         meridian, normal = radii(latitude)
         RM, RN = meridian + height, normal + height
@@ -90,7 +97,9 @@ def coefficients(latitude, height, velocity_n, radius=None):
     return F
 
 
-def _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec):
+def _add_turned_velocity(F: Floats, vE: Floats | float, vN: Floats | float, vU: Floats,
+                         RM: Floats | float, RN: Floats | float, tan: Floats | float,
+                         sec: Floats | float) -> None:
     """Add what a velocity turned by phi, eq. (21), does to position and computed omega_in."""
     dv = np.zeros((*F.shape[:-2], 3, 3))                # rows dvE, dvN, dvU by phi
     dv[..., 0, 1], dv[..., 0, 2] = -vU, vN
@@ -105,7 +114,7 @@ def _add_turned_velocity(F, vE, vN, vU, RM, RN, tan, sec):
     F[..., H, :3] = dv[..., 2, :]
 
 
-def _column(x):
+def _column(x: Floats | float) -> Floats:
     return np.asarray(x)[..., None]
 
 
@@ -121,14 +130,15 @@ class Transition:
     Gamma: NDArray[np.float64]
 
 
-def transition(path: Path, radius=None) -> Transition:
+def transition(path: Path, radius: float | None = None) -> Transition:
     """Return the transition matrices of a path, without a loop over its epochs."""
     S = _steps(path, radius, np.eye(3))
     _scan(S)
     return Transition(S[..., :6], S[..., 6:])
 
 
-def propagate(path: Path, x_0, eps_b, radius=None):
+def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float],
+              radius: float | None = None) -> Floats:
     """
     Return the states at every epoch, (m, 6).
 
@@ -146,10 +156,11 @@ def propagate(path: Path, x_0, eps_b, radius=None):
     """
     S = _steps(path, radius, np.asarray(eps_b, dtype=float)[..., None])
     _scan(S)
-    return S[..., :6] @ np.asarray(x_0, dtype=float) + S[..., 6]
+    x: Floats = S[..., :6] @ np.asarray(x_0, dtype=float) + S[..., 6]
+    return x
 
 
-def _steps(path, radius, drift_b):
+def _steps(path: Path, radius: float | None, drift_b: Floats) -> Floats:
     """
     Return what each epoch makes of the one before: (m, 6, 6 + k), [A | B], x_1 = A x_0 + B.
 
@@ -164,7 +175,8 @@ def _steps(path, radius, drift_b):
     return S
 
 
-def _fill(S, path, epochs, intervals, radius, drift_b):
+def _fill(S: Floats, path: Path, epochs: slice, intervals: slice, radius: float | None,
+          drift_b: Floats) -> None:
     """Write [A | B] of some intervals into S; epochs: those at their edges."""
     dt = np.diff(path.t[epochs])[:, None, None]
     latitude, height = ((a[:-1] + a[1:]) / 2
@@ -180,7 +192,7 @@ def _fill(S, path, epochs, intervals, radius, drift_b):
     S[:, :3, 6:] -= turned
 
 
-def _scan(S):
+def _scan(S: Floats) -> None:
     """
     Turn steps into running compositions, in place: (n, 6, 6 + k), see _steps.
 
@@ -198,14 +210,14 @@ def _scan(S):
         now[:] = _after(now, ends[:len(now)])
 
 
-def _after(then, first):
+def _after(then: Floats, first: Floats) -> Floats:
     """Return the map that does first and then: A2 A1 x + (A2 B1 + B2)."""
     both = then[..., :6] @ first
     both[..., 6:] += then[..., 6:]
     return both
 
 
-def in_fixed_axes(path: Path, x, origin: Origin):
+def in_fixed_axes(path: Path, x: Floats, origin: Origin) -> tuple[Floats, Floats]:
     """
     Return psi (rad) and dr (m) in the n of ``origin``, (m, 3) each, of states x, (m, 6).
 

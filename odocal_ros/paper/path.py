@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin, Track
 from odocal_ros.nav.earth import C_en, radii
 from odocal_ros.nav.rotations import matrix_from_quat, matrix_from_rpy, transpose
@@ -43,7 +44,8 @@ class Path:
         return np.concatenate([[0.0], np.cumsum(step)])
 
 
-def path_of_track(track: Track, forward, origin: Origin, start_n=(0.0, 0.0, 0.0)) -> Path:
+def path_of_track(track: Track, forward: Floats, origin: Origin,
+                  start_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
     """
     Return the path of a dead-reckoned leg.
 
@@ -68,7 +70,8 @@ def path_of_track(track: Track, forward, origin: Origin, start_n=(0.0, 0.0, 0.0)
     return Path(track.t, latitude, longitude, height, velocity, C_nb)
 
 
-def planned_path(t, speed, yaw, latitude, longitude=0.0, height=0.0) -> Path:
+def planned_path(t: Floats, speed: Floats, yaw: Floats | float, latitude: float,
+                 longitude: float = 0.0, height: float = 0.0) -> Path:
     """
     Return the path of a level drive that is not driven yet.
 
@@ -90,7 +93,7 @@ def planned_path(t, speed, yaw, latitude, longitude=0.0, height=0.0) -> Path:
     velocity = (flat[:-1] + flat[1:]) / 2
     step = velocity * np.diff(t)[:, None]
 
-    def run(first, steps):
+    def run(first: float, steps: Floats) -> Floats:
         return first + np.concatenate([[0.0], np.cumsum(steps)])
 
     along = np.full(len(t), float(latitude))

@@ -10,12 +10,14 @@
 """Tables 3 and 4 of Shi et al. 2015 from the simulated drive, and all four as one."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.paper.cells import Cell, CONVENTION, TABLE_3, TABLE_4
 from odocal_ros.paper.coefficients import DRIFT, HEADING, table_1, table_2
 from odocal_ros.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
+from odocal_ros.paper.error_forms import SpeedProfile
 
 SCALE_REMARK = ('alike to 2e-11 in every printed row, which plane and tilt are not: a constant of '
                 "the paper's numerics, no target")
@@ -58,7 +60,7 @@ class PaperTables:
     noise_deg: float
     sigma_deg: float
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return what --json prints."""
         third = {source: {
             'yaw_deg': row.yaw_deg.as_dict() | {'model': row.model_deg,
@@ -72,7 +74,8 @@ class PaperTables:
                        '4': _plain(self.table_4)}}
 
 
-def _plain(table):
+def _plain(table: Any) -> Any:
+    """Return cells, and tables of them in each other, as --json has them."""
     return table.as_dict() if isinstance(table, Cell) else {k: _plain(v) for k, v in table.items()}
 
 
@@ -89,7 +92,7 @@ def compute() -> PaperTables:
                        noise_deg, float(np.rad2deg(outcomes['all'].yaw_sigma)))
 
 
-def _row(source, outcome, growth, noise_deg):
+def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row:
     printed_scale, printed_yaw = TABLE_3[source]
     yaw = float(np.rad2deg(outcome.yaw))
     sigmas, remark = None, ''
@@ -102,11 +105,12 @@ def _row(source, outcome, growth, noise_deg):
                float(np.rad2deg(growth.yaw[-1])), sigmas)
 
 
-def _table_4(third, profile):
+def _table_4(third: dict[str, Row],
+             profile: SpeedProfile) -> dict[str, dict[str, dict[str, Cell]]]:
     formula = {'eps_z': profile.heading_and_drift(0.0, DRIFT),
                'phi_U0': profile.heading_and_drift(HEADING, 0.0)}
 
-    def line(source, name):
+    def line(source: str, name: str) -> dict[str, Cell]:
         if name == 'simulated':
             yaw_deg, scale = third[source].yaw_deg.value, third[source].scale.value
             remarks = '', SCALE_REMARK

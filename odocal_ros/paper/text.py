@@ -39,17 +39,17 @@ def text_of(tables: PaperTables) -> str:
         _third(tables), _fourth(tables)]) + '\n'
 
 
-def _rates(title, table):
+def _rates(title: str, table: dict[str, dict[str, Cell]]) -> str:
     lines = [title, '  rate of  by       printed        ours   ratio  remark']
     for row, cells in table.items():
         for column, cell in cells.items():
-            sign = '-' if cell.sign < 0 else '+'
+            sign = '-' if cell.sign is not None and cell.sign < 0 else '+'
             lines.append(f'  {row:8s} {column:6s} {cell.printed:9.1e}  {sign}{cell.value:9.3e}  '
                          f'{cell.ratio:6.3f}{_remark(cell)}')
     return '\n'.join(lines)
 
 
-def _third(tables):
+def _third(tables: PaperTables) -> str:
     lines = [TITLE_3, '           yaw error, deg                                   '
              'scale error, K',
              '  source      printed        ours   ratio       model   printed       ours']
@@ -72,7 +72,7 @@ def _third(tables):
     return '\n'.join(lines + [_note(note) for note in notes])
 
 
-def _fourth(tables):
+def _fourth(tables: PaperTables) -> str:
     lines = [TITLE_4, '                     yaw error, deg                     scale error, K0',
              '  source             printed        ours   ratio     printed       ours']
     remarks: dict[str, str] = {}
@@ -86,11 +86,11 @@ def _fourth(tables):
     return '\n'.join(lines + [_note(f'{mark}: {text}.') for text, mark in remarks.items()])
 
 
-def _note(text):
+def _note(text: str) -> str:
     return textwrap.fill(text, 95, initial_indent='  ', subsequent_indent='    ')
 
 
-def _figure(value, form):
+def _figure(value: float | None, form: str) -> str:
     return '-' if value is None else format(value, ('+' if form.endswith('e') else '') + form)
 
 

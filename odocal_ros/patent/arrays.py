@@ -23,6 +23,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Ints
 from odocal_ros.errors import BadUsage
 
 FULL_UP_TO = 2    # levels for which all combinations are taken
@@ -67,7 +68,7 @@ def next_prime_power(n: int, odd: bool = False) -> int:
 
 
 @cache
-def field_tables(q: int):
+def field_tables(q: int) -> tuple[Ints, Ints]:
     """
     Return addition and multiplication of the field of q elements: (q, q) each, of numbers 0..q-1.
 
@@ -99,7 +100,7 @@ def irreducible(p: int, m: int) -> tuple[int, ...]:
     raise AssertionError('a field of every prime power exists')
 
 
-def _divides(factor, polynomial, p):
+def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bool:
     """Tell whether a monic factor divides a polynomial, both low first."""
     rest, d = list(polynomial), len(factor) - 1
     for k in range(len(rest) - 1, d - 1, -1):
@@ -109,11 +110,11 @@ def _divides(factor, polynomial, p):
     return not any(rest[:d])
 
 
-def _digits(k, p, m):
+def _digits(k: int, p: int, m: int) -> list[int]:
     return [k // p**i % p for i in range(m)]
 
 
-def bose(q: int, columns: int):
+def bose(q: int, columns: int) -> Ints:
     """
     Return Bose's orthogonal array L(q^2)(q^columns): (q^2, columns) level numbers.
 
@@ -131,12 +132,12 @@ def bose(q: int, columns: int):
     return np.stack([slopes[0], j, *slopes[1:]][:columns], -1)
 
 
-def full_factorial(levels) -> NDArray[np.int64]:
+def full_factorial(levels: tuple[int, ...]) -> NDArray[np.int64]:
     """Return all combinations: (product of levels, columns)."""
     return np.stack([g.ravel() for g in np.indices(tuple(levels))], -1).astype(np.int64)
 
 
-def imbalance(rows, levels) -> float:
+def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
     """Return how far the count of a pair of levels is from even, at worst over all pairs."""
     worst = 0.0
     for a, b in combinations(range(len(levels)), 2):
@@ -146,18 +147,18 @@ def imbalance(rows, levels) -> float:
     return worst
 
 
-def is_balanced(rows) -> bool:
+def is_balanced(rows: Ints) -> bool:
     """Tell whether each pair of columns holds each pair of its levels equally often."""
     return imbalance(rows, tuple(int(n) + 1 for n in rows.max(axis=0))) == 0.0
 
 
-def least_rows(levels) -> int:
+def least_rows(levels: tuple[int, ...]) -> int:
     """Return the number of rows that an orthogonal array's must be a multiple of."""
     return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \
         else int(levels[0])
 
 
-def nearly_balanced(levels) -> Design:
+def nearly_balanced(levels: tuple[int, ...]) -> Design:
     """
     Return a small array for unlike numbers of levels, by dummy levels.
 
@@ -173,7 +174,7 @@ def nearly_balanced(levels) -> Design:
     return Design(f'L{q * q}({q}^{q + 1})', rows, levels, imbalance(rows, levels))
 
 
-def design_for(levels) -> Design:
+def design_for(levels: tuple[int, ...]) -> Design:
     """
     Return the array for numbers of levels of each parameter.
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.patent.planar import coefficients, PlanarLeg, squared_distances
 
@@ -44,7 +45,7 @@ class Scores:
     course_mean: NDArray[np.float64]
     course_rms: NDArray[np.float64]
 
-    def row(self, k: int) -> dict:
+    def row(self, k: int) -> dict[str, float | None]:
         """Return one set's criteria for people and JSON: m, deg; None: no course."""
         course = {f'course_{name}_deg': np.rad2deg(float(getattr(self, f'course_{name}')[k]))
                   for name in ('mean', 'rms')}
@@ -53,7 +54,7 @@ class Scores:
             name: None if np.isnan(angle) else float(angle) for name, angle in course.items()}
 
 
-def score(leg: PlanarLeg, sets, robust: bool = False, course: bool = True) -> Scores:
+def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = True) -> Scores:
     """
     Return the criteria of parameter sets.
 
@@ -84,7 +85,7 @@ def score(leg: PlanarLeg, sets, robust: bool = False, course: bool = True) -> Sc
     return Scores(**found)
 
 
-def loss(d2, sigma, robust: bool):
+def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     """
     Return what is lowered, of (m, k) squared distances, m^2: (m,).
 
@@ -92,13 +93,16 @@ def loss(d2, sigma, robust: bool):
     as the square up to HUBER and in proportion beyond.
     """
     if not robust:
-        return d2.mean(axis=1)
+        mean: Floats = d2.mean(axis=1)
+        return mean
     z2 = d2 / np.maximum(sigma, LEAST_SIGMA)**2
     far = z2 > HUBER**2
-    return np.where(far, 2 * HUBER * np.sqrt(np.where(far, z2, 0.0)) - HUBER**2, z2).mean(axis=1)
+    grown: Floats = np.where(far, 2 * HUBER * np.sqrt(np.where(far, z2, 0.0)) - HUBER**2, z2)
+    mean = grown.mean(axis=1)
+    return mean
 
 
-def weights(d2, sigma, robust: bool):
+def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     """Return by how much each fix pulls at the parameters, of (k,) squared distances: (k,)."""
     if not robust:
         return np.ones(len(d2))
@@ -106,7 +110,7 @@ def weights(d2, sigma, robust: bool):
     return np.minimum(1.0, HUBER * sigma / np.maximum(np.sqrt(d2), 1e-12)) / sigma**2
 
 
-def course_differences(leg: PlanarLeg, sets):
+def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
     """Return direction of the dead-reckoned less that of the fixed way, by piece, rad: (m, c)."""
     a, b = leg.pieces.T
     mix = coefficients(sets)[:, :3]

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.patent.criteria import loss, weights
 from odocal_ros.patent.planar import coefficients, PlanarLeg
 from odocal_ros.patent.space import sets_of, Space
@@ -62,7 +63,7 @@ class LeastSquares:
         return self.covariance / np.outer(self.sigma, self.sigma)
 
 
-def least_squares(leg: PlanarLeg, x, space: Space, robust: bool = False) -> LeastSquares:
+def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False) -> LeastSquares:
     """
     Return the parameters that lower the (robust) mean square, by Gauss-Newton from x.
 
@@ -103,7 +104,7 @@ def least_squares(leg: PlanarLeg, x, space: Space, robust: bool = False) -> Leas
                         _sigma_difference(J, covariance))
 
 
-def _linear(leg, x):
+def _linear(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return residuals turned back by the heading, (2k,) m, and their Jacobian by x: (2k, 3)."""
     heading = x[2]
     by_x = np.zeros((4, 5))
@@ -114,23 +115,24 @@ def _linear(leg, x):
     return rows[0], rows[1:].T
 
 
-def _d2(r):
+def _d2(r: Floats) -> Floats:
     east, north = r.reshape(2, -1)
     return east**2 + north**2
 
 
-def _value(leg, r, robust):
+def _value(leg: PlanarLeg, r: Floats, robust: bool) -> float:
     return float(loss(_d2(r)[None], leg.sigma, robust)[0])
 
 
-def _solve(A, b):
+def _solve(A: Floats, b: Floats) -> Floats:
     """Return the least-squares solution, columns scaled to one size first."""
     size = np.linalg.norm(A, axis=0)
     size = np.where(size > 0, size, 1.0)
     return np.linalg.lstsq(A / size, b, rcond=1e-14)[0] / size
 
 
-def _spread(leg, r, J, space, robust):
+def _spread(leg: PlanarLeg, r: Floats, J: Floats, space: Space,
+            robust: bool) -> tuple[Floats, float]:
     """Return covariance of x and condition number."""
     w = np.tile(weights(_d2(r), leg.sigma, robust), 2)
     s = np.linalg.svd(J @ space.T if space.held else J, compute_uv=False)
@@ -144,14 +146,14 @@ def _spread(leg, r, J, space, robust):
     return to_x @ to_x.T * ((rows**2).sum() / freedom * repeats(rows)), condition
 
 
-def _sigma_difference(J, covariance):
+def _sigma_difference(J: Floats, covariance: Floats) -> float:
     """Return the sigma of right less left: by scatter, and by a track bent as all are."""
-    reach, parts = np.linalg.norm(J[:, 2]), np.linalg.norm(J[:, 1] - J[:, 0]) / 2
+    reach, parts = np.linalg.norm(J[:, 2]), float(np.linalg.norm(J[:, 1] - J[:, 0])) / 2
     bent = BENT * reach / max(parts, 1e-12)
     return float(np.sqrt(DIFFERENCE @ covariance @ DIFFERENCE + bent**2))
 
 
-def repeats(rows):
+def repeats(rows: Floats) -> float:
     """
     Return how many residuals in a row say the same: 1 for white ones, many for a drift.
 

@@ -18,10 +18,12 @@ is to be turned counter-clockwise by the heading error.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.patent.arrays import full_factorial, least_rows, nearly_balanced
 from odocal_ros.patent.criteria import score
 from odocal_ros.patent.direct import least_squares, LeastSquares
@@ -50,7 +52,7 @@ class Row:
     left: float
     right: float
     heading_deg: float
-    criteria: dict
+    criteria: dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ class Embodiment:
         """Return the formal sigma of right less left radius by positions, m."""
         return self.direct.sigma_difference * self.radius
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return what ``odocal patent --json`` prints."""
         return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
                 'imbalance': self.imbalance, 'orthogonal_rows': self.least,
@@ -92,15 +94,16 @@ class Embodiment:
                 'least_squares': {'condition_number': float(self.direct.condition),
                                   'correlation': float(self.direct.correlation[0, 1]),
                                   'sigma_right_less_left_m': float(self.sigma_radius)},
-                'told_apart': bool(self.told_apart)}
+                'told_apart': self.told_apart}
 
     @property
     def told_apart(self) -> bool:
         """Tell whether the fixes say more of left against right than the range does."""
-        return self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2
+        return bool(self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2)
 
 
-def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment:
+def embodiment(leg: PlanarLeg, radius: float = RADIUS,
+               truth: tuple[float, float, float] | None = None) -> Embodiment:
     """
     Run the embodiment on a leg.
 
@@ -125,11 +128,12 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment
                space, widen=False) for space in spaces)
     direct, direct_together = (least_squares(leg, x_small, space) for space in spaces)
 
-    def row(name, x):
+    def row(name: str, x: Floats) -> Row:
         criteria = score(leg, sets_of(leg, x)).row(0)
-        return Row(name, *(float(r) for r in x[:2] * radius), float(np.rad2deg(x[2])), criteria)
+        left, right = (float(r) for r in x[:2] * radius)
+        return Row(name, left, right, float(np.rad2deg(x[2])), criteria)
 
-    def given(name, errors):
+    def given(name: str, errors: tuple[float, float, float]) -> Row:
         return row(name, np.array([errors[0] / radius, errors[1] / radius,
                                    np.deg2rad(errors[2])]))
 
@@ -144,11 +148,12 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS, truth=None) -> Embodiment
                       direct, direct_together, radius, means.reshape(LEVELS).min(axis=2))
 
 
-def _levels(rows, half):
-    return (2 * rows / (np.array(LEVELS) - 1) - 1) * half
+def _levels(rows: Ints, half: Floats) -> Floats:
+    x: Floats = (2 * rows / (np.array(LEVELS) - 1) - 1) * half
+    return x
 
 
-def _best(leg, x):
+def _best(leg: PlanarLeg, x: Floats) -> tuple[Floats, Floats]:
     """Return the row with the least mean distance, ties by the largest; and all mean distances."""
     scores = score(leg, sets_of(leg, x), course=False)
     return x[np.lexsort((scores.max, scores.mean))[0]], scores.mean

@@ -16,12 +16,14 @@ wheels' tracks are summed once, at one metre per unit, and a set costs two produ
 Only horizontal components are used, of n itself: no sphere, no map.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 
 CHUNK = 500_000          # distances held at once: 4 MB, which stays in the cache
@@ -60,7 +62,7 @@ class PlanarLeg:
         return np.array([self.scale_left, self.scale_right, 0.0])
 
     @cached_property
-    def basis(self):
+    def basis(self) -> tuple[Floats, Floats]:
         """
         Return the rows that a set's coefficients mix into residuals turned back by its heading.
 
@@ -74,8 +76,9 @@ class PlanarLeg:
                 np.vstack([rows[..., 1], [north, -east]]))
 
 
-def planar_leg(track_left: Track, track_right: Track, t_fix, fixes_n, covariance_n, start,
-               scales, pitch=0.0, lever_b=(0.0, 0.0, 0.0)) -> PlanarLeg:
+def planar_leg(track_left: Track, track_right: Track, t_fix: Floats, fixes_n: Floats,
+               covariance_n: Floats, start: tuple[float, Floats], scales: tuple[float, float],
+               pitch: float = 0.0, lever_b: ArrayLike = (0.0, 0.0, 0.0)) -> PlanarLeg:
     """
     Project a leg of two wheels on the plane.
 
@@ -111,7 +114,7 @@ def planar_leg(track_left: Track, track_right: Track, t_fix, fixes_n, covariance
                      pieces=course_pieces(fixes, sigma))
 
 
-def course_pieces(fixes_n, sigma):
+def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
@@ -125,14 +128,14 @@ def course_pieces(fixes_n, sigma):
     return np.stack([ends[:-1], ends[1:]], -1).astype(np.int64)
 
 
-def coefficients(sets):
+def coefficients(sets: Floats) -> Floats:
     """Return what mixes the rows of ``PlanarLeg.basis``, of (m, 3) sets: (m, 5)."""
     left, right, heading = np.asarray(sets, dtype=float).T
     return np.stack([left / 2, right / 2, np.ones_like(left), -np.cos(heading),
                      -np.sin(heading)], -1)
 
 
-def positions(leg: PlanarLeg, sets):
+def positions(leg: PlanarLeg, sets: Floats) -> Floats:
     """Return the antenna's track at the fixes, m, of (m, 3) parameter sets: (m, k, 2)."""
     mix = coefficients(sets)
     body = mix[:, :3] @ leg.basis[0][:3] + 1j * (mix[:, :3] @ leg.basis[1][:3])
@@ -140,7 +143,7 @@ def positions(leg: PlanarLeg, sets):
     return np.stack([p.real, p.imag], -1) + leg.start_n
 
 
-def squared_distances(leg: PlanarLeg, sets):
+def squared_distances(leg: PlanarLeg, sets: Floats) -> Iterator[tuple[slice, Floats]]:
     """Yield (rows, squared distances of track and fix, m^2: (len(rows), k)) by bounded chunks."""
     east, north = leg.basis
     mix = coefficients(sets)

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.patent.arrays import Design, next_prime_power
+from odocal_ros.settings.config import WheelsConfig
 
 SCALE_RANGE, HEADING_RANGE = 0.05, np.deg2rad(10.0)    # where no error is stated
 
@@ -32,7 +34,7 @@ class Ranges:
     why: tuple[str, str, str]
     levels: tuple[int, int, int]
 
-    def values(self, design: Design):
+    def values(self, design: Design) -> Floats:
         """Return x of the rows of an array: equal steps from -half to half."""
         top = np.maximum(np.array(design.levels) - 1, 1)
         return np.where(np.array(design.levels) > 1, (2 * design.rows / top - 1) * self.half, 0.0)
@@ -40,10 +42,11 @@ class Ranges:
     @property
     def step(self) -> NDArray[np.float64]:
         """Return the step between levels, the whole half range of a single one."""
-        return 2 * self.half / np.maximum(np.array(self.levels) - 1, 2)
+        step: Floats = 2 * self.half / np.maximum(np.array(self.levels) - 1, 2)
+        return step
 
 
-def ranges_of(wheels, heading_sigma: float | None = None) -> Ranges:
+def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Ranges:
     """
     Return the ranges that the settings ask for.
 

@@ -15,11 +15,14 @@ counter-clockwise: the error of the configured heading less the yaw mounting ang
 only the two together.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.patent.arrays import Design, design_for
 from odocal_ros.patent.criteria import score, Scores
@@ -68,7 +71,7 @@ class SearchResult:
     after: Scores
     reasons: tuple[Reason, ...]
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Return what belongs into calibration.json, angles in deg."""
         r, d = self.refined, self.direct
         shown = np.arange(len(self.sets))
@@ -99,19 +102,19 @@ class SearchResult:
             'before': self.before.row(0), 'after': self.after.row(0)}
 
 
-def _deg(k, value):
+def _deg(k: int, value: float) -> float:
     return np.rad2deg(value) if NAMES[k] == 'heading' else value
 
 
-def _unit(k):
+def _unit(k: int) -> str:
     return 'deg' if NAMES[k] == 'heading' else '1'
 
 
-def _finite(value):
+def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _set(parameters):
+def _set(parameters: Floats) -> dict[str, float]:
     left, right, heading = (float(p) for p in parameters)
     return {'scale_left': left, 'scale_right': right, 'heading_deg': float(np.rad2deg(heading))}
 
@@ -159,9 +162,9 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
         score(leg, refined_set, robust), _reasons(ranges, refined, direct, free, held))
 
 
-def _refined(leg, x, ranges, space, robust) -> Refined:
+def _refined(leg: PlanarLeg, x: Floats, ranges: Ranges, space: Space, robust: bool) -> Refined:
     """Lower the mean square; robust: then Huber's mean, which far off is a cone, from there."""
-    def by(robust):
+    def by(robust: bool) -> Callable[..., Any]:
         return lambda x: score(leg, sets_of(leg, x), robust, course=False).loss
 
     refined = refine(by(False), x, ranges.step, ranges.half, space)
@@ -172,7 +175,7 @@ def _refined(leg, x, ranges, space, robust) -> Refined:
                    iterations=refined.iterations + again.iterations)
 
 
-def _wrapped(parameters):
+def _wrapped(parameters: Floats) -> Floats:
     return np.array([*parameters[:2], wrap(parameters[2])])
 
 
@@ -185,7 +188,8 @@ def _told_apart(free: LeastSquares, ranges: Ranges) -> bool:
     return free.sigma_difference <= float(np.hypot(*ranges.half[:2])) / 2
 
 
-def _reasons(ranges, refined, direct, free, held) -> tuple[Reason, ...]:
+def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: LeastSquares,
+             held: bool) -> tuple[Reason, ...]:
     found = []
     if held:
         sigma = 100 * free.sigma_difference
@@ -212,5 +216,5 @@ def _reasons(ranges, refined, direct, free, held) -> tuple[Reason, ...]:
     return tuple(found)
 
 
-def _amount(k, value):
+def _amount(k: int, value: float) -> str:
     return f'{np.rad2deg(value):.3g} deg' if NAMES[k] == 'heading' else f'{100 * value:.3g} %'

@@ -21,6 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.patent.planar import PlanarLeg
+
 NAMES = ('left', 'right', 'heading')
 # columns: mean, difference (right less left), heading; held: mean, heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
@@ -44,23 +47,23 @@ class Space:
         """Return the matrix of v = S q: what the range bounds is x, or the mean where held."""
         return np.eye(2) if self.held else FREE
 
-    def q_of(self, x):
+    def q_of(self, x: Floats) -> Floats:
         """Return the coordinates of x; its difference is dropped where held."""
         left, right, heading = x
         mean = (left + right) / 2
         return np.array([mean, heading] if self.held else [mean, right - left, heading])
 
-    def bounds(self, half):
+    def bounds(self, half: Floats) -> Floats:
         """Return the half range of v for that of x: (n,)."""
         return np.array([min(half[:2]), half[2]]) if self.held else np.array(half)
 
-    def widened(self, half, on_edge):
+    def widened(self, half: Floats, on_edge: Bools) -> Floats:
         """Return the half range of x doubled where v lies on its edge, to WIDEST at most."""
         edge = np.array([on_edge[0], *on_edge]) if self.held else np.asarray(on_edge)
         return np.where(edge, np.minimum(2 * np.asarray(half), WIDEST), half)
 
 
-def sets_of(leg, x):
+def sets_of(leg: PlanarLeg, x: Floats) -> Floats:
     """Return parameter sets (scales in m per unit, heading in rad) of (m, 3) x."""
     x = np.atleast_2d(np.asarray(x, dtype=float))
     return np.stack([leg.scale_left * (1 + x[:, 0]), leg.scale_right * (1 + x[:, 1]), x[:, 2]], -1)

@@ -17,10 +17,12 @@ Where the minimum lies on the edge of the range, the range is widened.
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.patent.space import Space
 
 SHRINK, GROW = 0.25, 2.0
@@ -68,7 +70,7 @@ class Refined:
     last: Surface
 
 
-def fit_surface(y, values) -> Surface:
+def fit_surface(y: Floats, values: Floats) -> Surface:
     """Fit a second-order polynomial to (m,) values at (m, n) points by least squares."""
     n = y.shape[1]
     i, j = np.triu_indices(n)
@@ -84,7 +86,7 @@ def fit_surface(y, values) -> Surface:
                    float(np.abs(residual).max() / reach) if reach > 0 else 0.0)
 
 
-def minimum_in_box(gradient, hessian, low, high):
+def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats) -> Floats:
     """
     Return where a quadratic is least in a box: exact, whatever the signs of its curvature.
 
@@ -92,7 +94,7 @@ def minimum_in_box(gradient, hessian, low, high):
     and of three parameters there are but 27.
     """
     n = len(gradient)
-    best, least = None, np.inf
+    best, least = np.zeros(n), np.inf     # a corner at least is found
     for face in product((None, low, high), repeat=n):
         free = np.array([side is None for side in face])
         y = np.array([0.0 if side is None else side[k] for k, side in enumerate(face)])
@@ -107,7 +109,8 @@ def minimum_in_box(gradient, hessian, low, high):
     return best
 
 
-def refine(value: Callable, x, width, half, space: Space, widen: bool = True) -> Refined:
+def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, space: Space,
+           widen: bool = True) -> Refined:
     """
     Lower a criterion by surfaces.
 
@@ -150,7 +153,8 @@ def refine(value: Callable, x, width, half, space: Space, widen: bool = True) ->
 class _Walk:
     """The state of one search: where the box is, how wide, and the range."""
 
-    def __init__(self, value, space, half, width, x):
+    def __init__(self, value: Callable[..., Any], space: Space, half: Floats, width: Floats,
+                 x: Floats) -> None:
         self.value, self.space = value, space
         self.asked = self.half = half
         self.first_width = np.abs(space.q_of(width) if space.held else
@@ -166,7 +170,7 @@ class _Walk:
         self.least = float(self.values[len(self.grid) // 2])
         return fit_surface(self.grid, self.values)
 
-    def step(self, surface) -> bool:
+    def step(self, surface: Surface) -> bool:
         """Move to the surface's minimum in the range, shrink the box; tell whether it settled."""
         S, bound = self.space.S, self.space.bounds(self.half)
         v = S @ self.q
@@ -189,7 +193,7 @@ class _Walk:
         self.w = np.where(beyond, grown, np.where(shrinks, SHRINK * self.w, self.w))
         return done
 
-    def _to_best_of_grid(self, bound):
+    def _to_best_of_grid(self, bound: Floats) -> Bools:
         """Move to the best fitted point within the range; tell where it is an end of the box."""
         points = self.q + self.grid * self.w
         allowed = (np.abs(points @ self.space.S.T) <= bound).all(axis=1)
@@ -197,7 +201,8 @@ class _Walk:
         if not allowed[k] or self.values[k] >= self.least:
             return np.zeros(len(self.q), bool)
         self.q, self.least = points[k], float(self.values[k])
-        return self.grid[k] != 0
+        at_end: Bools = self.grid[k] != 0
+        return at_end
 
     def widen(self) -> bool:
         """Double the range where the minimum lies on its edge; False: it is as wide as it goes."""

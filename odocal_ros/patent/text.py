@@ -9,6 +9,8 @@
 
 """The embodiment's table as text for a terminal."""
 
+from odocal_ros.patent.embodiment import Embodiment
+
 HEAD = """\
 CN104359492A, embodiment: errors of both wheels' radii and of the heading found by combinations,
 as printed and as computed on a simulated town drive of ten minutes. Nominal radius {radius:g} m
@@ -18,7 +20,7 @@ COLUMNS = (f'  {"":22} {"left m":>9} {"right m":>9} {"head deg":>9} {"max m":>9}
            f'{"rms m":>9}')
 
 
-def text_of(table, fix_noise: str, truth) -> str:
+def text_of(table: Embodiment, fix_noise: str, truth: tuple[float, float, float]) -> str:
     """Return the page that odocal patent prints; truth: (left, right, heading), m and deg."""
     r, d = table.refined, table.direct
     lines = [HEAD.format(radius=table.radius, left=truth[0], right=truth[1], heading=truth[2],

@@ -9,9 +9,11 @@
 
 """The alignment that a planned drive will have: from the functions that align a recorded one."""
 
+
 import numpy as np
 
 from odocal_ros.nav.alignment import (
+    Alignment,
     COMPASS_LIMIT,
     complete,
     COURSE_DISTANCE,
@@ -25,13 +27,14 @@ from odocal_ros.nav.earth import earth_rate_n, gravity
 from odocal_ros.nav.rotations import quat_conjugate, quat_from_matrix, quat_multiply, transpose
 from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.config import AlignmentConfig, Config
+from odocal_ros.settings.grades import Grade, grade_of
 
 OWN_SOURCES = ('fixed', 'heading_topic', 'imu_orientation')
 
 
-def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float, spans):
+def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
+                   spans: list[tuple[float, float]]) -> tuple[Alignment, tuple[Reason, ...]]:
     """
     Return the alignment a drive will have, and what is to be said of it.
 
@@ -62,7 +65,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float, spans)
     return alignment, found + why
 
 
-def _level_at_rest(drive, span, grade) -> Level:
+def _level_at_rest(drive: PlannedDrive, span: tuple[float, float], grade: Grade) -> Level:
     """Return the level of a standstill from what its sensors will show on the mean."""
     span = (span[0], min(span[1], drive.duration))
     k = int(np.searchsorted(drive.t, span[0]))
@@ -73,7 +76,7 @@ def _level_at_rest(drive, span, grade) -> Level:
                          grade, grade.gyro_noise)
 
 
-def _level_in_motion(drive, grade) -> Level:
+def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
     """Return the level that the first half minute of driving gives."""
     pick = (drive.t >= 0.0) & (drive.t <= MOTION_LEVEL)
     if pick.sum() < 2:
@@ -87,7 +90,8 @@ def _level_in_motion(drive, grade) -> Level:
                            drive.speed[pick][[0, -1]], drive.latitude, grade)
 
 
-def _heading(drive, config, fix_sigma, level, grade):
+def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, level: Level,
+             grade: Grade) -> tuple[float, float, str, tuple[Reason, ...]]:
     """Return yaw, sigma and source of the heading, and what is to be said of it."""
     yaw = float(np.interp(level.t, drive.t, drive.yaw))
     source = config.heading_source

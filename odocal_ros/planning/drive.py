@@ -10,10 +10,12 @@
 """A drive not yet driven, or only looked at: speed, direction and slope by time."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.rotations import matrix_from_rpy
 
@@ -67,7 +69,8 @@ class PlannedDrive:
         """Return the signed way rolled by each time, 0 at the start mark, (m,) m."""
         s = np.concatenate([[0.0], np.cumsum(
             (self.speed[:-1] + self.speed[1:]) / 2 * np.diff(self.t))])
-        return s - np.interp(0.0, self.t, s)
+        way: Floats = s - np.interp(0.0, self.t, s)
+        return way
 
     @property
     def distance(self) -> float:
@@ -108,13 +111,14 @@ class PlannedDrive:
                                for n in ('t', 'speed', 'yaw', 'slope')})
         return cut._held(len(cut.t) - 1, rest, at_rest=True)
 
-    def _held(self, k, seconds, at_rest=False):
+    def _held(self, k: int, seconds: float, at_rest: bool = False) -> 'PlannedDrive':
         """Return the drive with the state of row k held for so long; before 0, all moves back."""
         hold = np.arange(DRIVE_STEP, seconds + DRIVE_STEP, max(DRIVE_STEP, seconds / 1000))
         hold = hold * (seconds / hold[-1])
-        rows = {name: np.insert(getattr(self, name), k + 1, np.full(len(hold), value))
-                for name, value in (('speed', 0.0 if at_rest else self.speed[k]),
-                                    ('yaw', self.yaw[k]), ('slope', self.slope[k]))}
+        rows: dict[str, Any] = {
+            name: np.insert(getattr(self, name), k + 1, np.full(len(hold), value))
+            for name, value in (('speed', 0.0 if at_rest else self.speed[k]),
+                                ('yaw', self.yaw[k]), ('slope', self.slope[k]))}
         t = np.concatenate([self.t[:k + 1], self.t[k] + hold, self.t[k + 1:] + seconds])
         if at_rest and k == 0:
             t, rows['speed'] = t - seconds, np.where(np.arange(len(t)) <= len(hold), 0.0,
@@ -122,7 +126,8 @@ class PlannedDrive:
         return replace(self, t=t, **rows)
 
 
-def from_rates(t, speed, yaw_rate, heading: float = np.pi / 4, **more) -> PlannedDrive:
+def from_rates(t: Floats, speed: Floats, yaw_rate: Floats, heading: float = np.pi / 4,
+               **more: Any) -> PlannedDrive:
     """
     Return the drive of a speed and a turn rate by time; marked where it first moves and ends.
 
@@ -142,7 +147,7 @@ def from_rates(t, speed, yaw_rate, heading: float = np.pi / 4, **more) -> Planne
                   **more)
 
 
-def marked(t, speed, yaw, slope, **more) -> PlannedDrive:
+def marked(t: Floats, speed: Floats, yaw: Floats, slope: Floats, **more: Any) -> PlannedDrive:
     """Return the drive with its start mark where it first moves, its stop mark at its end."""
     moving = np.flatnonzero(np.abs(speed) > REST_SPEED)
     first = max(int(moving[0]) - 1, 0) if len(moving) else 0

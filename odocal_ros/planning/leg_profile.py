@@ -11,12 +11,13 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
-from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import screen
+from odocal_ros.screening.placed import place, Placed
+from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
 
 PROFILE_WINDOW = 0.5    # s each side that a speed is taken over
@@ -55,7 +56,7 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
                         np.zeros_like(t), origin.latitude, origin.longitude, origin.height)
 
 
-def _placed(inputs, config):
+def _placed(inputs: Inputs, config: Config) -> Placed:
     """Return where the fixes lie and how far a count reaches; raise BadData without."""
     placed = place(inputs, config)
     if not placed.rough:
@@ -78,17 +79,18 @@ def count_size(leg: Leg, config: Config) -> float:
     return inputs.travel.quantum * _placed(inputs, config).rough
 
 
-def _yaw(inputs, spans, t):
+def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
     """Return the angle turned about the vertical by each time, rad; rate at rest taken out."""
     t_imu, w = inputs.t_imu, inputs.w_b[:, 2]
     at_rest = np.any([(t_imu >= a) & (t_imu <= b) for a, b in spans], axis=0) if len(spans) \
         else np.zeros(len(t_imu), bool)
     w = w - (w[at_rest].mean() if at_rest.any() else 0.0)
     turned = np.concatenate([[0.0], np.cumsum((w[:-1] + w[1:]) / 2 * np.diff(t_imu))])
-    return np.interp(t, t_imu, turned)
+    yaw: Floats = np.interp(t, t_imu, turned)
+    return yaw
 
 
-def _first_course(t, speed, yaw, t_fix, fixes_n):
+def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n: Floats) -> float:
     """Return what turns the track of speed and yaw onto the fixes, rad."""
     step = speed[:-1] * np.diff(t)
     track = np.concatenate([[0.0], np.cumsum(step * np.exp(1j * yaw[:-1]))])

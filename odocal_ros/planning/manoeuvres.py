@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 
 BRAKING = 1.5    # m/s^2, as in a town
@@ -70,7 +71,8 @@ def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     return inserted(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
 
 
-def inserted(drive: PlannedDrive, k: int, t, speed, turned) -> PlannedDrive:
+def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
+             turned: Floats) -> PlannedDrive:
     """
     Return the drive with a piece after row k; what follows comes later and turned.
 
@@ -92,7 +94,7 @@ def inserted(drive: PlannedDrive, k: int, t, speed, turned) -> PlannedDrive:
                             drive.yaw[k + 1:] + turned[-1]]))
 
 
-def _amid(drive):
+def _amid(drive: PlannedDrive) -> int:
     """Return the row nearest to the middle of the way among those near the greatest speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
     fast = np.flatnonzero(speed >= NEAR_TOP * speed.max())
@@ -100,7 +102,7 @@ def _amid(drive):
     return int(fast[np.argmin(np.abs(way[fast] - way[-1] / 2))])
 
 
-def _grid(end, *knots):
+def _grid(end: float, *knots: float) -> Floats:
     """Return times above 0 up to the end, at most DRIVE_STEP apart, with the knots among them."""
     t = np.linspace(0.0, end, max(2, int(np.ceil(end / DRIVE_STEP)) + 1))
     t = np.union1d(t, [x for x in knots if 0 < x < end])

@@ -65,7 +65,7 @@ class Plan:
             return self.methods[name].reasons
         return tuple(r for r in self.two_point.reasons if r not in self.two_point.of_drive)
 
-    def _verdict_of(self, name):
+    def _verdict_of(self, name: str) -> Verdict:
         return verdict_of(self.reasons_of(name))
 
     @property

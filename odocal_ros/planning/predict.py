@@ -15,6 +15,7 @@ goes through ``two_point.fit``: the predicted sigma and that of a result are one
 by one code path.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MARK_WINDOW, MarkFix, mean_fix, standing_at
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import Chord, fit, refusal, unsolved
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig, BadUsage
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Origin, Track
@@ -76,7 +78,7 @@ class Sigmas:
                 raise BadConfig(f'{what} {value:g}: want 0 or more')
 
     @property
-    def covariance_n(self):
+    def covariance_n(self) -> Floats:
         """Return the covariance of one fix, (3, 3) m^2."""
         up = 2 * self.fix if self.fix_up is None else self.fix_up
         return np.diag([self.fix**2, self.fix**2, up**2])
@@ -162,7 +164,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
     None where no distance up to ``farthest`` m does: a two-point yaw is never better than its
     heading.
     """
-    def enough(metres):
+    def enough(metres: float) -> bool:
         longer = drive.lengthened(metres) if metres else drive
         sigma = predict(longer, sigmas).sigma(parameter)
         return sigma is not None and sigma <= asked
@@ -171,7 +173,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
         return 0.0
     # a drifting gyro may spoil what a longer chord gains: look at several lengths, then halve
     tried = [farthest / 2**k for k in range(14, -1, -1)]
-    high = next((m for m in tried if enough(m)), None)
+    high: float | None = next((m for m in tried if enough(m)), None)
     if high is None:
         return None
     low = 0.0 if high == tried[0] else high / 2
@@ -181,24 +183,25 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
     return high
 
 
-def _rest(t, spans):
+def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
     """Return how long the standstill at a mark lasts, s."""
     begin, end = standing_at(t, spans) or (0.0, 0.0)
     return end - begin
 
 
-def _track(drive, quantum):
+def _track(drive: PlannedDrive, quantum: float) -> Track:
     return dead_reckon(drive.t, quat_from_matrix(drive.C_nb),
                        Travel(drive.t, drive.travel, quantum))
 
 
-def _from(track, t):
+def _from(track: Track, t: float) -> Track:
     """Return the track from an epoch on."""
     keep = track.t >= t - 1e-9
     return Track(track.t[keep], track.q_nb[keep], track.s[keep], track.P[keep])
 
 
-def _mark(t, track, drive, sigmas, spans, surveyed) -> MarkFix:
+def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
+          spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
     """Return the reference position there will be at a mark, by the fixes that fall to it."""
     span = standing_at(t, spans)
     position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ FORWARD
@@ -216,7 +219,7 @@ def _mark(t, track, drive, sigmas, spans, surveyed) -> MarkFix:
     return MarkFix(t, position_n, covariance, span is not None, used, 0)
 
 
-def _velocity_change(track, marks):
+def _velocity_change(track: Track, marks: tuple[MarkFix, MarkFix]) -> Floats:
     """Return C_nb s' at the end mark less that at the start, zero where it stands: (3, 3)."""
     change = np.zeros((3, 3))
     for mark, sign in zip(marks, (-1.0, 1.0), strict=True):

@@ -12,13 +12,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import GIVEN, Heading, HEADING_RATE
 from odocal_ros.calib.smoother.state import M, State
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import earth_rate_n
@@ -26,8 +26,8 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy, transpose
 from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.planning.predict import Sigmas
+from odocal_ros.settings.config import Config
 
-Floats = NDArray[np.float64]
 SAMPLE_RATE = 20.0     # Hz: the noise of a second does not hang on how often it is sampled
 SAMPLES_ENOUGH = 50    # samples between keyframes that lie far apart
 SENT = ('heading_topic', 'imu_orientation')
@@ -102,7 +102,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
                  max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
 
 
-def _motion(drive, t, origin, config) -> _Motion:
+def _motion(drive: PlannedDrive, t: Floats, origin: Origin, config: Config) -> _Motion:
     """Return the motion of the Imu on the plane that n lies in."""
     speed, yaw, slope = (np.interp(t, drive.t, x) for x in (drive.speed, drive.yaw, drive.slope))
     C_nb = matrix_from_rpy(np.stack([np.zeros_like(yaw), -slope, yaw], -1))
@@ -119,19 +119,19 @@ def _motion(drive, t, origin, config) -> _Motion:
                    _summed(speed[:, None], t)[:, 0])
 
 
-def _summed(x, t):
+def _summed(x: Floats, t: Floats) -> Floats:
     """Return the integral of x (m, d) from the first time on."""
     step = (x[1:] + x[:-1]) / 2 * np.diff(t)[:, None]
     return np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(step, axis=0)])
 
 
-def _times(begin, end, rate, spacing):
+def _times(begin: float, end: float, rate: float, spacing: float) -> Floats:
     """Return times at a rate, at most one for each keyframe, in the middle of their intervals."""
     count = max(1, round((end - begin) * min(rate, 1 / spacing)))
     return begin + (np.arange(count) + 0.5) * (end - begin) / count
 
 
-def _heading(drive, config, t_begin, spacing) -> Heading:
+def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float) -> Heading:
     """Return the heading that the settings promise; a course is none, and none a gyrocompass."""
     asked, sigma = config.alignment.heading_source, config.alignment.heading_sigma
     if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
@@ -144,7 +144,7 @@ def _heading(drive, config, t_begin, spacing) -> Heading:
     return Heading(t, np.interp(t, drive.t, drive.yaw), np.full(len(t), noise), sigma, asked)
 
 
-def _state(motion: _Motion, key) -> State:
+def _state(motion: _Motion, key: Ints) -> State:
     """Return the true state at the keyframes."""
     N = len(key)
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],

@@ -22,6 +22,7 @@ from odocal_ros.calib.smoother.outcome import outcome, refused
 from odocal_ros.calib.smoother.problem import Problem, SPACING
 from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
 from odocal_ros.calib.smoother.smoother import too_little
+from odocal_ros.calib.smoother.state import Priors
 from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.samples import Ideal, ideal
@@ -102,7 +103,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
-def _fit(problem, made: Ideal, levels, priors) -> Fit:
+def _fit(problem: Problem, made: Ideal, levels: Levels, priors: Priors) -> Fit:
     """Return the fit that stands where it is: no step is taken."""
     state = made.state
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)

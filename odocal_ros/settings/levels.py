@@ -18,3 +18,4 @@ FAULT_SIGMAS = 5.0      # to call a sensor or a setting wrong: once in 1.7 milli
 OUTLIER_SIGMAS = 5.0    # robust sigmas from which one value of many is not of them: the same
 FASTEST = 100.0         # m/s that no land vehicle drives: a counter reset, or another unit
 SWAY = 0.05             # m/s to the side and up, of a body on its springs, that no wheel feels
+DAY_NS = 86_400 * 10**9

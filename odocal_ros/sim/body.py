@@ -16,25 +16,28 @@ tyres that push to the side drift there: the axle's centre moves at an angle to 
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.motion import inertial_v, Motion
+from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Profile
 
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
-STEP = 0.02                   # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
 
 
-def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float):
+def tilts(speed: Profile, yaw_rate: Profile, squat: float,
+          body_roll: float) -> tuple[Profile, Profile]:
     """Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles."""
-    t = np.round(np.arange(0.0, speed.end + STEP, STEP), 9)
+    step = 0.02    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
+    t = np.round(np.arange(0.0, speed.end + step, step), 9)
     forward, side = speed.derivative().mean(t), speed(t) * yaw_rate(t)
     # nose up is a negative pitch; in a turn to the left the left side goes up
-    return tuple(hermite(t, *sprung(gain * push, STEP))
-                 for gain, push in ((body_roll, side), (-squat, forward)))
+    roll, pitch = (hermite(t, *sprung(gain * push, step))
+                   for gain, push in ((body_roll, side), (-squat, forward)))
+    return roll, pitch
 
 
-def sprung(push, step: float):
+def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:
     """
     Return value and rate of ``y'' + 2 z w y' + w^2 y = w^2 u`` for u in straight lines.
 
@@ -58,19 +61,20 @@ def sprung(push, step: float):
     return y, dy
 
 
-def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t):
+def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t: Floats) -> Floats:
     """Return the velocity to the left at times t, m/s: against the push of the tyres."""
     v = speed(t)
     return -sideslip * v * yaw_rate(t) * np.abs(v)
 
 
-def rotation(motion: Motion, t):
+def rotation(motion: Motion, t: Floats) -> Floats:
     """Return what takes the body's axes to the vehicle's at (n,) times: (n, 3, 3)."""
     roll, pitch = (profile(t) for profile in motion.tilt)
     return matrix_from_rpy(np.stack([roll, pitch, np.zeros_like(roll)], -1))
 
 
-def felt(motion: Motion, state, lever_arm):
+def felt(motion: Motion, state: State,
+         lever_arm: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
     Return turn rate (rad/s) and specific force (m/s^2) in the body's axes: (n, 3) each.
 
@@ -95,7 +99,7 @@ def felt(motion: Motion, state, lever_arm):
     return np.einsum('nij,ni->nj', R, w_v) + w_r, np.einsum('nij,ni->nj', R, f_v)
 
 
-def _angles(motion, t):
+def _angles(motion: Motion, t: Floats) -> tuple[Floats, ...]:
     """Return roll, its rate and acceleration, the pitch's rate and acceleration."""
     roll, pitch = motion.tilt
     rates = [p.derivative() for p in motion.tilt]

@@ -13,8 +13,9 @@ Draw a vehicle as real ones are: what it is, then what its sensors do; docs/zoo.
 Each effect draws from a stream of its own name: alone or among all others, it is the same.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 import math
+from typing import Any
 
 import numpy as np
 
@@ -23,34 +24,15 @@ from odocal_ros.sim import draw_imu, draw_road
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
+from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-GRADES = ('consumer', 'industrial', 'tactical')
 EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
-MOUNTING = {'consumer': (3.0, 3.0, 3.0), 'industrial': (1.5, 1.5, 2.0),
-            'tactical': (0.5, 0.5, 0.5)}               # deg: roll, pitch, yaw, 1 sigma
-NOMINAL = {'consumer': 0.015, 'industrial': 0.025, 'tactical': 0.005}   # relative, 1 sigma
-ODOMETERS = {'consumer': (0.6, 0.3, 0.1), 'industrial': (0.1, 0.2, 0.7),
-             'tactical': (1.0, 0.0, 0.0)}              # share of fine counters, coarse, speeds
-RTK = {'consumer': 0.1, 'industrial': 0.4, 'tactical': 0.9}
-TURNED = 0.2         # share whose Imu is mounted with a quarter or half turn, which is known
 
 
-@dataclass(frozen=True)
-class Vehicle:
-    """What an effect goes by."""
-
-    grade: str       # consumer, industrial or tactical
-    kind: str        # of drive
-    rtk: bool
-    city: bool       # multipath, outages, worse covariances
-    robot: bool      # small, slow, without springs
-    options: dict    # SimOptions drawn so far
-    alone: bool      # the effect alone is asked for: let it be there
-
-
-def drawn(seed: int, kind: str, grade: str, effects=None, **given):
+def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None,
+          **given: Any) -> tuple[SimOptions, tuple[str, ...]]:
     """
     Return SimOptions of a drawn vehicle, and the names of the effects that it has.
 
@@ -88,7 +70,7 @@ def drawn(seed: int, kind: str, grade: str, effects=None, **given):
     options |= given
     if effects is None:
         names = [n for n in names if n not in ODOMETER_EFFECTS or n == _odometer_of(vehicle, seed)]
-    real: dict = {}
+    real: dict[str, Any] = {}
     there = []
     for name in names:
         changes, figures = EFFECTS[name](stream(seed, f'vehicle {name}'), vehicle)
@@ -99,37 +81,33 @@ def drawn(seed: int, kind: str, grade: str, effects=None, **given):
     return SimOptions(**options | given, real=Real(**real | own)), tuple(there)
 
 
-def _odometer_of(vehicle, seed):
+def _odometer_of(vehicle: Vehicle, seed: int) -> str:
     """Return the effect that a drawn vehicle's odometer has, '' for a fine counter."""
-    shares = ODOMETERS[vehicle.grade]
-    return ('', 'coarse_pulses', 'coarse_speed')[
-        int(stream(seed, 'vehicle odometer').choice(3, p=shares))]
+    kind = stream(seed, 'vehicle odometer').choice(3, p=vehicle.row('odometers'))
+    return ('', 'coarse_pulses', 'coarse_speed')[int(kind)]
 
 
-def _clean(seed, kind, grade, alone):
+def _clean(seed: int, kind: str, grade: str, alone: bool) -> tuple[Vehicle, dict[str, Any]]:
     """Return the vehicle and its options before any effect."""
-    rng = stream(seed, 'vehicle')
-    roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in MOUNTING[grade])
+    rng, which = stream(seed, 'vehicle'), GRADES.index(grade)
+    roll, pitch, yaw = (math.radians(s) * rng.standard_normal() for s in ROWS['mounting'][which])
     heading, slope = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.02)
-    quarter = int(rng.integers(1, 4)) if rng.uniform() < TURNED else 0
-    rtk, city = bool(rng.uniform() < RTK[grade]), bool(rng.uniform() < 0.45)
+    quarter = int(rng.integers(1, 4)) if rng.uniform() < 0.2 else 0     # known
+    rtk, city = bool(rng.uniform() < SIZES['rtk'][which]), bool(rng.uniform() < 0.45)
     robot = kind == 'yard' and grade == 'consumer'
     size = 0.5 if robot else 1.0
     antenna = size * rng.normal((0.8, 0.0, 1.3), (0.8, 0.3, 0.2))
     imu = size * rng.normal((0.8, 0.0, 0.4), (0.6, 0.3, 0.2))
     scale = 1 / (500.0 if robot else 1000.0)     # fine counts, but for a coarser odometer
-    options = {
+    options: dict[str, Any] = {
         'scenario': kind, 'seed': seed, 'imu_grade': grade, 'heading': heading, 'slope': slope,
         'roll': roll, 'pitch': float(np.clip(pitch, -0.2, 0.2)), 'yaw': yaw,
         'mounting_rpy': (0.0, 0.0, quarter * math.pi / 2),
-        'antenna_lever_arm': _vector(antenna), 'imu_lever_arm': _vector(imu),
+        'antenna_lever_arm': plain(antenna), 'imu_lever_arm': plain(imu),
         'odometer_lever_arm': (0.0, 0.0, -0.1 if robot else -0.3),
         'odometer_rate': 50.0, 'fix_rate': float(rng.choice([1.0, 5.0, 10.0])),
         'fix_noise': 'rtk' if rtk else 'white', 'fix_sigma': 0.02 if rtk else 1.5,
-        'nominal_scale': scale, 'scale': scale * (1 + NOMINAL[grade] * rng.standard_normal())}
+        'nominal_scale': scale,
+        'scale': scale * (1 + SIZES['nominal scale'][which] * rng.standard_normal())}
     options = {k: float(v) if isinstance(v, np.floating) else v for k, v in options.items()}
     return Vehicle(grade, kind, rtk, city and kind != 'motorway', robot, options, alone), options
-
-
-def _vector(values):
-    return tuple(float(x) for x in values)

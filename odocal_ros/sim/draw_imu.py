@@ -14,96 +14,68 @@ import math
 import numpy as np
 
 from odocal_ros.settings.grades import GRADES
-
-DEG, MG, K_HOUR = math.radians(1.0), 9.81e-3, math.radians(1.0) / 3600
-G = 9.81
-CLASSES = ('consumer', 'industrial', 'tactical')
-# each for C, I, T; 1 sigma, or (median, sigma of the logarithm)
-GYRO_SCALE, ACCEL_SCALE = (0.01, 1.5e-3, 3e-4), (0.01, 2e-3, 3e-4)
-CROSS, BETWEEN = (0.4 * DEG, 0.05 * DEG, 3e-4), (0.5 * DEG, 0.1 * DEG, 1e-3)
-SENSITIVITY = (0.05 * DEG / G, 0.008 * DEG / G, K_HOUR / G)
-GYRO_BIAS, ACCEL_BIAS = (DEG, 0.1 * DEG, 5 * K_HOUR), (25 * MG, 3 * MG, MG)
-GYRO_WANDER = (200 * K_HOUR, 25 * K_HOUR, 0.5 * K_HOUR)
-ACCEL_WANDER = (MG, 0.2 * MG, 0.05 * MG)
-GYRO_SLOPE = ((0.02 * DEG, 0.7), (0.002 * DEG, 0.5), (0.5 * K_HOUR, 0.5))
-ACCEL_SLOPE = ((0.5 * MG, 0.5), (0.05 * MG, 0.5), (0.02 * MG, 0.5))
-WARMTH = ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0))     # K
-RECTIFIED = (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G)  # m/s^2 per (m/s^2)^2: mg per g^2
-LATENCY = ((0.010, 0.6), (0.005, 0.5), (0.002, 0.5))
-FILTER = ((0.002, 0.019), (0.002, 0.010), (0.001, 0.016))
-JITTER = (3e-3, 1e-3, 1e-5)
-MOST = 3.0           # sigmas at which a data sheet's limit cuts
+from odocal_ros.sim.zoo import DEG, Drawn, G, lognormal, plain, Vehicle
 
 
-def _of(table, vehicle):
-    return table[CLASSES.index(vehicle.grade)]
-
-
-def _plain(values):
-    return tuple(float(x) for x in np.ravel(values))
-
-
-def _lognormal(rng, pair, size=None):
-    median, spread = pair
-    return median * np.exp(spread * rng.standard_normal(size))
-
-
-def _limited(rng, sigma, size):
-    return sigma * np.clip(rng.standard_normal(size), -MOST, MOST)
-
-
-def triads(rng, vehicle):
+def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Scale of each axis, axes that are not square, a gyro turned against its accelerometer."""
-    x, y, z = rng.normal(0.0, _of(BETWEEN, vehicle) / math.sqrt(2), 3)
+    x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
     turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it each way
     figures = {}
-    for name, scale, sign in (('gyro_matrix', GYRO_SCALE, 1), ('accel_matrix', ACCEL_SCALE, -1)):
-        M = rng.normal(0.0, _of(CROSS, vehicle), (3, 3)) + sign * turned / math.sqrt(2)
-        np.fill_diagonal(M, _limited(rng, _of(scale, vehicle), 3))
-        figures[name] = _plain(M)
+    for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
+        M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * turned / math.sqrt(2)
+        # the limit of a data sheet cuts at three sigmas
+        np.fill_diagonal(M, vehicle.size(f'{sensor} scale')
+                         * np.clip(rng.standard_normal(3), -3.0, 3.0))
+        figures[name] = plain(M)
     return {}, figures
 
 
-def g_sensitivity(rng, vehicle):
+def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let the gyro feel specific force."""
-    return {}, {'g_sensitivity': _plain(rng.normal(0.0, _of(SENSITIVITY, vehicle), 9))}
+    return {}, {'g_sensitivity': plain(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
 
 
-def bias(rng, vehicle):
+def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Turn-on biases of the vehicle's table, and their wander in the run."""
-    return {}, {'gyro_bias': _plain(rng.normal(0.0, _of(GYRO_BIAS, vehicle), 3)),
-                'accel_bias': _plain(rng.normal(0.0, _of(ACCEL_BIAS, vehicle), 3) * [1, 1, 1.3]),
-                'gyro_wander': _of(GYRO_WANDER, vehicle),
-                'accel_wander': _of(ACCEL_WANDER, vehicle)}
+    return {}, {
+        'gyro_bias': plain(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
+        'accel_bias': plain(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
+        'gyro_wander': vehicle.size('gyro wander'),
+        'accel_wander': vehicle.size('accelerometer wander')}
 
 
-def temperature(rng, vehicle):
+def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Biases that ramp while the Imu warms; it may have been on for some minutes."""
-    tau = float(_lognormal(rng, (300.0, 0.5)))
+    tau = lognormal(rng, 300.0, 0.5)
     since = rng.uniform(0.0, 600.0)
-    slopes = {f'{name}_slope': _plain(rng.choice([-1, 1], 3) * _lognormal(
-        rng, _of(table, vehicle), 3)) for name, table in (('gyro', GYRO_SLOPE),
-                                                          ('accel', ACCEL_SLOPE))}
-    rise = rng.uniform(*_of(WARMTH, vehicle)) * math.exp(-since / tau)
-    return {}, slopes | {'warm_rise': float(rise), 'warm_time': tau}
+    figures = {}
+    for name, sensor in (('gyro_slope', 'gyro'), ('accel_slope', 'accelerometer')):
+        median, spread = vehicle.row(f'{sensor} slope')
+        sign = rng.choice([-1, 1], 3)
+        figures[name] = plain(sign * (median * np.exp(spread * rng.standard_normal(3))))
+    least, most = vehicle.row('warmth')
+    rise = rng.uniform(least, most) * math.exp(-since / tau)
+    return {}, figures | {'warm_rise': float(rise), 'warm_time': tau}
 
 
-def vibration(rng, vehicle):
+def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Shake the Imu by road and engine."""
     rms = G * rng.uniform(0.02, 0.1)
     return {}, {'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
-                'rectification': float(_of(RECTIFIED, vehicle) * rng.choice([-1, 1]))}
+                'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))}
 
 
-def imu_stamps(rng, vehicle):
+def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamps late by the sensor's filter and the way to the computer, jittered, in batches."""
-    latency = rng.uniform(*_of(FILTER, vehicle)) + _lognormal(rng, _of(LATENCY, vehicle))
+    shortest, longest = vehicle.row('filter')
+    latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.row('latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
-    return {}, {'imu_latency': float(latency), 'imu_jitter': _of(JITTER, vehicle),
+    return {}, {'imu_latency': float(latency), 'imu_jitter': vehicle.size('imu jitter'),
                 'imu_batch': 2 if batches else 1}
 
 
-def grade(rng, vehicle):
+def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let ``imu.grade`` be set right, one too good, or one too modest (navigation, consumer)."""
     names = list(GRADES)
     told = names.index(vehicle.grade) + int(rng.integers(-1, 2))

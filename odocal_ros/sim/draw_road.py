@@ -9,24 +9,16 @@
 
 """Effects of a drawn vehicle's wheels, body and receiver, after the tables of docs/zoo.md."""
 
-import math
-
 import numpy as np
 
-from odocal_ros.sim.draw_imu import _lognormal, _of
-
-DEG, KMH = math.radians(1.0), 1 / 3.6
-G = 9.81
-LEAST_BITS = (0.0075, 0.01, 0.031, 0.056, 0.06)    # km/h, steps of speeds on a car's bus
-WHOLE = 0.3          # share of whole km/h, as OBD-II gives them, among speeds
-ARM_ERROR, ARM_ZERO = (0.15, 0.03, 0.01), (0.3, 0.1, 0.0)
-DROPS = 0.01
+from odocal_ros.sim.zoo import DEG, Drawn, G, KMH, lognormal, plain, Vehicle
 
 
-def coarse_speed(rng, vehicle):
+def coarse_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Send speeds in steps of a bus, with a dead band; at times whole km/h at 1 to 10 Hz."""
-    whole = vehicle.alone or rng.uniform() < WHOLE
-    real = {'speed_step': KMH * (1.0 if whole else float(rng.choice(LEAST_BITS))),
+    whole = vehicle.alone or rng.uniform() < 0.3      # as OBD-II gives them
+    least_bits = (0.0075, 0.01, 0.031, 0.056, 0.06)     # km/h, of buses of cars
+    real = {'speed_step': KMH * (1.0 if whole else float(rng.choice(least_bits))),
             'speed_rounding': str(rng.choice(['floor', 'round']))}
     chance = rng.uniform()
     band = (0.0 if chance < 0.3 else rng.uniform(0.3, 1) if chance < 0.8 else rng.uniform(1, 3.5))
@@ -36,84 +28,84 @@ def coarse_speed(rng, vehicle):
             real | {'dead_band': 0.0 if whole else band * KMH})
 
 
-def coarse_pulses(rng, vehicle):
+def coarse_pulses(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Count few pulses per metre: the teeth of a brake's tone wheel."""
     nominal = 1 / rng.uniform(15, 50)
     ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
     return {'scale': ratio * nominal, 'nominal_scale': float(nominal)}, {}
 
 
-def odometer_stamps(rng, vehicle):
+def odometer_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamps late by filter and bus, with jitter."""
-    late = _lognormal(rng, (0.015, 0.6) if vehicle.robot else (0.04, 0.5)
-                      if vehicle.grade != 'tactical' else (0.005, 0.3))
-    return {'odometer_delay': float(late)}, {'odometer_jitter': 0.003}
+    late = lognormal(rng, *((0.015, 0.6) if vehicle.robot else (0.04, 0.5)
+                            if vehicle.grade != 'tactical' else (0.005, 0.3)))
+    return {'odometer_delay': late}, {'odometer_jitter': 0.003}
 
 
-def speed_law(rng, vehicle):
+def speed_law(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Tyres that grow with the square of the speed."""
-    return {}, {'speed_law': float(_lognormal(rng, (0.002, 0.6)))}
+    return {}, {'speed_law': lognormal(rng, 0.002, 0.6)}
 
 
-def warming(rng, vehicle):
+def warming(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Tyres that grow as they warm."""
     half = 0.5 if vehicle.grade == 'tactical' else 1.0
     return {}, {'warming': float(half * rng.uniform(0.001, 0.004)),
-                'warming_time': float(_lognormal(rng, (600.0, 0.4)))}
+                'warming_time': lognormal(rng, 600.0, 0.4)}
 
 
-def slip(rng, vehicle):
+def slip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Tyres that slip as they pull and brake."""
-    return {}, {'tyre_slip': float(1 / _lognormal(rng, (30.0, 0.4))),
+    return {}, {'tyre_slip': 1 / lognormal(rng, 30.0, 0.4),
                 'driven': bool(rng.uniform() < 0.5)}
 
 
-def sideslip(rng, vehicle):
+def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let the rear axle drift outwards by the lateral acceleration."""
-    drift = rng.uniform(0, 0.1) if vehicle.robot else _lognormal(rng, (0.22, 0.35))
+    drift = rng.uniform(0, 0.1) if vehicle.robot else lognormal(rng, 0.22, 0.35)
     return {}, {'sideslip': float(drift * DEG)}
 
 
-def squat(rng, vehicle):
+def squat(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Put the body on springs."""
-    pitch, roll = (0.2, 0.5) if vehicle.robot else (_lognormal(rng, (1.3, 0.4)),
-                                                    _lognormal(rng, (4.5, 0.3)))
+    pitch, roll = (0.2, 0.5) if vehicle.robot else (lognormal(rng, 1.3, 0.4),
+                                                    lognormal(rng, 4.5, 0.3))
     return {}, {'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G)}
 
 
-def lever_arms(rng, vehicle):
+def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Arms measured with a tape, by eye, or left at zero."""
-    zero, real = rng.uniform() < _of(ARM_ZERO, vehicle), {}
+    zero, real = rng.uniform() < vehicle.size('arm at zero'), {}
     for name in ('imu', 'antenna', 'odometer'):
-        off = _of(ARM_ERROR, vehicle) * rng.standard_normal(3)
+        off = vehicle.size('arm error') * rng.standard_normal(3)
         arm = np.array(vehicle.options[f'{name}_lever_arm'])
-        real[f'{name}_arm_error'] = tuple(float(x) for x in (-arm if zero else off))
+        real[f'{name}_arm_error'] = plain(-arm if zero else off)
     return {}, real
 
 
-def receiver_lag(rng, vehicle):
+def receiver_lag(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Filter positions as receivers do."""
     return {}, {'receiver_lag': float(rng.uniform(0.01, 0.15))}
 
 
-def fix_stamps(rng, vehicle):
+def fix_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Stamps of the arrival, by half of the drivers."""
     if vehicle.grade == 'tactical' or not (vehicle.alone or rng.uniform() < 0.5):
         return {}, {}
-    return {'fix_delay': float(_lognormal(rng, (0.12, 0.4)))}, {'fix_jitter': 0.01}
+    return {'fix_delay': lognormal(rng, 0.12, 0.4)}, {'fix_jitter': 0.01}
 
 
-def slow_errors(rng, vehicle):
+def slow_errors(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Errors that stay for minutes: most in one, the rest in a quarter of an hour."""
     if vehicle.rtk:
         return {'fix_sigma': 0.008}, {'slow_errors': ((0.01, 100.0),)}
     sbas = 0.6 if rng.uniform() < 0.4 else 1.0
-    sigma = float(sbas * _lognormal(rng, (1.5, 0.4)))
+    sigma = sbas * lognormal(rng, 1.5, 0.4)
     return ({'fix_sigma': float(rng.uniform(0.02, 0.3))},
             {'slow_errors': ((sigma * 0.6**0.5, 60.0), (sigma * 0.4**0.5, 900.0))})
 
 
-def multipath(rng, vehicle):
+def multipath(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Bursts of wrong positions in a city; of RTK, a false fix now and then."""
     if vehicle.rtk:
         return {}, {'bursts': 12.0 if vehicle.city else 1.0, 'burst_size': 0.6,
@@ -123,19 +115,19 @@ def multipath(rng, vehicle):
     return {}, {'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0}
 
 
-def covariance(rng, vehicle):
+def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """State sigmas that are not the true ones; in a city most are too small."""
-    optimism = _lognormal(rng, (3.0, 0.7) if vehicle.city and not vehicle.rtk else (1.3, 0.5))
-    return {}, {'stated_factor': float(1 / optimism)}
+    optimism = lognormal(rng, *((3.0, 0.7) if vehicle.city and not vehicle.rtk else (1.3, 0.5)))
+    return {}, {'stated_factor': 1 / optimism}
 
 
-def outages(rng, vehicle):
+def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Lose the sky, and a fix in a hundred."""
     spans, span = [], 500.0
     for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.alone):
         begin = float(rng.uniform(30.0, span))
-        spans.append((begin, begin + float(min(_lognormal(rng, (10.0, 1.0)), 90.0))))
-    return {'outages': tuple(sorted(spans))}, {'drops': DROPS}
+        spans.append((begin, begin + min(lognormal(rng, 10.0, 1.0), 90.0)))
+    return {'outages': tuple(sorted(spans))}, {'drops': 0.01}
 
 
 EFFECTS = {f.__name__: f for f in (

@@ -14,16 +14,13 @@ import math
 
 import numpy as np
 
+from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
-WEEK_NS, HOUR_NS = 7 * 86_400 * 10**9, 3600 * 10**9
 WALK = 1e-4              # of the scale, relative, per square root of a day
-SCALE_SPREAD = 0.003     # between vehicles of a model, relative, 1 sigma
-YAW_SPREAD, PITCH_SPREAD = math.radians(0.3), math.radians(0.2)
-TYRES, MOVED, BROKEN = 0.1, 0.05, 1 / 30     # shares of the vehicles, at least one of three
-KM_A_WEEK = 400.0
-ALIVE = 1 / 3            # of the drive: then a broken counter stands
+# shares of the vehicles whose tyres are changed, Imu moved, counter broken; at least one of three
+FATES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
 
 @dataclass(frozen=True)
@@ -73,21 +70,21 @@ def fleet_of(vehicles: int, bags: int, seed: int) -> list[FleetVehicle]:
     rng = stream(seed, 'fleet')
     order = rng.permutation(vehicles).tolist()
     fates: dict[int, str] = {}
-    for what, share in (('scale_factor', TYRES), ('yaw_mounting_angle', MOVED),
-                        ('counter', BROKEN)):
+    for what, share in FATES.items():
         for _ in range(math.ceil(vehicles * share - 1e-9) if vehicles > 2 and bags > 2 else 0):
             fates[order.pop()] = what
     return [_vehicle(k, bags, fates.get(k), stream(seed, f'fleet vehicle {k}'))
             for k in range(vehicles)]
 
 
-def _vehicle(k: int, bags: int, fate: str | None, rng) -> FleetVehicle:
+def _vehicle(k: int, bags: int, fate: str | None, rng: np.random.Generator) -> FleetVehicle:
     model = MODELS[k % len(MODELS)]
     walk = np.cumsum(WALK * math.sqrt(7) * rng.standard_normal(bags))
-    scale = model.scale * (1 + SCALE_SPREAD * rng.standard_normal()) * np.exp(walk)
-    yaw = np.full(bags, model.yaw + YAW_SPREAD * rng.standard_normal())
-    pitch = model.pitch + PITCH_SPREAD * rng.standard_normal()
-    km = 1000.0 + KM_A_WEEK * np.cumsum(rng.uniform(0.5, 1.5, bags))
+    # between vehicles of a model, 1 sigma: 0.3 % of the scale, 0.3 and 0.2 deg
+    scale = model.scale * (1 + 0.003 * rng.standard_normal()) * np.exp(walk)
+    yaw = np.full(bags, model.yaw + math.radians(0.3) * rng.standard_normal())
+    pitch = model.pitch + math.radians(0.2) * rng.standard_normal()
+    km = 1000.0 + 400.0 * np.cumsum(rng.uniform(0.5, 1.5, bags))    # 400 km a week
     when = int(rng.integers(1, max(2, bags - 1)))
     size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0))
     changes: tuple[FleetChange, ...] = ()
@@ -106,7 +103,7 @@ def drive_options(vehicle: FleetVehicle, number: int, bag: int, options: SimOpti
     """Return the options of a drive of the ``number``-th vehicle."""
     return replace(
         options, seed=options.seed + 1000 * (number + 1) + bag, yaw=float(vehicle.yaw[bag]),
-        start_ns=options.start_ns + bag * WEEK_NS + number % 100 * HOUR_NS,
+        start_ns=options.start_ns + bag * 7 * DAY_NS + number % 100 * DAY_NS // 24,
         pitch=vehicle.pitch, scale=float(vehicle.scale[bag]),
         nominal_scale=vehicle.model.nominal)
 
@@ -117,5 +114,6 @@ def as_driven(drive: Drive, broken: bool) -> Drive:
         return drive
     rows = drive.odometer
     value = rows.value.copy()
-    value[int(ALIVE * len(value)):] = value[int(ALIVE * len(value))]
+    third = int(1 / 3 * len(value))
+    value[third:] = value[third]
     return replace(drive, odometer=replace(rows, value=value))

@@ -17,14 +17,16 @@ and a push along x not by the y accelerometer. These are the angles that driving
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 
-def angles(d_b):
+
+def angles(d_b: Floats) -> tuple[float, float]:
     """Return yaw and pitch mounting angle of the forward axis in b, rad."""
     d = np.asarray(d_b, dtype=float)
     return float(-np.arcsin(d[1])), float(np.arctan2(d[2], d[0]))
 
 
-def turn_and_push(gyro_matrix, accel_matrix):
+def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     """
     Return the rotation that takes the turn-and-push frame to that of the matrices, (3, 3).
 
@@ -39,7 +41,8 @@ def turn_and_push(gyro_matrix, accel_matrix):
     return np.stack([x, np.cross(z, x), z], -1)
 
 
-def own_angles(C_vb, C_bi, gyro_matrix, accel_matrix):
+def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
+               accel_matrix: Floats) -> tuple[float, float, float, float]:
     """Return yaw and pitch by the Imu's own axes, then by its housing, rad; matrices in i."""
     d = np.asarray(C_vb)[0]
     R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.earth import (
     C_en,
     earth_rate_n,
@@ -32,9 +33,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Profile
 
 STEADY = Profile([0.0, 1.0], [[0.0]])     # no sway
-NODE_STEP = 0.1   # s; at 0.5 rad/s a four-point Gauss rule is then below round-off
-GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(4)[0] + 1) / 2, \
-    np.polynomial.legendre.leggauss(4)[1] / 2
+GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # on -1 to 1
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Hills:
     slope: float = 0.0
     length: float = 1000.0   # m
 
-    def __call__(self, travel):
+    def __call__(self, travel: Floats) -> tuple[Floats, Floats, Floats]:
         """Return slope and its first and second derivative by distance."""
         k = 2 * np.pi / self.length
         wave, along = self.slope * np.sin(k * travel), self.slope * np.cos(k * travel)
@@ -107,7 +106,7 @@ class Motion:
         """Return the metres rolled over the whole drive."""
         return float(self._travel(self.duration))
 
-    def at(self, t) -> State:
+    def at(self, t: Floats) -> State:
         """Return the state at times t, (n,) s."""
         t = np.asarray(t, dtype=float)
         node = np.clip(np.searchsorted(self._nodes, t, side='right') - 1, 0, None)
@@ -128,7 +127,8 @@ class Motion:
             sway_acceleration=np.stack([profile.mean(t) for profile in self._jolt], -1))
 
     def _place_nodes(self) -> None:
-        steps = np.arange(0.0, self.duration, NODE_STEP)
+        # 0.1 s: at 0.5 rad/s a four-point Gauss rule is then below round-off
+        steps = np.arange(0.0, self.duration, 0.1)
         breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
         nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
         self._nodes = nodes = nodes[nodes <= self.duration]
@@ -146,11 +146,11 @@ class Motion:
         self._turned = _running(
             0.0, turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
 
-    def _stretch(self, t, h):
+    def _stretch(self, t: Floats, h: Floats) -> list[Floats]:
         """Return metres east, north, up and rad turned against the level, from t to t + h."""
         sums = [np.zeros(np.shape(t)) for _ in range(4)]
-        for x, w in zip(GAUSS_X, GAUSS_W, strict=True):
-            at = t + x * h
+        for node, weight in GAUSS:
+            at, w = t + (node + 1) / 2 * h, weight / 2
             yaw, slope = self.start.yaw + self._turn(at), self.hills(self._travel(at))[0]
             ds, side, rise = (w * h * p(at) for p in (self.speed, *self.sway))
             level = ds * np.cos(slope) - rise * np.sin(slope)
@@ -163,37 +163,40 @@ class Motion:
         return sums
 
 
-def _running(first, steps):
+def _running(first: float, steps: Floats) -> Floats:
     return first + np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _walk_about(latitude, height, east, north):
+def _walk_about(latitude: Floats, height: Floats, east: Floats,
+                north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps about a middle latitude."""
     meridian, normal = radii(latitude)
     return north / (meridian + height), east / ((normal + height) * np.cos(latitude))
 
 
-def _walk(latitude, height, east, north):
+def _walk(latitude: Floats, height: Floats, east: Floats, north: Floats) -> tuple[Floats, Floats]:
     """Return the change of latitude and longitude of steps of metres that begin at latitude."""
     step, _ = _walk_about(latitude, height, east, north)
     return _walk_about(latitude + step / 2, height, east, north)
 
 
-def attitude(state: State):
+def attitude(state: State) -> Floats:
     """Return C_nv, n being the local level where the vehicle is: (n, 3, 3)."""
     return matrix_from_rpy(np.stack([np.zeros_like(state.yaw), -state.slope, state.yaw], -1))
 
 
-def velocity_n(state: State):
+def velocity_n(state: State) -> Floats:
     """Return the velocity over ground of v's origin in ENU, m/s: (n, 3)."""
-    return np.einsum('nij,nj->ni', attitude(state), _velocity_v(state))
+    v_n: Floats = np.einsum('nij,nj->ni', attitude(state), _velocity_v(state))
+    return v_n
 
 
-def _velocity_v(state):
+def _velocity_v(state: State) -> Floats:
     return np.concatenate([state.speed[:, None], state.sway], axis=1)
 
 
-def inertial_v(state: State, lever_arm_v):
+def inertial_v(state: State,
+               lever_arm_v: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
     Return what a perfect IMU at ``lever_arm_v`` (m, in v) feels, in v's axes.
 
@@ -236,11 +239,12 @@ def inertial_v(state: State, lever_arm_v):
     return w_v, f_v
 
 
-def _into(C_nv, a_n):
-    return np.einsum('nij,ni->nj', C_nv, a_n)
+def _into(C_nv: Floats, a_n: Floats) -> Floats:
+    a_v: Floats = np.einsum('nij,ni->nj', C_nv, a_n)
+    return a_v
 
 
-def _gravity_change(state, d_n, gamma):
+def _gravity_change(state: State, d_n: Floats, gamma: Floats) -> Floats:
     """Return gravity at d_n (m) from the vehicle less gravity there, in the vehicle's ENU."""
     meridian, normal = radii(state.latitude)
     tilt_e, tilt_n = d_n[:, 0] / (normal + state.height), d_n[:, 1] / (meridian + state.height)
@@ -248,7 +252,8 @@ def _gravity_change(state, d_n, gamma):
     return np.stack([-there * tilt_e, -there * tilt_n, gamma - there], -1)
 
 
-def point(state: State, lever_arm_v, tilt=None):
+def point(state: State, lever_arm_v: tuple[float, float, float],
+          tilt: Floats | None = None) -> tuple[Floats, Floats, Floats]:
     """
     Return latitude, longitude (rad), height (m) of a point fixed to the vehicle: (n,) each.
 
@@ -260,16 +265,17 @@ def point(state: State, lever_arm_v, tilt=None):
     return geodetic_from_ecef(r_e + C @ np.asarray(lever_arm_v, dtype=float))
 
 
-def contact_travel(state: State, lever_arm_v):
+def contact_travel(state: State, lever_arm_v: Floats | tuple[float, float, float]) -> Floats:
     """Return the metres that a wheel touching the ground at lever_arm_v has rolled: (n,)."""
     _, y, z = lever_arm_v
     return state.travel - y * state.turned - z * state.slope
 
 
-def contact_speed(state: State, lever_arm_v):
+def contact_speed(state: State, lever_arm_v: Floats | tuple[float, float, float]) -> Floats:
     """Return the speed of such a wheel, m/s: (n,)."""
     _, y, z = lever_arm_v
     east = state.speed * np.cos(state.slope) * np.cos(state.yaw)
     level_turn = east * np.tan(state.latitude) / (radii(state.latitude)[1] + state.height)
     turn = state.yaw_rate * np.cos(state.slope) + level_turn
-    return state.speed - y * turn - z * state.slope_rate
+    speed: Floats = state.speed - y * turn - z * state.slope_rate
+    return speed

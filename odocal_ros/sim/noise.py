@@ -13,25 +13,30 @@ import zlib
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
+
 
 def stream(seed: int, name: str) -> np.random.Generator:
     """Return the named generator of a seed; no setting of one sensor moves another's numbers."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def white(rng, root_psd: float, rate: float, shape) -> np.ndarray:
+def white(rng: np.random.Generator, root_psd: float, rate: float,
+          shape: tuple[int, int]) -> Floats:
     """Return samples at ``rate`` Hz of white noise of a root PSD, unit/sqrt(Hz)."""
-    return root_psd * rate**0.5 * rng.standard_normal(shape)
+    noise: Floats = root_psd * rate**0.5 * rng.standard_normal(shape)
+    return noise
 
 
-def random_walk(rng, root_rate: float, rate: float, shape) -> np.ndarray:
+def random_walk(rng: np.random.Generator, root_rate: float, rate: float,
+                shape: tuple[int, int]) -> Floats:
     """Return a random walk from 0 that grows by ``root_rate`` unit/sqrt(s): (n, ...)."""
     steps = root_rate / rate**0.5 * rng.standard_normal(shape)
     steps[:1] = 0.0
     return np.cumsum(steps, axis=0)
 
 
-def gauss_markov(rng, sigma: float, tau: float, t) -> np.ndarray:
+def gauss_markov(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
     """
     Return a first-order Gauss-Markov process in three axes: (n,) s to (n, 3).
 
@@ -40,7 +45,7 @@ def gauss_markov(rng, sigma: float, tau: float, t) -> np.ndarray:
     decay = np.exp(-np.diff(t, prepend=t[:1]) / tau)
     drive = sigma * np.sqrt(1 - decay**2)[:, None] * rng.standard_normal((len(t), 3))
     drive[:1] = sigma * rng.standard_normal((1, 3))
-    x = np.empty_like(drive)
+    x: Floats = np.empty_like(drive)
     last = np.zeros(3)
     for k, (d, push) in enumerate(zip(decay, drive, strict=True)):
         x[k] = last = d * last + push

@@ -9,20 +9,18 @@
 
 """What a simulated drive is made of: every choice with its default, checked in one place."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 import math
 from typing import Any
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.grades import Grade, GRADES
-from odocal_ros.sim.real import Real
+from odocal_ros.sim.real import NONE3, Real, Vector
 
-PERFECT = Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-SIM_GRADES = GRADES | {'perfect': PERFECT}
+SIM_GRADES = {**GRADES, 'perfect': Grade(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 FIX_NOISES = ('white', 'correlated', 'rtk')
 ODOMETERS = ('counts', 'speed', 'angle')
-Vector = tuple[float, float, float]
-ORIGIN: Vector = (0.0, 0.0, 0.0)
 BY_SCENARIO: Any = None   # filled in by ``resolved``
 
 
@@ -51,8 +49,8 @@ class SimOptions:
     yaw: float = BY_SCENARIO   # rad, yaw mounting angle
     pitch: float = BY_SCENARIO   # rad, pitch mounting angle
     roll: float = 0.0                      # rad
-    mounting_rpy: Vector = ORIGIN          # rad, nominal, Imu frame to b
-    imu_lever_arm: Vector = ORIGIN
+    mounting_rpy: Vector = NONE3          # rad, nominal, Imu frame to b
+    imu_lever_arm: Vector = NONE3
     gyro_scale_error: float = 0.0          # relative, of all axes
     accel_scale_error: float = 0.0         # relative, of all axes
     orientation_sigma: float | None = None  # rad; None: the Imu sends no orientation
@@ -60,7 +58,7 @@ class SimOptions:
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
     odometer_rate: float = 50.0            # Hz
     odometer_delay: float = 0.0            # s by which its stamps are late
-    odometer_lever_arm: Vector = ORIGIN    # wheel contact point; of two wheels: their middle
+    odometer_lever_arm: Vector = NONE3    # wheel contact point; of two wheels: their middle
     scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: what is to be found
     nominal_scale: float = BY_SCENARIO   # K0, what the operator believes
     speed_noise: float = 0.0               # m/s, white, of kind speed
@@ -79,7 +77,7 @@ class SimOptions:
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
     fix_correlation_time: float = 60.0     # s, of kind correlated
     fix_delay: float = 0.0                 # s by which its stamps are late
-    antenna_lever_arm: Vector = ORIGIN
+    antenna_lever_arm: Vector = NONE3
     outliers: float = 0.0                  # share of the fixes
     outlier_size: float = 20.0             # m
     outages: tuple[tuple[float, float], ...] = ()   # s from the start, no fixes in between
@@ -99,9 +97,7 @@ DEFAULTS = {
     'motorway': {'duration': 600.0, 'imu_grade': 'industrial'},
     'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
 }
-EVERYWHERE = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4)}
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
-FINE = 0.001   # m/pulse of the paper's odometer: a coarser pulse would hide 1e-6 of 11 200 m
 POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'scale', 'nominal_scale',
             'track_width', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
@@ -114,7 +110,6 @@ LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0
           'odometer_rate': 10_000.0, 'fix_rate': 1000.0, 'heading_rate': 1000.0}
 ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0, 'yaw': 180.0,
           'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}
-MOST_SAMPLES = 20_000_000   # of one topic; more would not fit in memory
 
 
 def resolved(options: SimOptions) -> SimOptions:
@@ -130,10 +125,12 @@ def resolved(options: SimOptions) -> SimOptions:
     _choice('--scenario', options.scenario, DEFAULTS)
     _choice('--fix-noise', options.fix_noise, FIX_NOISES)
     _choice('--odometer', options.odometer, ODOMETERS)
-    defaults: dict[str, Any] = EVERYWHERE | DEFAULTS[options.scenario]
+    defaults: dict[str, Any] = {'yaw': math.radians(1.0), 'pitch': math.radians(0.4),
+                                **DEFAULTS[options.scenario]}
     scale, nominal = SCALES[options.odometer]
     if options.scenario == 'paper':
-        scale = FINE if options.odometer == 'counts' else scale
+        # fine pulses: a coarser one would hide 1e-6 of 11 200 m
+        scale = 0.001 if options.odometer == 'counts' else scale
         nominal = 1.2 * (options.scale or scale)
     elif options.scale is not None:
         nominal = options.scale * nominal / scale
@@ -147,7 +144,7 @@ def resolved(options: SimOptions) -> SimOptions:
     return filled
 
 
-def _check(options):
+def _check(options: SimOptions) -> None:
     _choice('--imu-grade', options.imu_grade, SIM_GRADES)
     for field in fields(options):
         value = getattr(options, field.name)
@@ -159,12 +156,13 @@ def _check(options):
     for begin, end in options.outages:
         if not 0 <= begin < end:
             raise BadUsage(f'--outage {begin:g}:{end:g}: want A:B, seconds with 0 <= A < B')
-    if options.duration * options.imu_rate > MOST_SAMPLES:
+    most = 20_000_000    # of one topic; more would not fit in memory
+    if options.duration * options.imu_rate > most:
         raise BadUsage(f'--duration {options.duration:g} at --imu-rate {options.imu_rate:g}: more '
-                       f'than {MOST_SAMPLES:,} samples; lower one of them')
+                       f'than {most:,} samples; lower one of them')
 
 
-def _check_number(name, value):
+def _check_number(name: str, value: float) -> None:
     degrees = name in ANGLES
     flag = '--' + name.replace('_', '-') + ('-deg' if degrees else '')
     shown = math.degrees(value) if degrees else value
@@ -179,6 +177,6 @@ def _check_number(name, value):
         raise BadUsage(f'{flag} {shown:g}: want at most {limit:g}')
 
 
-def _choice(flag, name, names):
+def _choice(flag: str, name: str, names: Collection[str]) -> None:
     if name not in names:
         raise BadUsage(f'{flag} {name}: want one of {", ".join(names)}')

@@ -12,16 +12,17 @@
 from dataclasses import dataclass, fields
 import difflib
 import math
+from typing import Any
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.grades import GRADES
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
-NONE3: Vector = (0.0, 0.0, 0.0)
-NONE9: Matrix = (0.0,) * 9
+NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9
 WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
@@ -76,7 +77,8 @@ class Real:
     antenna_arm_error: Vector = NONE3
 
     receiver_lag: float = 0.0        # s, time constant of a first-order filter on positions
-    slow_errors: tuple = ()          # (sigma m of east and north, up twice; correlation s) each
+    # (sigma m of east and north, up twice; correlation s) each
+    slow_errors: tuple[tuple[float, float], ...] = ()
     bursts: float = 0.0              # multipath bursts per hour
     burst_size: float = 12.0         # m, median
     burst_time: float = 8.0          # s, median
@@ -90,12 +92,12 @@ class Real:
             value = _checked(field.name, getattr(self, field.name), field.default)
             object.__setattr__(self, field.name, value)
 
-    def matrix(self, name: str):
+    def matrix(self, name: str) -> Floats:
         """Return a matrix by its name: (3, 3)."""
         return np.reshape(getattr(self, name), (3, 3))
 
 
-def _checked(name, value, default):
+def _checked(name: str, value: Any, default: Any) -> Any:
     """Return a figure as numbers and tuples of them, or say what is wrong with it."""
     if name in WORDS:
         if value not in WORDS[name] and value != default:
@@ -115,21 +117,21 @@ def _checked(name, value, default):
     return value
 
 
-def _numbers(name, value, default):
+def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
     """Return the numbers of a figure whose form is right."""
     if name == 'slow_errors':
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
                                                  and v[1] for v in value)):
             raise BadUsage('--real slow_errors: want pairs of sigma and correlation time, such '
                            'as ((1.2,60),(0.9,900))')
-        return [x for pair in value for x in pair]
+        return tuple(x for pair in value for x in pair)
     count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
     if isinstance(value, tuple) != bool(count) or count and len(value) != count:
         raise BadUsage(f'--real {name}: want {f"{count} numbers" if count else "one number"}')
     return value if count else (value,)
 
 
-def parsed(text: str) -> tuple:
+def parsed(text: str) -> tuple[str, Any]:
     """
     Return name and value of ``NAME=VALUE``.
 

@@ -11,9 +11,11 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.sim import body
-from odocal_ros.sim.motion import point
+from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, stream
+from odocal_ros.sim.options import SimOptions
 
 # ages, in time constants, and weights of a first-order filter: Gauss and Legendre on pieces, so
 # fine that the kinks of a route do no harm
@@ -27,7 +29,7 @@ SPREAD = 0.9         # of the logarithm of a burst's size and length
 ONSET = (1.0, 3.0)   # s in which a burst comes and goes
 
 
-def places(motion, t, options):
+def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
     """Return latitude, longitude (rad), height (m) that a receiver without noise tells at t."""
     lag = options.real.receiver_lag
     if not lag:
@@ -39,21 +41,22 @@ def places(motion, t, options):
         strict=True))
 
 
-def _antenna(motion, t, options):
+def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
     tilt = body.rotation(motion, t) if motion.tilt else None
     return point(motion.at(t), options.antenna_lever_arm, tilt)
 
 
-def errors(t, options):
+def errors(t: Floats, options: SimOptions) -> Floats | float:
     """Return slow errors and bursts at (n,) times, ENU, m: (n, 3), or 0.0."""
-    real, total = options.real, 0.0
+    real = options.real
+    total: Floats | float = 0.0
     for k, (sigma, tau) in enumerate(real.slow_errors):
         slow = gauss_markov(stream(options.seed, f'real slow {k}'), sigma, tau, t)
         total = total + slow * [1.0, 1.0, UP]
     return total + burst_errors(t, options) if real.bursts else total
 
 
-def burst_errors(t, options):
+def burst_errors(t: Floats, options: SimOptions) -> Floats:
     """Return errors by multipath: bursts to any side, of smooth onset: (n, 3)."""
     real, rng = options.real, stream(options.seed, 'real bursts')
     total, hours = np.zeros((len(t), 3)), t[-1] / 3600
@@ -68,7 +71,7 @@ def burst_errors(t, options):
     return total
 
 
-def true_variance(white, options):
+def true_variance(white: Floats, options: SimOptions) -> Floats:
     """Return the variance of the errors but for bursts, ENU: (3,) m^2. white: of the noise."""
     slow = sum(sigma**2 for sigma, _ in options.real.slow_errors)
     return white + slow * np.array([1.0, 1.0, UP**2])

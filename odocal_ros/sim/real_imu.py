@@ -11,15 +11,16 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.sim.noise import gauss_markov, stream
+from odocal_ros.sim.options import SimOptions
+from odocal_ros.sim.real import Real
 
 RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))   # Hz, width, share: wheel hop, engine
-SHAKEN_AT = 5.0      # m/s at which half of the vibration is there
-WANDER_STEP = 1.0    # s between draws of the in-run instability
 APART_NS = 50_000    # between the stamps of one batch
 
 
-def crooked(w_i, f_i, real):
+def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
     """Return what the triads make of turn rate and specific force: (n, 3) each."""
     gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
     w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
@@ -28,7 +29,7 @@ def crooked(w_i, f_i, real):
     return w_m, f_i + f_i @ accel.T if accel.any() else f_i
 
 
-def drifts(t, speed, options):
+def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
     """Return what warmth, wander and vibration add to gyro and accelerometer: (n, 3) or 0.0."""
     real = options.real
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
@@ -40,7 +41,7 @@ def drifts(t, speed, options):
             total = total + _wander(stream(options.seed, f'real {name} wander'), wander,
                                     real.wander_time, t)
         if shake:
-            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + SHAKEN_AT)
+            level = np.abs(speed)[:, None] / (np.abs(speed)[:, None] + 5.0)    # half at 5 m/s
             total = total + level * vibration(stream(options.seed, f'real {name} vibration'),
                                               shake, options.imu_rate, len(t))
             if name == 'accel' and real.rectification:
@@ -49,14 +50,14 @@ def drifts(t, speed, options):
     return added
 
 
-def _wander(rng, sigma, tau, t):
+def _wander(rng: np.random.Generator, sigma: float, tau: float, t: Floats) -> Floats:
     """Return a walk about 0 from the bias at the first sample on, straight between draws."""
-    knots = np.arange(0.0, t[-1] + 2 * WANDER_STEP, WANDER_STEP)
+    knots = np.arange(0.0, t[-1] + 2.0, 1.0)    # s
     x = gauss_markov(rng, sigma, tau, knots)
     return np.stack([np.interp(t, knots, column) for column in (x - x[0]).T], -1)
 
 
-def vibration(rng, rms: float, rate: float, n: int):
+def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floats:
     """
     Return shaking of a body that goes nowhere, (n, 3): around its resonances, nothing at 0 Hz.
 
@@ -73,10 +74,12 @@ def vibration(rng, rms: float, rate: float, n: int):
     weight = np.full(len(f), 2.0)
     weight[0] = 1.0
     weight[-1] = 1.0 if n % 2 == 0 else 2.0
-    return rms * x / np.sqrt((weight * power).sum() / n)
+    shaking: Floats = rms * x / np.sqrt((weight * power).sum() / n)
+    return shaking
 
 
-def stamped(ns, rng, latency: float, jitter: float, batch: int = 1):
+def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
+            batch: int = 1) -> Ints:
     """
     Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
 

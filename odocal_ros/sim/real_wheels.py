@@ -11,39 +11,43 @@
 
 import numpy as np
 
-AT_SPEED = 36.0      # m/s at which the speed law is stated
+from odocal_ros.data.arrays import Floats
+from odocal_ros.sim.motion import State
+from odocal_ros.sim.real import Real
+from odocal_ros.sim.zoo import G
+
 REST = 0.01          # rolling resistance over load
 AIR = 1e-5           # air drag over load, per (m/s)^2
-G = 9.81
 
 
-def growth(state, real):
+def growth(state: State, real: Real) -> Floats | float:
     """Return by how much the rolling radius exceeds that of a cold, slow tyre: (n,), or 0.0."""
-    grown = 0.0
+    grown: Floats | float = 0.0
     if real.speed_law:
-        grown = grown + real.speed_law * (state.speed / AT_SPEED)**2
+        grown = grown + real.speed_law * (state.speed / 36.0)**2    # as stated
     if real.warming:
         steps = np.diff(state.t, prepend=state.t[:1]) * (np.abs(state.speed) > 1e-9)
         grown = grown - real.warming * np.expm1(-np.cumsum(steps) / real.warming_time)
     return grown
 
 
-def slip_share(state, real):
+def slip_share(state: State, real: Real) -> Floats:
     """Return the metres spun beyond each metre of ground as the tyres pull or brake: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
     force = forward * state.acceleration / G + REST + AIR * state.speed**2     # over load
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
-    return real.tyre_slip * (pull + np.minimum(force, 0.0))
+    share: Floats = real.tyre_slip * (pull + np.minimum(force, 0.0))
+    return share
 
 
-def tyre_slip(state, real):
+def tyre_slip(state: State, real: Real) -> Floats:
     """Return the metres spun beyond the ground by then: (n,)."""
     way = np.diff(state.travel, prepend=state.travel[:1])
     return np.cumsum(slip_share(state, real) * way)
 
 
-def leg_factor(state, real) -> float:
+def leg_factor(state: State, real: Real) -> float:
     """
     Return true metres rolled over those of a wheel that neither grew nor slipped.
 
@@ -58,7 +62,7 @@ def leg_factor(state, real) -> float:
     return float(np.abs(way).sum() / np.abs(counted).sum())
 
 
-def coarse(speed, real):
+def coarse(speed: Floats, real: Real) -> Floats:
     """Return speeds as a bus sends them: in steps, 0 below the dead band."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step

@@ -15,14 +15,7 @@ import math
 import numpy as np
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim.profile import chain, hold, Profile, ramp, turn
-
-BLEND = 1.0        # s in which an acceleration sets in
-TURN_BLEND = 1.5   # s in which a turn rate sets in
-SIDE_LIMIT = 3.0   # m/s^2 to the side in a turn
-TOWN_LIMIT = math.radians(110.0)   # rad off the first heading, so that a town drive gets away
-YARD_MOVE = 40.0   # s, longer than any move in a yard with the stop after it
-TOWN_ENOUGH = 135.0   # s of a town drive that hold a cycle, whatever is drawn
+from odocal_ros.sim.profile import chain, hold, Piece, Profile, ramp, turn
 
 
 @dataclass(frozen=True)
@@ -33,33 +26,33 @@ class Route:
     yaw_rate: Profile
 
 
-def paper(duration: float, rng) -> Route:
+def paper(duration: float, rng: np.random.Generator) -> Route:
     """Return the drive of the paper's section 3: 300 s still, 20 m/s for 520 s, 30 s still."""
     cruise = _rest('paper', duration, 300 + 40 + 40 + 30)
     pieces = (hold(300) + ramp(40, 20, 0.0) + hold(cruise) + ramp(40, -20, 0.0) + hold(30))
     return _route([(pieces, hold(duration))])
 
 
-def straight(duration: float, rng) -> Route:
+def straight(duration: float, rng: np.random.Generator) -> Route:
     """Return one straight run: 60 s still, 25 s up to 12 m/s, cruise, 25 s down, 60 s still."""
     cruise = _rest('straight', duration, 60 + 25 + 25 + 60)
-    pieces = hold(60) + ramp(25, 12, BLEND) + hold(cruise) + ramp(25, -12, BLEND) + hold(60)
+    pieces = hold(60) + ramp(25, 12) + hold(cruise) + ramp(25, -12) + hold(60)
     return _route([(pieces, hold(duration))])
 
 
-def out_and_back(duration: float, rng) -> Route:
+def out_and_back(duration: float, rng: np.random.Generator) -> Route:
     """Return a straight out, a stop of 30 s, a U turn at 4 m/s, the same straight back."""
     around = 5 + 2 + 14 + 2 + 10
     cruise = _rest('out_and_back', duration, 60 + 15 + 15 + 30 + around + 15 + 60) / 2
-    out = hold(60) + ramp(15, 15, BLEND) + hold(cruise) + ramp(15, -15, BLEND) + hold(30)
-    about = ramp(5, 4, BLEND) + hold(2 + 14 + 2) + ramp(10, 11, BLEND)
-    back = hold(cruise) + ramp(15, -15, BLEND) + hold(60)
+    out = hold(60) + ramp(15, 15) + hold(cruise) + ramp(15, -15) + hold(30)
+    about = ramp(5, 4) + hold(2 + 14 + 2) + ramp(10, 11)
+    back = hold(cruise) + ramp(15, -15) + hold(60)
     return _route([(out, hold(60 + 15 + cruise + 15 + 30)),
                    (about, hold(7) + turn(14, math.pi, 2.0) + hold(12)),
                    (back, hold(cruise + 75))])
 
 
-def town(duration: float, rng) -> Route:
+def town(duration: float, rng: np.random.Generator) -> Route:
     """
     Return stop and go with a turn and a lane change between stops, all drawn from ``rng``.
 
@@ -67,7 +60,8 @@ def town(duration: float, rng) -> Route:
     6 s or more, 6 to 12 s down, 4 to 15 s still. Turns keep the heading within 110 deg of the
     first, so that the end lies well away from the start.
     """
-    left = _rest('town', duration, 20 + 15, enough=TOWN_ENOUGH)
+    enough = 135.0    # s that hold a cycle, whatever is drawn
+    left = _rest('town', duration, 20 + 15, enough=enough)
     stretches, off = [(hold(20), hold(20))], 0.0
     while left >= 90.0 or not stretches[1:]:
         speed, rate, off = _town_cycle(rng, off)
@@ -78,12 +72,12 @@ def town(duration: float, rng) -> Route:
         left -= length
     if not stretches[1:]:
         raise BadUsage(f'scenario town: --duration {duration:g} s holds no cycle of stop and go; '
-                       f'give {TOWN_ENOUGH:g} s or more')
+                       f'give {enough:g} s or more')
     stretches.append((hold(15 + left), hold(15 + left)))
     return _route(stretches)
 
 
-def motorway(duration: float, rng) -> Route:
+def motorway(duration: float, rng: np.random.Generator) -> Route:
     """
     Return a ramp, a long way at 25 to 36 m/s with gentle curves and changes of speed, a ramp.
 
@@ -92,34 +86,35 @@ def motorway(duration: float, rng) -> Route:
     """
     up, down = _tenth(rng.uniform(25, 40)), _tenth(rng.uniform(25, 40))
     ramp_top, fast = 12.0, rng.uniform(25, 36)
-    slip_road = ramp(10, ramp_top, BLEND) + hold(12)
+    slip_road = ramp(10, ramp_top) + hold(12)
     bend = turn(10, rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(30, 60)), 2.0)
     left = _rest('motorway', duration, 40 + 22 + up + down + 30)
     stretches = [(hold(40), hold(40)),
-                 (slip_road + ramp(up, fast - ramp_top, BLEND),
+                 (slip_road + ramp(up, fast - ramp_top),
                   hold(11) + bend + hold(1 + up))]
     while left >= 60:
         length = _tenth(rng.uniform(15, 45))
         to = rng.uniform(max(25.0, fast - 6), min(36.0, fast + 6))
         angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(0.2, 1.2)) * (length - 6)
         change = _tenth(rng.uniform(8, 14))
-        stretches.append((ramp(change, to - fast, BLEND) + hold(length - change),
+        stretches.append((ramp(change, to - fast) + hold(length - change),
                           turn(length, angle, 6.0)))
         fast, left = to, round(left - length, 9)
-    stretches.append((hold(left) + ramp(down, -fast, BLEND) + hold(30),
+    stretches.append((hold(left) + ramp(down, -fast) + hold(30),
                       hold(left + down + 30)))
     return _route(stretches)
 
 
-def yard(duration: float, rng) -> Route:
+def yard(duration: float, rng: np.random.Generator) -> Route:
     """
     Return slow work in a yard: moves of 5 to 20 s at 0.6 to 2.2 m/s, turns, a fifth backwards.
 
     In each move one turn of up to 120 deg at 10 to 40 deg/s; then 3 to 9 s still.
     """
-    left = _rest('yard', duration, 20 + 15, least=YARD_MOVE)
+    longest = 40.0    # s, of a move with the stop after it
+    left = _rest('yard', duration, 20 + 15, least=longest)
     stretches = [(hold(20), hold(20))]
-    while left >= YARD_MOVE:
+    while left >= longest:
         top = rng.uniform(0.6, 2.2) * rng.choice([-1.0, 1.0], p=[0.2, 0.8])
         up, down, before, after = (_tenth(rng.uniform(*r)) for r in (
             (2.0, 4.0), (2.0, 4.0), (0, 4), (0, 4)))
@@ -135,29 +130,32 @@ def yard(duration: float, rng) -> Route:
     return _route(stretches)
 
 
-def _town_cycle(rng, off):
+def _town_cycle(rng: np.random.Generator,
+                off: float) -> tuple[list[Piece], list[Piece], float]:
     up, top, down = _tenth(rng.uniform(5, 12)), rng.uniform(9, 14), _tenth(rng.uniform(6, 12))
     before, turning, between = (_tenth(rng.uniform(*r)) for r in ((1, 8), (6, 10), (2, 8)))
     weave, after, stop = (_tenth(rng.uniform(*r)) for r in ((4, 6), (1, 6), (4, 15)))
     angle = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(60, 110))
-    turning = max(turning, _tenth(abs(angle) * top / SIDE_LIMIT + TURN_BLEND))
-    if abs(off + angle) > TOWN_LIMIT:
+    side_limit, blend = 3.0, 1.5    # m/s^2 to the side; s in which a turn rate sets in
+    turning = max(turning, _tenth(abs(angle) * top / side_limit + blend))
+    if abs(off + angle) > math.radians(110.0):    # so that the drive gets away
         angle = -angle
     side = rng.choice([-1.0, 1.0]) * math.radians(rng.uniform(4, 10))
     cruise = before + turning + between + 2 * weave + after
-    speed = ramp(up, top, BLEND) + hold(cruise) + ramp(down, -top, BLEND) + hold(stop)
-    rate = (hold(up + before) + turn(turning, angle, TURN_BLEND) + hold(between)
-            + turn(weave, side, TURN_BLEND) + turn(weave, -side, TURN_BLEND)
+    speed = ramp(up, top) + hold(cruise) + ramp(down, -top) + hold(stop)
+    rate = (hold(up + before) + turn(turning, angle, blend) + hold(between)
+            + turn(weave, side, blend) + turn(weave, -side, blend)
             + hold(after + down + stop))
     return speed, rate, off + angle
 
 
-def _tenth(seconds):
+def _tenth(seconds: float) -> float:
     """Round to 0.1 s: kinks then fall on samples, where a trapezoid rule is exact."""
     return round(float(seconds), 1)
 
 
-def _rest(name, duration, fixed, least=10.0, enough=None):
+def _rest(name: str, duration: float, fixed: float, least: float = 10.0,
+          enough: float | None = None) -> float:
     """Return what is left beside the fixed parts, s; too little is told with what is enough."""
     if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
@@ -165,7 +163,7 @@ def _rest(name, duration, fixed, least=10.0, enough=None):
     return duration - fixed
 
 
-def _route(stretches) -> Route:
+def _route(stretches: list[tuple[list[Piece], list[Piece]]]) -> Route:
     """Join stretches of (acceleration pieces, turn-rate pieces) of equal length."""
     acceleration = chain([p for speed, _ in stretches for p in speed])
     yaw_rate = chain([p for _, rate in stretches for p in rate])

@@ -31,13 +31,11 @@ from odocal_ros.sim.motion import attitude, Hills, Motion, Start
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
-from odocal_ros.sim.routes import ROUTES
+from odocal_ros.sim.routes import Route, ROUTES
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
 SCENARIOS = tuple(DEFAULTS)
-SWAY_STEP = 0.1      # s between draws of the sway
-FINE_STEP = 0.02     # s of the sum that is the true scale of growing tyres
 FORMS = {'counts': OdometerForm('cumulative', 2**64, 'm/pulse'),
          'speed': OdometerForm('rate', 0, '1'),
          'angle': OdometerForm('cumulative', 0, 'm/rad')}
@@ -103,15 +101,16 @@ def motion_of(options: SimOptions) -> Motion:
     return Motion(route.speed, route.yaw_rate, start, Hills(options.slope), **more)
 
 
-def _sway(route, options):
+def _sway(route: Route, options: SimOptions) -> tuple[Profile, Profile]:
     """Return velocities to the side and up: straight lines between draws, less below 1 m/s."""
-    breaks = np.round(np.arange(0.0, route.speed.end + SWAY_STEP, SWAY_STEP), 9)
+    step = 0.1      # s between draws
+    breaks = np.round(np.arange(0.0, route.speed.end + step, step), 9)
     size = options.sway * np.clip(np.abs(route.speed(breaks)), 0.0, 1.0)
     draws = size * stream(options.seed, 'sway').standard_normal((2, len(breaks)))
-    side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / SWAY_STEP], -1)) for x in draws)
+    side, up = (Profile(breaks, np.stack([x[:-1], np.diff(x) / step], -1)) for x in draws)
     if options.real.sideslip:
         v = body.drift(route.speed, route.yaw_rate, options.real.sideslip, breaks)
-        drift = hermite(breaks, v, np.gradient(v, SWAY_STEP))
+        drift = hermite(breaks, v, np.gradient(v, step))
         side = Profile(breaks, drift.powers + np.pad(side.powers, ((0, 0), (0, 2))))
     return side, up
 
@@ -139,13 +138,14 @@ def simulate(options: SimOptions | None = None) -> Drive:
                  else sensors.heading(motion, options, options.heading_sigma)))
 
 
-def _truth(motion, options, imu) -> Truth:
+def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:
     gyro_bias, accel_bias = sensors.turn_on_biases(options)
     _, t = sensors.stamps(motion.duration, options.imu_rate)    # true, however late the stamps
     start = int(np.searchsorted(t, _first_move(motion) + 1e-9, side='right')) - 1
     C_vb = matrix_from_rpy([options.roll, options.pitch, options.yaw])
     x_n = (attitude(motion.at(t[start:start + 1])) @ C_vb)[0, :, 0]
-    factor = real_wheels.leg_factor(motion.at(np.arange(0.0, motion.duration, FINE_STEP)),
+    # a sum in steps of 0.02 s is the true scale of growing tyres
+    factor = real_wheels.leg_factor(motion.at(np.arange(0.0, motion.duration, 0.02)),
                                     options.real)
     scale = options.scale * factor
     yaw, pitch, yaw_housing, pitch_housing = _angles(options)
@@ -158,7 +158,7 @@ def _truth(motion, options, imu) -> Truth:
         gyro_bias=gyro_bias, accel_bias=accel_bias)
 
 
-def _angles(options):
+def _angles(options: SimOptions) -> tuple[float, float, float, float]:
     """Return yaw and pitch by the Imu's own axes, then by its housing, rad."""
     real = options.real
     gyro, accel = real.matrix('gyro_matrix'), real.matrix('accel_matrix')
@@ -169,7 +169,7 @@ def _angles(options):
                       matrix_from_rpy(options.mounting_rpy), gyro, accel)
 
 
-def _first_move(motion) -> float:
+def _first_move(motion: Motion) -> float:
     """Return the time at which the vehicle first moves, s."""
     speed = motion.speed
     moves = np.flatnonzero((speed.powers != 0).any(axis=1))

@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 from odocal_ros.nav.earth import radii
 from odocal_ros.nav.rotations import (
@@ -29,45 +30,45 @@ from odocal_ros.nav.rotations import (
     quat_multiply,
 )
 from odocal_ros.sim import body, real_fixes, real_imu, real_wheels
-from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion
+from odocal_ros.sim.motion import attitude, contact_speed, contact_travel, Motion, State
 from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
-from odocal_ros.sim.options import ORIGIN, SIM_GRADES, SimOptions
+from odocal_ros.sim.options import SIM_GRADES, SimOptions
+from odocal_ros.sim.real import NONE3
 
-# seconds from the first Imu sample, so that no two topics sample together
-ODOMETER_PHASE, FIX_PHASE, HEADING_PHASE = 0.002, 0.003, 0.004
-# seconds from measuring to arriving
-IMU_TRANSPORT, FIX_TRANSPORT, HEADING_TRANSPORT = 0.0005, 0.05, 0.01
+# s from the first Imu sample, so that no two topics sample together
+PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
+TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
 FIRST_COUNT = 10_000     # an encoder that was on before the recording
 WHITE_SHARE = 0.2        # of the correlated sigma: receiver noise on top
 SIGMA_FLOOR = 0.001      # m; no receiver reports zero
-SLIP_TIME = 1.0          # s that a slip event takes
 AT_REST = 1e-9           # m/s
-AT_BREAK = 1e-6          # s
 
 
-def stamps(duration: float, rate: float, phase: float = 0.0):
+def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:
     """Return sample times: whole ns from the start (n,), and the same in s."""
     n = int(np.floor((duration - phase) * rate + 1e-9)) + 1
     ns = np.rint(phase * 1e9 + np.arange(n) * (1e9 / rate)).astype(np.int64)
     return ns, ns * 1e-9
 
 
-def imu_rotation(options: SimOptions):
+def imu_rotation(options: SimOptions) -> Floats:
     """Return C_vi, which takes the Imu's own frame to the vehicle: C_vb C_bi."""
     return (matrix_from_rpy([options.roll, options.pitch, options.yaw])
             @ matrix_from_rpy(options.mounting_rpy))
 
 
-def turn_on_biases(options: SimOptions):
+def turn_on_biases(options: SimOptions) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer bias at the first sample, frame i: (3,) each."""
-    grade, seed, real = SIM_GRADES[options.imu_grade], options.seed, options.real
-    return tuple(
-        sigma * stream(seed, f'{name} bias').standard_normal(3) if own is None else np.array(own)
-        for name, sigma, own in (('gyro', grade.gyro_bias, real.gyro_bias),
-                                 ('accelerometer', grade.accel_bias, real.accel_bias)))
+    grade, real = SIM_GRADES[options.imu_grade], options.real
+    gyro, accel = (
+        sigma * stream(options.seed, f'{name} bias').standard_normal(3) if own is None
+        else np.array(own) for name, sigma, own in (
+            ('gyro', grade.gyro_bias, real.gyro_bias),
+            ('accelerometer', grade.accel_bias, real.accel_bias)))
+    return gyro, accel
 
 
-def imu_errors(options: SimOptions, n: int):
+def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
     """Return gyro and accelerometer errors in frame i, (n, 3) each: noise, bias and its walk."""
     grade, rate, seed = SIM_GRADES[options.imu_grade], options.imu_rate, options.seed
     gyro, accel = turn_on_biases(options)
@@ -94,11 +95,11 @@ def imu(motion: Motion, options: SimOptions) -> ImuSamples:
         q_ni = _orientation(state, options, options.orientation_sigma, 'orientation')
         variance = np.full(len(t), options.orientation_sigma**2)
     stamp = options.start_ns + _imu_stamps(ns, options)
-    return ImuSamples(stamp, stamp + round(IMU_TRANSPORT * 1e9), w_i + gyro + gyro_drift,
+    return ImuSamples(stamp, stamp + round(TRANSPORT['imu'] * 1e9), w_i + gyro + gyro_drift,
                       f_i + accel + accel_drift, q_ni, variance)
 
 
-def _imu_stamps(ns, options):
+def _imu_stamps(ns: Ints, options: SimOptions) -> Ints:
     real = options.real
     if not (real.imu_latency or real.imu_jitter or real.imu_batch > 1):
         return ns
@@ -108,28 +109,28 @@ def _imu_stamps(ns, options):
 
 def heading(motion: Motion, options: SimOptions, sigma: float) -> HeadingSamples:
     """Return an outside heading of b's x axis, as a dual-antenna receiver sends it."""
-    ns, t = stamps(motion.duration, options.heading_rate, HEADING_PHASE)
-    q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=ORIGIN), sigma, 'heading')
+    ns, t = stamps(motion.duration, options.heading_rate, PHASE['heading'])
+    q_nb = _orientation(motion.at(t), replace(options, mounting_rpy=NONE3), sigma, 'heading')
     stamp = options.start_ns + ns
-    return HeadingSamples(stamp, stamp + round(HEADING_TRANSPORT * 1e9), q_nb,
+    return HeadingSamples(stamp, stamp + round(TRANSPORT['heading'] * 1e9), q_nb,
                           np.full(len(t), sigma**2))
 
 
-def _orientation(state, options, sigma, name):
+def _orientation(state: State, options: SimOptions, sigma: float, name: str) -> Floats:
     """Return q_ni with one heading error for the whole drive: a compass' does not average out."""
     q_ni = quat_from_matrix(attitude(state) @ imu_rotation(options))
     error = sigma * stream(options.seed, name).standard_normal()
     return quat_multiply(quat_from_rotvec([0.0, 0.0, error]), q_ni)
 
 
-def wheel_arms(options: SimOptions):
+def wheel_arms(options: SimOptions) -> list[Floats]:
     """Return the contact points: one, or left and right about the middle."""
     middle = np.asarray(options.odometer_lever_arm, dtype=float)
     half = np.array([0.0, options.track_width / 2, 0.0])
     return [middle + half, middle - half] if options.two_wheels else [middle]
 
 
-def wheel_scales(options: SimOptions):
+def wheel_scales(options: SimOptions) -> list[float]:
     """
     Return the true scale of each wheel.
 
@@ -144,7 +145,7 @@ def wheel_scales(options: SimOptions):
 
 def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
     """Return the samples of each wheel; pulses are whole counts, so late by up to one."""
-    ns, t = stamps(motion.duration, options.odometer_rate, ODOMETER_PHASE)
+    ns, t = stamps(motion.duration, options.odometer_rate, PHASE['odometer'])
     state = motion.at(t)
     stamp = options.start_ns + _late(ns, options, 'odometer')
     wheels = zip('LR', wheel_arms(options), wheel_scales(options), strict=False)
@@ -152,16 +153,18 @@ def odometers(motion: Motion, options: SimOptions) -> list[OdometerSamples]:
             for side, arm, scale in wheels]
 
 
-def _late(ns, options, name):
+def _late(ns: Ints, options: SimOptions, name: str) -> Ints:
     """Return stamps that are late by a topic's delay, and by its jitter where it has one."""
     delay, jitter = (getattr(owner, f'{name}_{what}') for owner, what in (
         (options, 'delay'), (options.real, 'jitter')))
     if not jitter:
-        return ns + round(delay * 1e9)
+        late: Ints = ns + round(delay * 1e9)
+        return late
     return real_imu.stamped(ns, stream(options.seed, f'real {name} stamps'), delay, jitter)
 
 
-def _reading(state, options, side, arm, scale):
+def _reading(state: State, options: SimOptions, side: str, arm: Floats,
+             scale: float) -> Floats | Ints:
     real, spun = options.real, slip(state, options, side)
     grown = 1 + real_wheels.growth(state, real)
     if options.odometer == 'speed':
@@ -181,7 +184,7 @@ def _reading(state, options, side, arm, scale):
     return FIRST_COUNT + np.floor(rolled + phase).astype(np.int64)
 
 
-def slip(state, options: SimOptions, side: str = 'L'):
+def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
     """Return the metres a wheel has spun beyond the ground by each time: (n,)."""
     spun = np.zeros(len(state.t))
     moving = np.abs(state.speed) > AT_REST
@@ -189,30 +192,30 @@ def slip(state, options: SimOptions, side: str = 'L'):
     if options.slip_walk:
         walk = stream(options.seed, f'slip walk {side}')
         spun += options.slip_walk * np.cumsum(np.sqrt(steps) * walk.standard_normal(len(spun)))
-    if options.slip_events:
+    if options.slip_events:     # each takes a second
         rng = stream(options.seed, f'slip events {side}')
         spins = rng.poisson(options.slip_events * steps.sum() / 3600)
         for at in rng.choice(state.t[moving], spins):
-            spun += options.slip_size * np.clip((state.t - at) / SLIP_TIME, 0.0, 1.0)
+            spun += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
     if options.start_slip:
         spun += options.start_slip * _way_after_starts(state, moving, options.start_slip_time)
     return spun
 
 
-def _way_after_starts(state, moving, seconds):
+def _way_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
     """Return the metres rolled within so many seconds after each start, summed up: (n,)."""
     starts = np.flatnonzero(moving & ~np.roll(moving, 1)) - 1    # the last sample at rest
     starts = starts[starts >= 0]
     since = np.searchsorted(starts, np.arange(len(moving)), side='right') - 1
     if not len(starts):
         return np.zeros(len(moving))
-    fresh = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + AT_BREAK)
+    fresh = (since >= 0) & (state.t - state.t[starts[since]] <= seconds + 1e-6)    # s of rounding
     return np.cumsum(np.diff(state.travel, prepend=state.travel[:1]) * fresh)
 
 
 def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     """Return GNSS fixes of the antenna, without those in an outage."""
-    ns, t = stamps(motion.duration, options.fix_rate, FIX_PHASE)
+    ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
     latitude, longitude, height = real_fixes.places(motion, t, options)
     error = fix_errors(t, options) + real_fixes.errors(t, options)
@@ -224,7 +227,7 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     n = len(t)
     stamp = options.start_ns + _late(ns, options, 'fix')
     samples = FixSamples(
-        stamp, stamp + round(FIX_TRANSPORT * 1e9), latitude, longitude, height + error[:, 2],
+        stamp, stamp + round(TRANSPORT['fix'] * 1e9), latitude, longitude, height + error[:, 2],
         np.tile(np.diag(variance), (n, 1, 1)), np.full(n, 2),
         np.full(n, 2 if options.fix_noise == 'rtk' else 0))
     seen = np.ones(n, dtype=bool)
@@ -237,15 +240,15 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
         'covariance_type', 'status')))
 
 
-def _axes(options):
+def _axes(options: SimOptions) -> Floats:
     return options.fix_sigma * np.array([1.0, 1.0, 2.0])
 
 
-def _power(options):
+def _power(options: SimOptions) -> float:
     return 1 + WHITE_SHARE**2 if options.fix_noise == 'correlated' else 1.0
 
 
-def fix_errors(t, options: SimOptions):
+def fix_errors(t: Floats, options: SimOptions) -> Floats:
     """Return the errors of fixes at (n,) times, ENU, m: (n, 3), outliers included."""
     draws = stream(options.seed, 'fix white').standard_normal((len(t), 3))
     if options.fix_noise == 'correlated':

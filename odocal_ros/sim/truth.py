@@ -11,14 +11,16 @@
 
 from dataclasses import asdict
 import math
+from typing import Any
 
 from odocal_ros.sim.noise import stream
+from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.scenarios import Drive
 
 STANDS_FOR_PERFECT = 'navigation'   # the best grade there is in the settings
 
 
-def truth_entries(drive: Drive, bag: str) -> dict:
+def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
     """Return the content of truth.yaml: what is to be found, then how it was made."""
     truth, options = drive.truth, drive.options
     return {
@@ -51,8 +53,8 @@ def truth_entries(drive: Drive, bag: str) -> dict:
     }
 
 
-def _topics(drive):
-    odometer: dict | str = '/odometer'
+def _topics(drive: Drive) -> dict[str, Any]:
+    odometer: Any = '/odometer'
     if drive.options.odometer == 'angle':
         odometer = '/joint_states'
     elif drive.options.two_wheels:
@@ -61,20 +63,21 @@ def _topics(drive):
     return topics | ({'heading_topic': '/heading'} if len(drive.heading.stamp_ns) else {})
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """Return tuples as lists: YAML has no tuples."""
     if isinstance(value, dict):
         return {key: _plain(v) for key, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, tuple) else value
 
 
-def _told_arm(options, name):
+def _told_arm(options: SimOptions, name: str) -> list[float]:
     """Return a lever arm as configured: the true one and the error of whoever measured it."""
     true, error = getattr(options, f'{name}_lever_arm'), getattr(options.real, f'{name}_arm_error')
     return [float(x + e) for x, e in zip(true, error, strict=True)]
 
 
-def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
+def settings(drive: Drive,
+             known_heading_sigma: float | None = None) -> dict[str, dict[str, Any]]:
     """
     Return the settings an operator of this vehicle would give, by group.
 
@@ -83,7 +86,7 @@ def settings(drive: Drive, known_heading_sigma: float | None = None) -> dict:
     """
     options = drive.options
     grade = options.real.told_grade or options.imu_grade
-    odometer: dict = {'nominal_scale': float(options.nominal_scale),
+    odometer: dict[str, Any] = {'nominal_scale': float(options.nominal_scale),
                       'lever_arm': _told_arm(options, 'odometer')}
     if options.two_wheels:
         left, right = (('left_wheel_joint', 'right_wheel_joint')

@@ -52,7 +52,7 @@ def leg_of(leg, config):
 def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
     """Return the drive's leg with a GNSS velocity at 5 Hz; errors: (n, 3) draws to m/s."""
     o = drive.options
-    ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.FIX_PHASE)
+    ns, t = sensors.stamps(drive.motion.duration, 5.0, sensors.PHASE['fix'])
     state = drive.motion.at(t)
     swing = np.cross(np.stack([0 * t, 0 * t, state.yaw_rate], -1), o.antenna_lever_arm)
     v = motion.velocity_n(state) + np.einsum('kij,kj->ki', motion.attitude(state), swing)

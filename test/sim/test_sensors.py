@@ -233,7 +233,7 @@ def test_slip_spins_only_while_moving_and_as_much_as_said():
 def test_a_wheel_slips_after_each_start_and_not_elsewhere():
     options = resolved(replace(TOWN, start_slip=0.005, start_slip_time=5.0))
     drive = motion_of(options)
-    _, t = sensors.stamps(drive.duration, 50.0, sensors.ODOMETER_PHASE)
+    _, t = sensors.stamps(drive.duration, 50.0, sensors.PHASE['odometer'])
     state = drive.at(t)
     spun = sensors.slip(state, options)
     moving = state.speed > sensors.AT_REST

@@ -1,0 +1,84 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What drawn vehicles are drawn from: a table by the class of the Imu, sources in docs/zoo.md."""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+
+from odocal_ros.data.arrays import Floats
+
+Pair = tuple[float, float]
+Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, figures of Real
+GRADES = ('consumer', 'industrial', 'tactical')
+# units of data sheets in SI; G: as they round it, far within any distribution here
+G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
+
+# one number for each class: a sigma (normal), a share or a size
+SIZES = {
+    'gyro scale': (0.01, 1.5e-3, 3e-4),                                # relative, sigma
+    'accelerometer scale': (0.01, 2e-3, 3e-4),
+    'cross': (0.4 * DEG, 0.05 * DEG, 3e-4),                            # rad, between axes, sigma
+    'between': (0.5 * DEG, 0.1 * DEG, 1e-3),                           # rad, triads, sigma
+    'g sensitivity': (0.05 * DEG / G, 0.008 * DEG / G, DEG_H / G),     # rad/s per m/s^2, sigma
+    'gyro bias': (DEG, 0.1 * DEG, 5 * DEG_H),                          # rad/s, sigma
+    'accelerometer bias': (25 * MG, 3 * MG, MG),                       # m/s^2, sigma
+    'gyro wander': (200 * DEG_H, 25 * DEG_H, 0.5 * DEG_H),             # rad/s, sigma
+    'accelerometer wander': (MG, 0.2 * MG, 0.05 * MG),                 # m/s^2, sigma
+    'rectified': (0.3e-3 / G, 0.06e-3 / G, 0.01e-3 / G),    # m/s^2 per (m/s^2)^2: mg per g^2
+    'imu jitter': (3e-3, 1e-3, 1e-5),                                  # s, sigma
+    'nominal scale': (0.015, 0.025, 0.005),                            # relative, sigma
+    'rtk': (0.1, 0.4, 0.9),                                            # share of the vehicles
+    'arm error': (0.15, 0.03, 0.01),                                   # m, each axis, sigma
+    'arm at zero': (0.3, 0.1, 0.0),                                    # share of the vehicles
+}
+# several for each class: (median, sigma of the logarithm), a range, or one for each of a list
+ROWS: dict[str, tuple[tuple[float, ...], ...]] = {
+    'gyro slope': ((0.02 * DEG, 0.7), (0.002 * DEG, 0.5), (0.5 * DEG_H, 0.5)),     # rad/s per K
+    'accelerometer slope': ((0.5 * MG, 0.5), (0.05 * MG, 0.5), (0.02 * MG, 0.5)),  # m/s^2 per K
+    'warmth': ((5.0, 25.0), (3.0, 10.0), (3.0, 5.0)),                  # K, range
+    'latency': ((0.010, 0.6), (0.005, 0.5), (0.002, 0.5)),             # s
+    'filter': ((0.002, 0.019), (0.002, 0.010), (0.001, 0.016)),        # s, range
+    'mounting': ((3.0, 3.0, 3.0), (1.5, 1.5, 2.0), (0.5, 0.5, 0.5)),   # deg, roll, pitch, yaw
+    'odometers': ((0.6, 0.3, 0.1), (0.1, 0.2, 0.7), (1.0, 0.0, 0.0)),  # fine, coarse, speeds
+}
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What an effect goes by."""
+
+    grade: str       # consumer, industrial or tactical
+    kind: str        # of drive
+    rtk: bool
+    city: bool       # multipath, outages, worse covariances
+    robot: bool      # small, slow, without springs
+    options: dict[str, Any]    # SimOptions drawn so far
+    alone: bool      # the effect alone is asked for: let it be there
+
+    def size(self, name: str) -> float:
+        """Return the number that a table has for the vehicle's class."""
+        return SIZES[name][GRADES.index(self.grade)]
+
+    def row(self, name: str) -> tuple[float, ...]:
+        """Return the several numbers that a table has for the vehicle's class."""
+        return ROWS[name][GRADES.index(self.grade)]
+
+
+def lognormal(rng: np.random.Generator, median: float, spread: float) -> float:
+    """Return a draw of a log-normal law. spread: sigma of the logarithm."""
+    return float(median * np.exp(spread * rng.standard_normal()))
+
+
+def plain(values: Floats) -> tuple[float, ...]:
+    """Return numbers of any shape as a flat tuple."""
+    return tuple(float(x) for x in np.ravel(values))
