@@ -17,10 +17,6 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 
-ROUNDING_SHARE = 1e-12    # of the largest eigenvalue: what is below is rounding
-# unit of a constant without a prior, ln K and angles: where a leg's equations stop being linear
-STEP_UNIT = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Border:
@@ -88,9 +84,13 @@ class Border:
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
-    def told(self, unit: Floats, least: float) -> 'Border':
-        """Return what is left of it in directions with so much information, in units of (m,)."""
-        size, V = self._directions(unit, least)
+    def told(self, unit: Floats) -> 'Border':
+        """
+        Return what is left of it in directions in which it tells as much as a prior, or more.
+
+        unit : (m,) prior sigmas, in which such information is 1.
+        """
+        size, V = self._directions(unit, 1.0)
         V, W = V / unit[:, None], V * unit[:, None]
         return replace(self, information=V * size @ V.T, pull=V @ (W.T @ self.pull))
 
@@ -107,5 +107,6 @@ class Border:
 
     def _directions(self, unit: Floats, least: float) -> tuple[Floats, Floats]:
         size, V = np.linalg.eigh(self.information * np.multiply.outer(unit, unit))
-        keep = size > max(ROUNDING_SHARE * size[-1], least, 1e-300)
+        rounding = 1e-12 * size[-1]       # of doubles, times what elimination loses
+        keep = size > max(rounding, least, 1e-300)
         return size[keep], V[:, keep]

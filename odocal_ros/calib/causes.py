@@ -9,8 +9,9 @@
 
 """What makes a scale change, in words: for the comparison of results and for legs on their own."""
 
-ANOTHER_SCALE = 0.1    # relative change of a scale beyond what tyres do
-PPM_BELOW = 1e-3       # relative change below which it is said in ppm
+from odocal_ros.settings.levels import TYRE_SPREAD
+
+ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change of a scale beyond what any tyres do
 TYRES = 'tyre pressure, wear, load or another tyre'
 OTHER = 'another vehicle, gear, counter or unit: no tyre changes so much'
 
@@ -22,6 +23,6 @@ def cause_of_change(relative: float) -> str:
 
 def change_in_words(relative: float) -> str:
     """Return a relative change as people read it."""
-    if abs(relative) < PPM_BELOW:
+    if abs(relative) < 1e-3:
         return f'{1e6 * relative:+.0f} ppm'
     return f'{100 * relative:+.3g} %'

@@ -19,13 +19,14 @@ from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS
 
-DIRECTION_CHORD = 10.0           # m, least length of a piece whose direction is compared
-CLEAR_SIGMAS = 20.0    # fix sigmas, the same: a direction is then good to sqrt(2) / 20 rad
-AS_FAR_BACKWARDS = (0.6, 1.6)    # of a piece driven backwards, track beside fixes
-MISMATCH_SIGMAS = 4.0            # sigmas of disagreement that name a mismatch
-BEND_WINDOWS = 3                 # fewest to tell a bend by
-SLOP_OF_WAY = 0.002              # of the distance: slip, suspension, road
+# ratio of two measures of one motion, ways or turns, by track and by fixes. Physical: no error of
+# scale, skid or lean is so large; fixes that only jump go as far as they like
+ONE_MOTION_RATIO = 0.6, 1.6
+# factor on stated fix sigmas below which they stand. Statistical: by the median of 30 fixes chance
+# alone makes 1.25 of 1 once in 30 legs
+NOISIER_WORTH = 1.25
 
 
 def stray(path: Callable[[Floats], Floats], pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
@@ -66,7 +67,7 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
         As stated, m^2.
     drift : float
         What the gyros may have bent the track by, m: taken out of the residuals. What is left may
-        still hold errors of the track, so this errs on the wide side; below a factor of 1.25 the
+        still hold errors of the track, so this errs on the wide side; below NOISIER_WORTH the
         stated sigmas stand.
     marks : sequence of MarkFix
         The two that the track is pinned to: it has their errors, in proportion to the way a third
@@ -76,18 +77,28 @@ def fix_noise_factor(residual: Floats, covariance_n: Floats, drift: float,
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     level2 = np.median((residual[:, :2]**2).sum(axis=1)) / np.log(2)     # mean of an exponential
     rise = residual[:, 2] - np.median(residual[:, 2])
-    up2 = (np.median(np.abs(rise)) / 0.6745)**2                          # median of a normal law
+    up2 = (np.median(np.abs(rise)) / NORMAL_MEDIAN)**2
     seen = np.array([level2, level2, up2]) - drift**2
     level = stated[0] + stated[1] + sum(np.trace(m.covariance_n[:2, :2]) for m in marks) / 3
     asked = np.array([level, level, stated[2]])
     factors = np.sqrt(np.maximum(np.nan_to_num(seen), 0.0) / np.maximum(asked, 1e-12))
-    return np.where(factors > 1.25, factors, 1.0)
+    return np.where(factors > NOISIER_WORTH, factors, 1.0)
+
+
+def _believable(sigma: float, distance: float) -> float:
+    """
+    Return how far a track may stray from fixes, m.
+
+    Four sigmas (once in 16 000 by chance), and 0.2 % of the distance for slip, suspension and road
+    (judgement).
+    """
+    return 4.0 * sigma + 0.002 * distance
 
 
 def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
              distance: float) -> tuple[Reason, ...]:
     """Return TRACK_MISMATCH where the corrected track strays from the fixes beyond its sigmas."""
-    allowed = MISMATCH_SIGMAS * np.hypot(np.sqrt(2) * fix_sigma, drift) + SLOP_OF_WAY * distance
+    allowed = _believable(np.hypot(np.sqrt(2) * fix_sigma, drift), distance)
     if check.rms <= allowed:
         return ()
     return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
@@ -118,10 +129,10 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
     x, y = chord_n[:2] / np.hypot(*chord_n[:2])
     count, _, (along, across) = window_means(t, *(residual[:, :2] @ axis
                                                   for axis in ((x, y), (-y, x))))
-    if len(count) < BEND_WINDOWS:
+    if len(count) < 3:      # two windows have no bend between them
         return ()
     sigma = np.sqrt((along**2).mean() + fix_sigma**2 / np.median(count) + drift**2)
-    allowed, most = MISMATCH_SIGMAS * sigma + SLOP_OF_WAY * distance, np.abs(across).max()
+    allowed, most = _believable(sigma, distance), np.abs(across).max()
     if most <= allowed:
         return ()
     return (Reason(Code.MODEL_MISMATCH, f'the track bends {most:.1f} m away from the fixes, '
@@ -141,7 +152,7 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,
     stretch : (k,) how long the track is beside the fixes.
 
     """
-    need = max(DIRECTION_CHORD, CLEAR_SIGMAS * sigma)
+    need = max(10.0, 20 * sigma)     # m; a direction is then good to sqrt(2) / 20 rad
     a, cuts = 0, []
     for b in range(1, len(fixes_2d)):
         if np.hypot(*(fixes_2d[b] - fixes_2d[a])) >= need:
@@ -172,7 +183,7 @@ def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     windows = np.lib.stride_tricks.sliding_window_view(
         np.pad(level, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
     off = np.hypot(*(level - np.median(windows, axis=-1)).T)
-    return off <= 5 * sigma, sigma
+    return off <= OUTLIER_SIGMAS * sigma, sigma
 
 
 def against_travel(track_direction: Floats, course: Floats, stretch: Floats,
@@ -187,7 +198,7 @@ def against_travel(track_direction: Floats, course: Floats, stretch: Floats,
     off = wrap(track_direction - course)
     middle = np.angle(np.median(np.cos(off)) + 1j * np.median(np.sin(off)))
     back = np.abs(wrap(off - middle)) > np.deg2rad(135)
-    back &= (stretch > AS_FAR_BACKWARDS[0]) & (stretch < AS_FAR_BACKWARDS[1])
+    back &= (stretch > ONE_MOTION_RATIO[0]) & (stretch < ONE_MOTION_RATIO[1])
     if not back.any() or back.mean() > 0.5:
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'

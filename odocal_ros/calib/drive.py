@@ -11,20 +11,13 @@
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
-from odocal_ros.settings.levels import FASTEST
-
-MOVED_SPREAD = 20.0    # m over which fixes must spread to say that the vehicle moved
-STOPPED_SPREAD = 100.0  # m of it while a counter stands: no wheel slides, no fix strays so far
-STOPPED_SHARE = 0.05   # of the way, least: tyres that differ by less are seen
-STRETCHES = 20         # of fixes while a counter stands: motion is in more than two of them
-EDGE_TIME = 0.5        # s of odometer missing at a mark worth saying
-ASTRAY_FIX = 50.0      # m by which any fix may be off
-TURNS_SHARE = 0.1      # of the distance: more of it in turns is worth saying
+from odocal_ros.settings.levels import FASTEST, NORMAL_MEDIAN, TYRE_SPREAD
 
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
@@ -58,30 +51,33 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                          f'{leg.min_distance:g} m are the least'),)
     if len(t) < 2:
         return distance, found
-    top = float(np.abs(_rate_1s(t, s)).max())
+    top = float(np.abs(rate_over_second(t, s)).max())
     if top < leg.min_speed:
         found += (Reason(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
                          f'{leg.min_speed:g} m/s are asked'),)
     C = matrix_from_quat(track.q_nb[inside])
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
-    turning = np.abs(_rate_1s(t, yaw)) > leg.max_yaw_rate
+    turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
     share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-    if share > TURNS_SHARE:
+    if share > 0.1:     # judgement: a manoeuvre at either end is less
         found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
                          f'in turns above {leg.max_yaw_rate:g} rad/s'),)
     return distance, found
 
 
-def _rate_1s(t, x):
-    """Return the slope of x over one second about each t."""
+def rate_over_second(t: Floats, x: Floats) -> Floats:
+    """Return the rate of x by time over one second about each row: (m,), zero of a single row."""
+    if len(t) < 2:
+        return np.zeros(len(t))
     low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
-    return (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-6)
+    return (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
 
 
 def uncovered(travel, t_stop) -> tuple[Reason, ...]:
     """Say where the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
-    edge = max(EDGE_TIME, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
+    # s worth saying, of a topic that comes seldom half as much again as it takes anyway
+    edge = max(0.5, 1.5 * float(np.median(np.diff(travel.t))) if len(travel.t) > 1 else 0.0)
     what = [f'begins {late:.1f} s after the start mark'] * (late > edge)
     what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
     if not what:
@@ -100,13 +96,15 @@ def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
     if len(here) > 4:       # a single outlier is no motion: running median of three
         here = np.median(np.lib.stride_tricks.sliding_window_view(here, 3, axis=0), axis=-1)
         t_here = t_here[1:-1]
-    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(MOVED_SPREAD, 10 * fix_sigma)
+    # m over which a receiver at rest wanders, 10 sigmas: judgement, less is no leg either
+    fixes_move = np.hypot(*np.ptp(here, axis=0)) > max(20.0, 10 * fix_sigma)
     pick = (travel.t >= 0) & (travel.t <= t_stop)
     if pick.sum() < 2:
         return (Reason(Code.NO_ODOMETER, 'no odometer messages between the marks'),)
     wheels_move = np.ptp(travel.s[pick]) > 3 * travel.quantum
     if wheels_move and fixes_move:
-        return _stopped(travel, t_here, here, max(STOPPED_SPREAD, 10 * fix_sigma))
+        # m: physical, no wheel slides and no fix strays so far
+        return _stopped(travel, t_here, here, max(100.0, 10 * fix_sigma))
     if fixes_move:
         return (Reason(Code.ODOMETER_STILL, 'the fixes move, the odometer does not count'),)
     return (Reason(Code.LEG_TOO_SHORT, 'the fixes stay in one place while the odometer counts'
@@ -121,7 +119,8 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
     lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])]), begin[k], end[k])
             for k in np.flatnonzero(end - begin > least / FASTEST)]
     far, since, until = max(lost, default=(0.0, 0.0, 0.0))
-    if far < least or far < STOPPED_SHARE * way_and_chord(t, fixes)[0]:
+    # of the way: a counter that lacks less is within what tyres differ by, and seen elsewhere
+    if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
         return ()
     return (Reason(Code.ODOMETER_STILL, f'the fixes move on by {far:.0f} m from t = {since:.0f} s '
                    f'to {until:.0f} s, the odometer does not count'),)
@@ -133,9 +132,10 @@ def _gone(fixes) -> float:
 
     One jump of them is no motion, nor is noise, nor what strays and comes back.
     """
-    if len(fixes) < STRETCHES:
+    stretches = 20      # so many that motion is in more than two of them
+    if len(fixes) < stretches:
         return 0.0
-    middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, STRETCHES)])
+    middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, stretches)])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
     # a jump is one step, or two where it is within a stretch: they count as the one after them
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
@@ -160,7 +160,8 @@ def within_reach(t_fix, fixes_n):
     """Tell which fixes a vehicle gets to from the one amid them, fix by fix: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
-    if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + ASTRAY_FIX).all():
+    astray = 50.0       # m by which any fix may be off: physical, multipath in a street
+    if len(p) < 2 or (steps <= FASTEST * np.diff(t_fix) + astray).all():
         return np.ones(len(p), bool)
     amid = int(np.argmin(np.hypot(*(p - np.median(p, axis=0)).T)))
     keep, rows = np.zeros(len(p), bool), list(zip(t_fix.tolist(), *p.T.tolist(), strict=True))
@@ -168,7 +169,7 @@ def within_reach(t_fix, fixes_n):
         t, x, y = rows[amid]
         for k in order:
             far = np.hypot(rows[k][1] - x, rows[k][2] - y)
-            if far <= FASTEST * abs(rows[k][0] - t) + ASTRAY_FIX:
+            if far <= FASTEST * abs(rows[k][0] - t) + astray:
                 keep[k] = True
                 t, x, y = rows[k]
     return keep
@@ -179,7 +180,7 @@ def white_noise(fixes_n) -> float:
     if len(fixes_n) < 5:
         return 2.5
     bend = np.diff(fixes_n[:, :2], n=2, axis=0)
-    return float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6)))
+    return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 
 def knots_of(fixes_n, least) -> list[int]:

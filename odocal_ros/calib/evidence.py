@@ -14,15 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.sections import Sections, sections
 from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import matrix_from_quat
 
-KEPT_ROWS = 5000       # of each kind kept
-MOTION_WINDOW = 0.5    # s to either side, over which speed, turn rate and direction are taken
-CREEP_WAY = 0.2        # m in the window, below which the direction of travel is that of before
+KEPT_ROWS = 5000       # of each kind kept in a result: more than a screen has columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +93,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
     before, after = (_pinned(path, pin) for path in paths)
     after_n, off_n = after(t), after(t_fix) - fix_n
     yaw = np.unwrap(by_row(_yaw, track.q_nb[inside]))
-    sign = np.where(_over_window(t, track.s[inside]) < 0, -1.0, 1.0)
+    sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
     forward = _forward_at(t_fix, t, after_n, sign)
     fix_distance = np.interp(t_fix, t, distance)
@@ -103,8 +102,8 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
 
     m, k, x = (_few(n) for n in (len(t), len(t_fix), len(because)))
     return Evidence(
-        t=t[m], distance=distance[m], speed=(_over_window(t, distance) * sign)[m],
-        yaw_rate=_over_window(t, yaw)[m], track_n=after_n[m], track_before_n=before(t[m]),
+        t=t[m], distance=distance[m], speed=(rate_over_second(t, distance) * sign)[m],
+        yaw_rate=rate_over_second(t, yaw)[m], track_n=after_n[m], track_before_n=before(t[m]),
         t_fix=t_fix[k], fix_distance=fix_distance[k], fix_n=fix_n[k], fix_sigma=sigma[k],
         fix_status=status[k], residual=_split(off_n, forward)[k],
         residual_before=_split(before(t_fix) - fix_n, forward)[k],
@@ -159,20 +158,13 @@ def _sent(leg, inputs, kept, span, config):
     return fix.status[rows], t[out], because
 
 
-def _over_window(t, x):
-    """Return the rate of x by time, over a second about each row: (m,)."""
-    if len(t) < 2:
-        return np.zeros(len(t))
-    a, b = np.clip([t - MOTION_WINDOW, t + MOTION_WINDOW], t[0], t[-1])
-    return (np.interp(b, t, x) - np.interp(a, t, x)) / np.maximum(b - a, 1e-9)
-
-
 def _forward_at(t_new, t, track_n, sign):
     """Return the forward direction as complex numbers; at rest that of before: (k,)."""
     if not len(t):
         return np.ones(len(t_new), complex)
-    z = (_over_window(t, track_n[:, 0]) + 1j * _over_window(t, track_n[:, 1])) * sign
-    moving = np.flatnonzero(np.abs(z) * 2 * MOTION_WINDOW > CREEP_WAY)
+    z = (rate_over_second(t, track_n[:, 0]) + 1j * rate_over_second(t, track_n[:, 1])) * sign
+    # below 0.2 m/s what noise a track has (rounding to counts) gives it any direction
+    moving = np.flatnonzero(np.abs(z) > 0.2)
     if not len(moving):
         return np.ones(len(t_new), complex)
     before = np.searchsorted(moving, np.arange(len(t)), side='right') - 1

@@ -24,13 +24,9 @@ from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
 
 Floats = NDArray[np.float64]
-Z95 = 1.6449            # one-sided 95 % point of the normal law
-DEVIATES = 2.7          # deviates, one in 300: some 15 constants are looked at
-MOST_SPREADS = 3        # constants that may differ between legs before all sigmas are widened
-ANY_SPREAD = 1e3        # times what values of legs differ by: more than their sigma can be
-SPREAD_FREEDOM = 0.5    # of the freedom that a constant of each leg's own takes up
-BISECTIONS = 40         # of a bisection
-BENDING_PASSES = 3      # passes in which legs are taken to where they were not linearised
+# statistical, deviates of a chi-square from which legs disagree: once in 20 sets of sound legs by
+# chance; in one constant once in 300, since some 15 are looked at: again one set in 20
+Z95, DISPUTED_DEVIATES = 1.6449, 2.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +103,14 @@ def deviate(chi2, freedom):
 def _disputed(legs) -> dict[str, float]:
     """Return the constants in which legs differ for certain, and by what sigma."""
     spread: dict[str, float] = {}
-    while len(spread) < MOST_SPREADS:
+    while len(spread) < 3:      # where legs differ in more, all their sigmas are in doubt
         now, freedom = legs.disagreement(spread)
         found = []
         for name in (n for n in legs.names if n not in spread):
             left, rest = legs.disagreement(spread | {name: np.inf})
-            if freedom - rest > SPREAD_FREEDOM:
+            if freedom - rest > 0.5:    # less is no constant that legs tell
                 found.append((deviate(now - left, freedom - rest), name, left + freedom - rest))
-        if not found or max(found)[0] < DEVIATES:
+        if not found or max(found)[0] < DISPUTED_DEVIATES:
             break
         _, name, target = max(found)
         spread = spread | {name: _spread(legs, spread, name, target)}
@@ -130,10 +126,10 @@ def _spread(legs, spread, name, target) -> float:
     does not differ by 4 %, and legs told of it without that say what their noise wants.
     """
     i = legs.names.index(name)
-    high = ANY_SPREAD * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
+    high = 1e3 * max(np.ptp([b.value[i] for b in legs.borders]), legs.unit[i])
     high = min(high, float(legs.used[i]))
     low = high * 1e-12
-    for _ in range(BISECTIONS):
+    for _ in range(40):     # halvings of the logarithm: to 3e-11 of it
         middle = float(np.sqrt(low * high))
         chi2, _ = legs.disagreement(spread | {name: middle})
         low, high = (middle, high) if chi2 > target else (low, middle)
@@ -144,7 +140,7 @@ def _bend(legs, curved):
     """Give each leg an error of its own for the way from where it was linearised; (J,) of it."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))
-    for _ in range(BENDING_PASSES if curved else 0):
+    for _ in range(3 if curved else 0):     # legs of less weight move the others less
         x, _ = legs.solve()
         way = np.array([x[legs.place(j)][at] - b.value[at] for j, b in enumerate(first)])
         bent = (way**2).sum(axis=1) / 2

@@ -25,13 +25,12 @@ MISTAKEN = {
               np.pi / 30: 'rates in rpm'},
     'm/pulse': {0.25: 'a counter of the four edges of a pulse',
                 0.5: 'a counter of both edges of a pulse'}}
-LIKE_RATIO = 0.04    # of such a ratio
 
 
 def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return which unit a scale so far from its nominal looks like, and what to set then."""
     for known, what in MISTAKEN.get(unit, {}).items():
-        if abs(ratio / known - 1) < LIKE_RATIO:
+        if abs(ratio / known - 1) < 0.04:      # what tyres add: the ratios lie farther apart
             return f', as {what} would be', (
                 f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or mend the sender; '
                 'else check the odometer: odometer.max_scale_deviation is the limit.')

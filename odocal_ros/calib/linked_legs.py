@@ -13,12 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.border import Border, STEP_UNIT
+from odocal_ros.calib.border import Border
 
-LEAST_STEP = 1e-7        # of ln K between legs: what no vehicle keeps, and no equations hold
-NO_NEWS_SHARE = 1e-6     # share of a leg's information on a constant that others do not foresee
-TELLING_RATIO = 1.0      # information by that believed: what a leg tells of a constant
-ROUNDING_VALUE = 1e-8    # singular value, of the largest, that is rounding
+# relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
+# are linear as far, the square of it being 0.1 %
+STEP_UNIT = 0.05
 
 
 class LinkedLegs:
@@ -38,7 +37,8 @@ class LinkedLegs:
             for which in ('sigma', 'used', 'usual'))
         self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
-        self.steps = np.maximum(steps, LEAST_STEP)
+        # 0.1 ppm of ln K: no vehicle keeps it, and rows of less would swamp all others by rounding
+        self.steps = np.maximum(steps, 1e-7)
 
     def take(self, borders):
         """Take legs in place of those there, on the names of all."""
@@ -47,7 +47,7 @@ class LinkedLegs:
     def told(self):
         """Return of each leg what it tells at least as well as it was believed."""
         if self._told is None:      # asked for each constant anew
-            self._told = [b.told(self.unit, TELLING_RATIO) for b in self.borders]
+            self._told = [b.told(self.unit) for b in self.borders]
         return self._told
 
     def columns(self, j):
@@ -140,7 +140,7 @@ class LinkedLegs:
         # directions that are never the same, would have one set of them, however far apart
         prior, centre = self._beliefs(A.shape[1])
         U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
-        of_legs, U = slice(len(A)), U[:, size > ROUNDING_VALUE * size[0]]
+        of_legs, U = slice(len(A)), U[:, size > 1e-8 * size[0]]      # below is rounding
         rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
         return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
 
@@ -158,7 +158,8 @@ class LinkedLegs:
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
             variance = np.diag(D - D @ C[np.ix_(where, where)] @ D)
-            news = variance > np.maximum(NO_NEWS_SHARE * np.diag(D), 1e-300)
+            # of a constant of which the others foresee all, to a millionth, a leg tells no news
+            news = variance > np.maximum(1e-6 * np.diag(D), 1e-300)
             out[j, news] = pull[news] / np.sqrt(variance[news])
         return out
 

@@ -22,10 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.settings.levels import OUTLIER_SIGMAS
+from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS, RAYLEIGH_MEDIAN
 
-MARK_WINDOW = 1.0         # s, least half-window of fixes about a mark in motion
-FEWEST_CORRELATED = 20    # fixes below which nothing is judged about their correlation
+# s, least half-window of fixes about a mark in motion. Judgement: two seconds of fixes, over which
+# dead reckoning errs by less than any of them
+MARK_WINDOW = 1.0
+# fixes below which their scatter says nothing of how their errors go on. Statistical: a variance
+# by 20 is good to 30 %
+FEWEST_SCATTERED = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +95,8 @@ def _near_middle(position_n, covariance_n):
     off = np.abs(position_n - np.median(position_n, axis=0))
     level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
-    # medians: 1.1774 sigma of a Rayleigh law, 0.6745 of a normal one
-    spread = max(np.median(level) / 1.1774, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
-    spread_up = max(np.median(up) / 0.6745, 0.2 * np.sqrt(stated[2]))
+    spread = max(np.median(level) / RAYLEIGH_MEDIAN, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
+    spread_up = max(np.median(up) / NORMAL_MEDIAN, 0.2 * np.sqrt(stated[2]))
     return (level <= OUTLIER_SIGMAS * spread) & (up <= OUTLIER_SIGMAS * spread_up)
 
 
@@ -105,7 +108,7 @@ def _share(t, residual, whole, weight, correlation_time):
         return white
     if not np.isnan(correlation_time):
         return _left(t, weight, correlation_time)
-    if n < FEWEST_CORRELATED:
+    if n < FEWEST_SCATTERED:
         return 1.0
     sigma = np.sqrt(np.diag(whole))
     z = residual[:, :2] / sigma[:2]

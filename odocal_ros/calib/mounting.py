@@ -23,10 +23,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import FEWEST_BINS_FACING, pushes
 from odocal_ros.screening.screen import Inputs
 
-# of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but the other way round
+# rad of yaw from nominal: a nominal rotation or heading is wrong; no mounting, but the other way
+# round. Judgement: nobody mounts an Imu 20 deg askew unawares, and quarter turns are set
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
-AXIS_SIGMA = np.deg2rad(15.0)    # 1 sigma of the forward axis, to name it
-MEANT_AXIS = np.deg2rad(30.0)    # an axis this near to another is meant to be it
+# rad within which an axis is meant to be another: a third of a quarter turn, to its sigma of half
+# of that an axis is named at all
+MEANT_AXIS = np.deg2rad(30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,7 @@ def _forward(t: Floats, w_i: Floats, f_i: Floats, up_i: Floats, travel: Travel,
     rest = F - gain * A
     # half the residual lies across the axis; neighbours share noise, so count every third bin
     sigma = float(np.sqrt(np.vdot(rest, rest).real / (2 * len(A) / 3) / power) / abs(gain))
-    if sigma > AXIS_SIGMA:
+    if sigma > MEANT_AXIS / 2:
         return None, sigma
     theta = np.angle(gain)
     return np.cos(theta) * found.e1 + np.sin(theta) * found.e2, sigma

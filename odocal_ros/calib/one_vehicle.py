@@ -17,10 +17,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.levels import FAULT_SIGMAS
-
-MOST_SCALE = 0.05    # tyres: wear 2 %, pressure and load 1 %, another make 3 %
-MOST_YAW = 0.087     # rad (5 deg): no mounting gives way so far
+from odocal_ros.settings.levels import FAULT_SIGMAS, TYRE_SPREAD
 
 
 def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]:
@@ -39,14 +36,15 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         return (Reason(Code.LEGS_UNLIKE, f'the odometers are of different kinds, their scales '
                        f'have no mean: {which}'),)
     far = _farthest(scales)
-    if far and (more := far[1].value / far[0].value - 1) > MOST_SCALE:
+    if far and (more := far[1].value / far[0].value - 1) > TYRE_SPREAD:
         low, high = far
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
     yaws = _told('yaw_mounting_angle', estimates)
     # of an Imu that faces backwards they lie about +-180 deg
     far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
-    if far and (more := far[1].value - far[0].value) > MOST_YAW:
+    # rad, 5 deg: no mounting gives way so far
+    if far and (more := far[1].value - far[0].value) > 0.087:
         low, high = far
         found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
                      f'that of leg {low.leg}')

@@ -18,11 +18,8 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m
-PIECE_STARTS = 10                       # of pieces, on the length of one
-PIECE_TOO_LONG = 1.2                    # times the length: fixes are missing in there
-FEWEST_PIECES = 3.0                     # pieces end to end, for a word on them
-WORSE_TIMES = 1.1                       # times as far, below which nobody would mind
+PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, as KITTI's benchmark has them, for a road
+PIECE_STARTS = 10                       # of pieces, on the length of one, as there
 
 
 def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:
@@ -63,7 +60,7 @@ def _ends(way: Floats, length: float) -> tuple[Ints, Ints]:
     b = np.searchsorted(way, way[a] + length)
     whole = b < len(way)
     a, b = a[whole], b[whole]
-    near = way[b] - way[a] <= PIECE_TOO_LONG * length
+    near = way[b] - way[a] <= 1.2 * length      # farther apart, fixes are missing in there
     return a[near], b[near]
 
 
@@ -75,7 +72,8 @@ def check_worse(way: Floats, before: Floats, after: Floats, configured: bool) ->
     """
     for length, pieces, (was, now) in _lengths(way, before, after):
         more = now - was
-        if pieces < FEWEST_PIECES or now.mean() < WORSE_TIMES**2 * was.mean() \
+        # of fewer than three pieces end to end no scatter is known, a tenth more nobody would mind
+        if pieces < 3 or now.mean() < 1.1**2 * was.mean() \
                 or more.mean() < REMARK_SIGMAS * more.std() / np.sqrt(pieces):
             continue
         return [Reason(Code.CHECK_WORSE, f'in {length:g} m the track as calibrated strays '

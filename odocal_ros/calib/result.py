@@ -21,7 +21,6 @@ from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.evidence import Evidence
 from odocal_ros.reasons import GRAVITY, Reason, Verdict, verdict_of
 
-TRACK_ROWS = 5000    # of a track kept in a result
 # what stands in a result beside its estimates (calibration.json)
 BESIDE = frozenset({'imu_rotation', 'scale_by_speed', 'scale_by_time',
                     'scale_ratio_next_drive_sigma', 'yaw_mounting_angle_housing_sigma',

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.linked_legs import LinkedLegs
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-FREE = 1.0          # of ln K: what a change may be
+FREE_STEP = 1.0     # 1 sigma of ln K where it changes for good: any tyre, gear or counter
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def scale_steps(borders, steps, drifting: str, angles=()) -> list[ScaleStep]:
         sigmas = float(legs.deviations()[j, legs.drifting])
         if abs(sigmas) <= REMARK_SIGMAS:
             continue
-        steps[j - 1] = FREE
+        steps[j - 1] = FREE_STEP
         legs = LinkedLegs(borders[:j + 1], drifting, steps[:j], angles)
         x, _ = legs.solve()
         before, now = (x[legs.place(k)[legs.drifting]] for k in (j - 1, j))

@@ -17,16 +17,10 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 
-SECTIONS = 10              # equal parts of the way
-FEWEST_OF_SECTION = 8      # fixes of a section
-# means of fixes that a section is made of: noise from one to the next is gone
-SECTION_BLOCKS = 24
-SHORTEST_SECTION = 10.0    # m, of a section
-LEAST_OF_STATED = 0.01     # of a stated sigma: fixes are not better than that, one to the next
-BLOCK_LAGS = (1, 3)        # blocks, at which the correlation is looked at
-LONG_LAG = 16         # blocks from which the longer lag tells
+BLOCK_LAGS = (1, 3)        # blocks, at which the correlation of what a fit leaves is looked at
 Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
-MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])    # block to block
+# correlation of errors from block to block: a grid, finer where a stretch's sigma grows faster
+MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +59,8 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
 
     """
     whole = way[-1] - way[0] if len(way) else 0.0
-    count = int(min(SECTIONS, len(way) // FEWEST_OF_SECTION, whole // SHORTEST_SECTION))
+    fewest = 8      # fixes of a section, twice the parameters of its fit
+    count = int(min(10, len(way) // fewest, whole // 10.0))      # tenths, of 10 m at least
     if count < 1:
         return Sections(*(np.empty(0) for _ in range(4)))
     edges = way[0] + whole * np.linspace(0.0, 1.0, count + 1)
@@ -75,8 +70,9 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     fits = {}
     for i in range(count):
         rows = np.flatnonzero(part == i)
-        if len(rows) >= FEWEST_OF_SECTION and np.ptp(way[rows]) > 0:
-            blocks = np.array_split(rows, min(len(rows), SECTION_BLOCKS))
+        if len(rows) >= fewest and np.ptp(way[rows]) > 0:
+            # means of fixes: in 24 of them noise from one to the next is gone
+            blocks = np.array_split(rows, min(len(rows), 24))
             fits[i] = _stretched(*(np.array([x[b].mean() for b in blocks]) for x in (z, w)))
     for i, found in zip(fits, _errors(list(fits.values()), float(np.median(sigma))),
                         strict=True):
@@ -102,12 +98,13 @@ def _errors(fits: list[Stretch], stated: float) -> list[float]:
     power = np.array([np.vdot(left, left).real / len(left) for _, left, _ in fits]) / 2
     whole = sum(np.vdot(left, left).real for _, left, _ in fits)
     at = np.arange(len(MEMORIES))
-    # white noise on top hides a memory at the next block, not further on: the longer one counts
+    # white noise on top hides a memory at the next block, not further on: the longer one counts,
+    # where there are enough blocks for it to tell
     memory = max(np.interp(sum(np.vdot(left[:-lag], left[lag:]).real for _, left, _ in fits)
                            / whole if whole else 0.0, row, at)
-                 for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= LONG_LAG)
+                 for lag, row in zip(BLOCK_LAGS, alike, strict=True) if lag == 1 or n >= 16)
     level = np.maximum(power, np.median(power)) / np.interp(memory, at, left_over)
-    level = np.maximum(level, (LEAST_OF_STATED * stated)**2)
+    level = np.maximum(level, (0.01 * stated)**2)    # no fix is better than that, one to the next
     return [float(np.sqrt(v * np.interp(memory, at, widening) / spread))
             for v, (_, _, spread) in zip(level, fits, strict=True)]
 

@@ -26,13 +26,15 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import NORMAL_MEDIAN
 
-SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill
-SPIN_GRID = 0.2      # s, grid
-PIN_STEPS = 2        # steps each side that the speed at an end is taken over
-LEAST_SPIN = 0.45    # m: 0.1 m/s^2 of tilt wandering within a window makes a third of it
-SPIN_TURN = 0.1      # rad in a window: more is a turn
-PIN_COUNTS = 8.0     # odometer counts: what pins by counts may make of a window
+SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
+SPIN_GRID = 0.2      # s between rows: a spin lasts longer
+PIN_STEPS = 2        # rows each side that the speed at an end is taken over
+SPIN_TURN = 0.1      # rad in a window: in more of a turn the level's error is another axis'
+# odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
+# window, its own ends 1 more; the rest is margin
+PIN_COUNTS = 8.0
 
 
 def rounding(travel) -> float:
@@ -77,8 +79,9 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
     excess[np.abs(yaw[span:] - yaw[:-span]) > SPIN_TURN] = 0.0
     # what the drive as a whole does (rough road, soft suspension) is no event
-    usual = np.median(np.abs(excess[excess != 0.0])) / 0.6745 if excess.any() else 0.0
-    limit = max(LEAST_SPIN, PIN_COUNTS * quantum * K, 6 * usual)
+    usual = np.median(np.abs(excess[excess != 0.0])) / NORMAL_MEDIAN if excess.any() else 0.0
+    least = 0.45        # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m
+    limit = max(least, PIN_COUNTS * quantum * K, 6 * usual)
     return _events(grid[PIN_STEPS:-span - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 

@@ -14,12 +14,9 @@ import numpy as np
 from odocal_ros.calib.marks import MarkFix, standing_at
 from odocal_ros.data.arrays import Floats, Ints
 
-CHI2_MEDIAN = 0.4549                               # of one squared normal
-UNCLEAR_RATIO = 2.0    # of a variance: nearer, neither of two estimates is the better
-TIME_CONSTANTS = np.geomspace(2.0, 2000.0, 100)    # s, time constants that SLOW_WINDOW can tell
-SLOW_WINDOW = 20.0                                 # s, window in which white errors average down
-ROWS_IN_WINDOW = 5                                 # fewest, for a mean
-WINDOWS_FOR_VARIANCE = 5                           # fewest, the same
+# s, window in which white errors average down and slow ones do not. Physical: those of receivers
+# stay for a minute and more
+SLOW_WINDOW = 20.0
 
 
 def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]:
@@ -31,7 +28,7 @@ def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]
     """
     window = ((t - t[0]) / SLOW_WINDOW).astype(int)
     count = np.bincount(window)
-    full = np.flatnonzero(count >= max(ROWS_IN_WINDOW, 0.5 * count.max()))
+    full = np.flatnonzero(count >= max(5, 0.5 * count.max()))
     return count[full], full, [np.bincount(window, x)[full] / count[full] for x in columns]
 
 
@@ -55,12 +52,12 @@ def slow_variance(t, along, way, variance, drift):
 
     """
     count, number, (means, places) = window_means(t, along, way)
-    if len(count) < WINDOWS_FOR_VARIANCE:
+    if len(count) < 5:      # with a mean and a slope taken out, a variance by five is good to 80 %
         return 0.0, np.inf
     means, places = means - means.mean(), places - places.mean()
     means = means - places * (places @ means) / max(places @ places, 1e-9)
     free = len(count) - 2
-    jump = np.median(np.diff(along)**2) / CHI2_MEDIAN / 2
+    jump = np.median(np.diff(along)**2) / 0.4549 / 2      # median of a squared normal deviate
     white = min(jump, np.median(variance)) / np.median(count)
     seen = (means**2).sum() / free - drift**2
     # within three sigmas of the mean square of so many windows, white errors alone may do it
@@ -73,9 +70,10 @@ def slow_variance(t, along, way, variance, drift):
 
 def _lasting(alike):
     """Return the time constant, s, that makes neighbouring means of SLOW_WINDOW so alike."""
-    x = SLOW_WINDOW / TIME_CONSTANTS
+    times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can tell
+    x = SLOW_WINDOW / times
     correlation = (1 - np.exp(-x))**2 / (2 * (x - 1 + np.exp(-x)))
-    return float(np.interp(alike, correlation, TIME_CONSTANTS))
+    return float(np.interp(alike, correlation, times))
 
 
 def slow_share(seconds, tau):
@@ -109,8 +107,9 @@ def no_better(mark: MarkFix, slow, tau, span, stated, up_ratio) -> MarkFix:
     begin, end = span or (mark.t, mark.t)
     floor = slow * slow_share(end - begin, tau)
     own = (mark.covariance_n[0, 0] + mark.covariance_n[1, 1]) / 2
-    took_for_white = own * mark.used < UNCLEAR_RATIO * stated
-    if took_for_white or floor > UNCLEAR_RATIO * own:
+    unclear = 2.0       # ratio of variances: nearer, neither of two estimates is the better
+    took_for_white = own * mark.used < unclear * stated
+    if took_for_white or floor > unclear * own:
         return mark.at_least(floor, up_ratio)
     return mark
 

@@ -11,19 +11,15 @@
 
 import numpy as np
 
+from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.integral import twice_integral_at
 from odocal_ros.reasons import Code, Reason
 
-TURNS_COMPARED = 1.0    # rad, root of the sum of squares of turns, to compare gyro and course
-COURSE_APART = 5.0, 10.0      # m, and fix sigmas: between fixes that give a course
-SAME_TURNS = 0.9              # correlation from which they are the same turns
-SLOPE_SIGMAS = 8.0            # sigmas of the slope: of a few courses chance makes some alike
-MOST_TURN_BETWEEN = 2.0       # rad from one course to the next
-RIGHT_RATIO = 0.6, 1.6        # of the ratio: no scale error, skid or lean is so large
-NO_TURN_SHARE = 0.01          # of the turns of the fixes: no unit makes that of a turn
-DEGREES_RATIO = 40.0, 80.0    # the same, of deg/s
+# statistical: correlation of turns by gyro and by course from which they are the same turns, and
+# sigmas of the slope, since of a few courses chance makes some alike
+SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
 
 
 def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
@@ -40,7 +36,7 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
         s, m, and m horizontally.
 
     """
-    knots = knots_of(fixes_n, max(COURSE_APART[0], COURSE_APART[1] * sigma))
+    knots = knots_of(fixes_n, max(5.0, 10 * sigma))     # m: a course is then good to 0.14 rad
     if len(knots) < 5:
         return None
     step = np.diff(fixes_n[knots, :2], axis=0)
@@ -50,11 +46,11 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     ends = t_fix[knots]
     gyro = np.diff(twice_integral_at(ends, t_imu, w_up)) / np.diff(ends)
     # where the course turns about at once a vehicle may have backed up: by how much is left open
-    about = np.flatnonzero(np.abs(np.diff(course)) > MOST_TURN_BETWEEN)
+    about = np.flatnonzero(np.abs(np.diff(course)) > 2.0)
     drift = np.column_stack([np.ones_like(t), t, np.arange(len(t))[:, None] > about])
     course, gyro = (x - drift @ np.linalg.lstsq(drift, x, rcond=None)[0] for x in (course, gyro))
     power = float(gyro @ gyro)
-    if course @ course < TURNS_COMPARED**2 or power == 0:
+    if course @ course < 1.0 or power == 0:     # rad^2: turns of 1 rad in all, by their rms
         return None
     slope = float(course @ gyro / power)      # of the noisy one on the clean one: no bias
     alike = slope**2 * power / (course @ course)
@@ -64,13 +60,13 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
 
 def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
     """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, tells it."""
-    if ratio is None or RIGHT_RATIO[0] < ratio < RIGHT_RATIO[1]:
+    if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()
-    if ratio < -RIGHT_RATIO[0]:
+    if ratio < -ONE_MOTION_RATIO[0]:
         return (Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right (ratio '
                        f'{ratio:.2f} instead of 1)'),)
-    degrees = DEGREES_RATIO[0] < ratio < DEGREES_RATIO[1]
-    if abs(ratio) < NO_TURN_SHARE:
+    degrees = 40.0 < ratio < 80.0       # 180 / pi, within what scale errors and skid make of it
+    if abs(ratio) < 0.01:       # no unit makes that of a turn: revolutions make 0.16
         return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.2g} times as far as the course '
                        'of the fixes, next to nothing', 'Mend the sender, or set '
                        'imu.mounting_rpy: the axis that turns may be another.'),)

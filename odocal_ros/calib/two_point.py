@@ -41,10 +41,9 @@ from odocal_ros.nav.projection import geodesic_chord, plane_chord
 from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
-CHORD_OF_PATH = 0.2              # of the path: under it, the chord is no measure of the path
-PITCH_PRIOR = 0.05               # rad, what is believed of the pitch where heights say nothing
+# rad, prior sigma of the pitch where heights say nothing: physical, what holders and loads do
+PITCH_PRIOR = 0.05
 PITCH_LIMIT = 0.26    # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
-PLANE_LIMIT = 3e-5    # relative: a plane about the leg keeps ratios of chords far better
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
     # the length of the track's own chord, whatever the yaw: M is a turn times it
     reckoned = np.sqrt(abs(np.linalg.det(chord.M[:2, :2]))) * scale_guess
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
-        if chord_length <= CHORD_OF_PATH * path:
+        if chord_length <= path / 5:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
                            f'{chord_length:.1f} m, under a fifth of the way driven, about '
                            f'{path:.0f} m'),)
@@ -285,7 +284,8 @@ def _cross_check(chord, f, nominal_scale, config):
 
 def _planes_agree(check, K, sigma_relative):
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
-    if worst > PLANE_LIMIT + 0.2 * sigma_relative:
+    # relative: a plane about the leg keeps ratios of chords far better
+    if worst > 3e-5 + 0.2 * sigma_relative:
         return (Reason(Code.PLANES_DISAGREE, f'the scale by plane or geodesic differs by '
                        f'{worst * 1e6:.0f} ppm from that in space'),)
     return ()

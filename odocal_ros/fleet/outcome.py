@@ -19,7 +19,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from odocal_ros.calib.one_vehicle import MOST_SCALE
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bag_task import BagJob
 from odocal_ros.fleet.bags import at_hand
@@ -34,6 +33,7 @@ from odocal_ros.fleet.tables import VEHICLES
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import write_text
 from odocal_ros.reasons import Verdict
+from odocal_ros.settings.levels import TYRE_SPREAD
 
 TABLE, PAGE = 'fleet.csv', 'fleet.html'
 
@@ -130,7 +130,7 @@ def remarks(row: dict) -> list[str]:
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
                 f'{57.29577951308232 * change["size"]:+.2f} deg')
-        odometer = change['value'] == 'scale_factor' and abs(change['size']) > MOST_SCALE
+        odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                    f'{change["after"][:10]} and {change["by"][:10]}'
                    + ', which no tyres do: look at the odometer' * odometer)

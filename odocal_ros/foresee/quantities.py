@@ -14,7 +14,7 @@ import math
 
 from odocal_ros.calib.choice import ABOUT
 from odocal_ros.calib.result import Calibration, Estimate
-from odocal_ros.calib.wheels.observable import WIDTH_SHARE
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 from odocal_ros.foresee.forecast import Forecast
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
@@ -34,7 +34,8 @@ class Quantity:
     def limit(self, config: Config) -> float:
         """Return the largest sigma that is good enough, a share of the value or rad."""
         if self.estimates[0] == 'track_width':
-            return WIDTH_SHARE       # no verdict.* asks for it: what the method states it by
+            # no verdict.* asks for it: what the method states it by
+            return TRACK_WIDTH.told_share
         return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
 
 

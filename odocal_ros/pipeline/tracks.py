@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.check import stray, track_check
-from odocal_ros.calib.evidence import evidence
+from odocal_ros.calib.evidence import evidence, KEPT_ROWS
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.per_distance import check_worse, per_distance
-from odocal_ros.calib.result import Estimate, TRACK_ROWS
+from odocal_ros.calib.result import Estimate
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.pipeline.method_run import Path, Paths
@@ -73,7 +73,7 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
     start = _start(ready, after)
     if start is None:
         return {}, ()
-    t = ready.track.t[::max(1, len(ready.track.t) // TRACK_ROWS)]
+    t = ready.track.t[::max(1, len(ready.track.t) // KEPT_ROWS)]
     more: dict[str, Any] = {
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}

@@ -11,11 +11,22 @@
 What several rooms ask alike: how many sigmas make a word, and what land vehicles do.
 
 A level is one of two sides of the normal law; beside each, how often chance alone reaches it.
+
+Beside a number stands where it is from: physical, with its source; statistical, with how often
+chance does so; tuned, with the benchmark that shows it; or judgement, where nothing was measured.
 """
 
 REMARK_SIGMAS = 3.0     # to say that something is there: once in 370
 FAULT_SIGMAS = 5.0      # to call a sensor or a setting wrong: once in 1.7 million
 OUTLIER_SIGMAS = 5.0    # robust sigmas from which one value of many is not of them: the same
 FASTEST = 100.0         # m/s that no land vehicle drives: a counter reset, or another unit
+# physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
+TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or drives, may differ
+# of the sigma believed beforehand: a posterior one below it says that the data told the value;
+# at half the data weigh three times the prior
+INFORMED_SHARE = 0.5
+# statistical: sigmas by a median, which half of the values may spoil
+NORMAL_MEDIAN = 0.6745      # of |x|, x normal with sigma 1
+RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
 SWAY = 0.05             # m/s to the side and up, of a body on its springs, that no wheel feels
 DAY_NS = 86_400 * 10**9

@@ -23,8 +23,8 @@ from odocal_ros.calib.wheels.judge_noise import (
     evidence,
     inverse_root,
     judge_turns,
+    log_size_prior,
     NOTHING_LASTS_PRIOR,
-    sizes_believed,
     slow_means,
 )
 from odocal_ros.calib.wheels.leg import C_bv, wheel_factors
@@ -174,7 +174,7 @@ def test_slip_is_found_as_large_as_it_is():
 
 def test_what_is_believed_of_sizes_is_whole_and_least_far_from_the_usual():
     sizes = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
-    p = np.exp(sizes_believed(sizes, 3e-3, 1.5))
+    p = np.exp(log_size_prior(sizes, 3e-3, 1.5))
     assert p.sum() == pytest.approx(1.0, rel=1e-12)
     assert p[0] == NOTHING_LASTS_PRIOR
     # a log-normal law: a factor e^1.5 off the usual is as likely as e^-1.5, and e^-0.5 of it

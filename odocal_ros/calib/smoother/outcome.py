@@ -12,9 +12,10 @@
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
+from odocal_ros.calib.evidence import KEPT_ROWS
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
-from odocal_ros.calib.result import Estimate, MethodResult, Source, TRACK_ROWS
+from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
@@ -237,7 +238,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
     state, motion, fixes = fit.state, fit.weighted[MotionRows].motion, fit.weighted[Fixes]
     K = state.scale
     arm = state.C_bv @ motion.arm_v
-    step = max(1, len(state.t) // TRACK_ROWS)
+    step = max(1, len(state.t) // KEPT_ROWS)
     t_fix = leg.t_fix[problem.use]
     alike, _ = correlation(t_fix, fixes.r[:, :2])
     speed = np.linalg.norm(motion.way, axis=1) / motion.T[:, 0]

@@ -16,7 +16,7 @@ from odocal_ros.calib.causes import cause_of_change, change_in_words
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
-from odocal_ros.calib.scale_steps import FREE, scale_steps
+from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps
 from odocal_ros.calib.smoother.imperfect import weighed_together
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
 from odocal_ros.calib.smoother.part import WANTED
@@ -62,7 +62,7 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
         if config.leg.automatic else []
-    steps[[change.leg - 1 for change in changes]] = FREE
+    steps[[change.leg - 1 for change in changes]] = FREE_STEP
     found = _joint(borders, steps)
     if not found.spread and found.factor == 1:
         # legs that agree tell together what is imperfect; what they differ in would seem to be it

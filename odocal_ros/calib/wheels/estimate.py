@@ -22,20 +22,17 @@ import numpy as np
 from odocal_ros.calib.wheels.first import first_state, near_neighbours, thinned
 from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import make_bins
-from odocal_ros.calib.wheels.noise import ANY_WIDTH
 from odocal_ros.calib.wheels.rounds import Rounds
 from odocal_ros.calib.wheels.solution import Solution
-
-LEG_BINS = 100          # of a leg: twice as many move no sigma by more than 2 %
-SHORTEST_BIN = 1.0      # s, of a bin
-LATENCY_SIGMAS = 2.0    # sigmas of latency: fixes nearer to the track's ends are not used
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 
 
-def solve(leg: WheelLeg, config, turn_rate=True, n_bins=LEG_BINS) -> Solution | None:
+def solve(leg: WheelLeg, config, turn_rate=True, n_bins=100) -> Solution | None:
     """
     Estimate scale, ratio, heading and track width of a leg.
 
-    turn_rate : False leaves the wheels' turn against the gyro's out.
+    turn_rate : False leaves the wheels' turn against the gyro's out.   n_bins : at most, of 1 s at
+    least; twice 100 move no sigma by more than 2 %.
 
     Returns
     -------
@@ -45,18 +42,18 @@ def solve(leg: WheelLeg, config, turn_rate=True, n_bins=LEG_BINS) -> Solution | 
     variance = np.trace(leg.covariance_n[:, :2, :2], axis1=1, axis2=2) / 2
     t0 = max(leg.t_start, float(leg.left.t[0]))
     t1 = min(leg.t_stop, float(leg.left.t[-1]))
-    late = LATENCY_SIGMAS * config.gnss.time_sigma
+    late = 2 * config.gnss.time_sigma       # nearer to the track's ends a fix may lie off it
     inside = ((leg.t_fix >= max(t0, leg.left.t[0] + late))
               & (leg.t_fix <= min(t1, leg.left.t[-1] - late))
               & np.isfinite(leg.fixes_n[:, :2]).all(axis=1))
-    if inside.sum() < 5 or t1 - t0 < 5 * SHORTEST_BIN:
+    if inside.sum() < 5 or t1 - t0 < 5.0:
         return None
     leg = thinned(leg)
     state, residual = first_state(leg, inside, variance)
     keep = inside.copy()
     keep[inside] = near_neighbours(residual, np.sqrt(variance[inside]))
-    n = int(np.clip(min(n_bins, (t1 - t0) / SHORTEST_BIN, keep.sum() / 2), 4, None))
+    n = int(np.clip(min(n_bins, t1 - t0, keep.sum() / 2), 4, None))
     bins = make_bins(leg.t_fix, keep, variance, t0, t1, n)
     width = config.odometer.track_width
-    state = replace(state, width=width or ANY_WIDTH, phi=np.zeros((n + 1, 3)))
+    state = replace(state, width=width or TRACK_WIDTH.of_a_car, phi=np.zeros((n + 1, 3)))
     return Rounds(leg, config, bins, turn_rate, width).run(state, int(inside.sum()))

@@ -15,17 +15,17 @@ import numpy as np
 
 from odocal_ros.calib.wheels.model import State
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.settings.levels import OUTLIER_SIGMAS
-
-EPOCH_RATE_HZ = 20.0        # Hz, of epochs: between them a turn bends the way by a millimetre
-FIXES_BESIDE = 7            # fixes each side
-HUBER = 1.345               # sigmas beyond which the pull of a fix no longer grows
+from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS, RAYLEIGH_MEDIAN
 
 
-def thinned(leg):
-    """Return a leg with no more epochs than EPOCH_RATE_HZ asks: of sums, nothing is lost."""
+def thinned(leg, rate=20.0):
+    """
+    Return a leg with no more epochs than a rate, Hz: of sums, nothing is lost.
+
+    At 20 Hz a turn bends the way between two of them by a millimetre.
+    """
     t = leg.left.t
-    step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / EPOCH_RATE_HZ))
+    step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / rate))
     pick = np.unique(np.append(np.arange(0, len(t), step), len(t) - 1))
     return replace(leg, **{side: Track(*(getattr(getattr(leg, side), name)[pick] for name in (
         't', 'q_nb', 's', 'P'))) for side in ('left', 'right')})
@@ -44,25 +44,27 @@ def first_state(leg, inside, variance):
     for _ in range(8):      # Huber, scaled by the median: outliers do not pull
         x = np.linalg.lstsq(A * weight[:, None], y * weight, rcond=None)[0]
         off = np.abs(y - A @ x)
-        scale = np.median(off) / 0.6745
-        weight = np.sqrt(np.minimum(1.0, HUBER * scale / np.maximum(off, 1e-9))) / sigma
+        # from 1.345 sigmas on the pull no longer grows: 95 % efficient with normal errors
+        bound = 1.345 * (np.median(off) / NORMAL_MEDIAN)
+        weight = np.sqrt(np.minimum(1.0, bound / np.maximum(off, 1e-9))) / sigma
     start = np.append(x[2:], leg.start.position_n[2])
     state = State(float(np.hypot(*x[:2])), 0.0, float(np.arctan2(x[1], x[0])), 0.0, start, 0.0,
                   0.0, np.zeros((1, 3)))
     return state, (y - A @ x).reshape(-1, 2)
 
 
-def near_neighbours(residual, sigma):
+def near_neighbours(residual, sigma, beside=7):
     """
     Tell which fixes lie with those beside them.
 
     residual : (k, 2) fixes less a track, m, slow errors and all.   sigma : (k,) stated.
+    beside : fixes each side.
     """
-    span = 2 * FIXES_BESIDE + 1
+    span = 2 * beside + 1
     if len(residual) <= span:
         return np.ones(len(residual), bool)
-    padded = np.pad(residual, ((FIXES_BESIDE, FIXES_BESIDE), (0, 0)), mode='reflect')
+    padded = np.pad(residual, ((beside, beside), (0, 0)), mode='reflect')
     windows = np.lib.stride_tricks.sliding_window_view(padded, span, axis=0)
     off = np.hypot(*(residual - np.median(windows, axis=-1)).T)
-    usual = max(np.median(off / sigma) / 1.1774, 0.2)       # of a Rayleigh law
+    usual = max(np.median(off / sigma) / RAYLEIGH_MEDIAN, 0.2)
     return off <= OUTLIER_SIGMAS * usual * sigma

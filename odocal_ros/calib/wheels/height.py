@@ -24,11 +24,6 @@ from odocal_ros.calib.wheels.judge_noise import slow_means, spread
 from odocal_ros.calib.wheels.model import Bins, Equations, State
 from odocal_ros.calib.wheels.noise import node_covariance
 
-KNOWN_PITCH = 0.3       # of the prior: a larger sigma of the pitch says nothing
-SLOW_TIME = 60.0        # s: heights are taken as errors that last so long, half of their variance
-HEIGHT_OUTLIER = 4.0    # robust sigmas
-START_HEIGHT = 30.0     # m: what a start height may be off the mark's own
-
 
 @dataclass(frozen=True, eq=False)
 class Height:
@@ -74,13 +69,14 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
         if found is None:
             return unknown
         delta, covariance, phi, P, cross, off = found
-        far = use & (off > HEIGHT_OUTLIER)
+        far = use & (off > 4.0)     # sigmas: of 100 bins one in 160 legs by chance
         if not far.any():
             break
         keep = use & ~far
     sigma = float(np.sqrt(covariance[1, 1]))
     pitch = state.pitch + float(delta[1])
-    if sigma > KNOWN_PITCH * PITCH_PRIOR or abs(pitch) > PITCH_LIMIT:
+    # judgement: no pitch is taken from heights that hardly tell more than its prior
+    if sigma > 0.3 * PITCH_PRIOR or abs(pitch) > PITCH_LIMIT:
         return unknown
     tilt = np.diag(Q) - np.einsum('ij,ik,kj->j', (L @ Q)[use], P, (L @ Q)[use], optimize=True)
     return Height(pitch, sigma, float(state.start_n[2] + delta[0]), phi.reshape(2, -1).T,
@@ -89,12 +85,16 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
 
 
 def _fix_noise(leg, bins, r, use):
-    """Return the covariance of bin means of the heights: half of the variance stated lasts."""
+    """
+    Return the covariance of bin means of the heights, (N, N) m^2.
+
+    Half of the variance stated is white, half lasts for a minute, as heights of receivers do.
+    """
     n = len(bins.edges) - 1
     stated = leg.covariance_n[bins.fix, 2, 2]
     mean = bins.mean(stated)
     white = np.bincount(bins.of_fix, stated * bins.share**2, n)
-    slow = slow_means(*spread(bins, leg.t_fix), SLOW_TIME)
+    slow = slow_means(*spread(bins, leg.t_fix), 60.0)
     root = np.sqrt(mean)
     return np.diag(0.5 * white + 1e-6) + 0.5 * root[:, None] * slow * root
 
@@ -102,8 +102,8 @@ def _fix_noise(leg, bins, r, use):
 def _solve(V, r, X, use, LQ, state):
     inverse = np.linalg.inv(V[np.ix_(use, use)])
     right = X[use].T @ inverse
-    # the prior of the pitch, weakly of the height
-    weight = np.array([1 / START_HEIGHT**2 * 1e-4, 1 / PITCH_PRIOR**2])
+    # the prior of the pitch, weakly of the height: 3 km
+    weight = np.array([1 / 30.0**2 * 1e-4, 1 / PITCH_PRIOR**2])
     covariance = np.linalg.inv(right @ X[use] + np.diag(weight))
     delta = covariance @ (right @ r[use] - weight * [0.0, state.pitch])
     if not np.isfinite(delta).all():

@@ -19,20 +19,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.marks import FEWEST_SCATTERED
 from odocal_ros.calib.wheels.model import Bins
 
-SLOW_TIMES = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0])    # s
-SLOW_VARIANCES = np.append(0.0, np.geomspace(0.003, 300.0, 34))    # of the stated variance
-STATED_PRIOR = 0.5    # ln: how far the stated variance may be off, before looking
-SLIP_NOISES = np.append(0.0, np.geomspace(1e-5, 0.1, 41))                    # m/sqrt(s)
-NOTHING_LASTS_PRIOR = 0.8    # probability that nothing lasts, no wheel slips
-# where something does: size, and ln by which it may be off
-SLOW_PRIOR = 1.0, 2.0                              # of the stated variance
-SLIP_PRIOR = 3e-3, 1.5                             # m/sqrt(s)
-ROUNDING_LEVELS = 2.0**(np.arange(-4, 8) / 1.5)    # of the variance of rounding in motion
-LEVEL_PRIOR = 0.7                                  # ln: how far it may be off, before looking
-LEAST_WHITE_SHARE = 1e-4                           # of the stated variance
-FEWEST_SCATTERED = 20                              # fixes below which their scatter says nothing
+# grids of sizes, 0 for none: slow errors of the fixes, of their stated variance; slip of a wheel,
+# m/sqrt(s)
+SLOW_VARIANCES = np.append(0.0, np.geomspace(0.003, 300.0, 34))
+SLIP_NOISES = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
+NOTHING_LASTS_PRIOR = 0.8    # prior probability of no slow error, and of no slip: judgement
+# priors of sizes, log-normal: median, and sigma of the logarithm. Judgement
+SIZE_PRIORS = {
+    'stated': (1.0, 0.5),       # variance of the fixes, of that stated
+    'slow': (1.0, 2.0),         # of the part that lasts, where one does, of that stated
+    'slip': (3e-3, 1.5),        # m/sqrt(s), where a wheel slips
+    'rounding': (1.0, 0.7)}     # variance of rounding in motion, of independent draws; mean 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def white_share(t_fix, residual, covariance_n, bins: Bins):
     step = np.diff(residual, axis=0)**2 / (stated[1:] + stated[:-1])
     if near.sum() < FEWEST_SCATTERED:
         return 1.0
-    return max(float(step[near].mean()), LEAST_WHITE_SHARE)
+    return max(float(step[near].mean()), 1e-4)      # of the stated variance: keeps it solvable
 
 
 def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise:
@@ -108,12 +108,12 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
         return FixNoise(white, 0.0, np.nan, W)
     use = np.flatnonzero(np.tile(bins.filled, 2))
     root = np.sqrt(stated).T.ravel()
-    times = SLOW_TIMES if np.isnan(told) else np.array([told])
+    times = 5.0 * 2.0**np.arange(8) if np.isnan(told) else np.array([told])    # s, to 640
     begin, end = spread(bins, t_fix)
     shapes = [root[:, None] * np.kron(np.eye(2), slow_means(begin, end, time)) * root
               for time in times]
-    log_prior = -0.5 * (np.log(white + SLOW_VARIANCES) / STATED_PRIOR)**2
-    log_prior += sizes_believed(SLOW_VARIANCES, *SLOW_PRIOR)
+    log_prior = -0.5 * (np.log(white + SLOW_VARIANCES) / SIZE_PRIORS['stated'][1])**2
+    log_prior += log_size_prior(SLOW_VARIANCES, *SIZE_PRIORS['slow'])
     cut = np.ix_(use, use)
     white_root = inverse_root((known + W)[cut])
     log = np.array([log_prior + evidence(r[use], X[use], white_root, S[cut], SLOW_VARIANCES)
@@ -139,9 +139,10 @@ def judge_turns(r, X, known, counts, walk) -> TurnNoise:
         1 m/sqrt(s).
 
     """
-    levels = ROUNDING_LEVELS if counts.any() else np.ones(1)
-    log_prior = -0.5 * ((np.log(levels) + LEVEL_PRIOR**2 / 2) / LEVEL_PRIOR)**2     # mean 1
-    log_prior = log_prior[:, None] + sizes_believed(SLIP_NOISES, *SLIP_PRIOR)
+    levels = 2.0**(np.arange(-4, 8) / 1.5) if counts.any() else np.ones(1)
+    spread = SIZE_PRIORS['rounding'][1]
+    log_prior = -0.5 * ((np.log(levels) + spread**2 / 2) / spread)**2
+    log_prior = log_prior[:, None] + log_size_prior(SLIP_NOISES, *SIZE_PRIORS['slip'])
     roots = [inverse_root(known + level * counts) for level in levels]
     log = log_prior + [evidence(r, X, root, walk, SLIP_NOISES**2) + np.log(np.diag(root)).sum()
                     for root in roots]
@@ -150,15 +151,19 @@ def judge_turns(r, X, known, counts, walk) -> TurnNoise:
     return TurnNoise(float((p @ SLIP_NOISES**2).sum()), float(levels @ p.sum(axis=1)))
 
 
-def sizes_believed(sizes, usual, spread):
-    """Return the log of what is believed of sizes, the first of them 0, before looking: (n,)."""
+def log_size_prior(sizes, usual, spread):
+    """
+    Return the log prior of sizes of a grid, the first of them 0: (n,).
+
+    usual, spread : median of what there is, and sigma of its logarithm.
+    """
     log = np.append(np.log(NOTHING_LASTS_PRIOR), -0.5 * (np.log(sizes[1:] / usual) / spread)**2)
     log[1:] += np.log(1 - NOTHING_LASTS_PRIOR) - np.log(np.exp(log[1:]).sum())
     return log
 
 
 def inverse_root(covariance):
-    """Return the inverse of the Cholesky root of a covariance, (n, n)."""
+    """Return the inverse of the Cholesky root of a covariance, (n, n), kept solvable."""
     tiny = 1e-13 * np.diag(covariance).max()
     return np.linalg.inv(np.linalg.cholesky(covariance + tiny * np.eye(len(covariance))))
 

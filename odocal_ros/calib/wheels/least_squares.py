@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.wheels.judge_noise import inverse_root
 from odocal_ros.calib.wheels.model import (
     Equations,
     FIX_LAG2,
@@ -25,8 +26,6 @@ from odocal_ros.calib.wheels.model import (
     SCALE,
     WIDTH,
 )
-
-SOLVABLE_SHARE = 1e-13    # of the largest variance: keeps a covariance solvable
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +80,7 @@ def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
         Inverse variance and value of what is believed of each step.
 
     """
-    V = V[np.ix_(use, use)]
-    least = SOLVABLE_SHARE * np.diag(V).max()
-    root = np.linalg.inv(np.linalg.cholesky(V + least * np.eye(len(V))))
+    root = inverse_root(V[np.ix_(use, use)])
     inverse = root.T @ root
     Xu, ru, LQ = X[use], r[use], drift.L[use] @ drift.Q
     right = Xu.T @ inverse

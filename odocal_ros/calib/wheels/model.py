@@ -41,7 +41,8 @@ PARAMETERS = ('scale', 'log_ratio', 'heading', 'east', 'north', 'width', 'turn_o
 SCALE, RATIO, HEADING, EAST, NORTH, WIDTH, OFFSET, LATENCY, GYRO, FIX_LAG2 = range(
     len(PARAMETERS))
 NUISANCES = [LATENCY, GYRO, FIX_LAG2]    # estimated, believed beforehand, and no result
-VELOCITY_WINDOW = 0.25                   # s each side that a velocity is taken over
+# s each side that a velocity is taken over: judgement, a few rows of an odometer, little of a turn
+VELOCITY_WINDOW = 0.25
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import Bins, Equations, State
-
-ANY_WIDTH = 1.6      # m, of a car: where nothing is known yet
-LEAST_WIDTH = 0.1    # m: less is none
-LOOSE_WIDTH = 3.0    # times the gyro's drift: what a width not known makes of turns
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +188,8 @@ def tilted(eq: Equations, state: State, tilt_variance) -> Part:
 def unknown_width(eq: Equations, drift) -> Part:
     """Return what keeps turns over a width not known from telling the gyro's drift, as a part."""
     n = len(eq.turn)
-    mean = phi_loading(eq, ANY_WIDTH)[2 * n:]
+    mean = phi_loading(eq, TRACK_WIDTH.of_a_car)[2 * n:]
     whole = np.zeros((3 * n, 3 * n))
-    whole[2 * n:, 2 * n:] = LOOSE_WIDTH**2 * mean @ drift @ mean.T
+    loose = 3.0     # times the gyro's drift, what a width not known makes of turns: judgement
+    whole[2 * n:, 2 * n:] = loose**2 * mean @ drift @ mean.T
     return Part('track_width_unknown', covariance=whole)

@@ -11,23 +11,15 @@
 
 import numpy as np
 
+from odocal_ros.calib.check import NOISIER_WORTH
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.two_point import PITCH_PRIOR
 from odocal_ros.calib.wheels.model import PARAMETERS
-from odocal_ros.calib.wheels.noise import LEAST_WIDTH
-from odocal_ros.calib.wheels.priors import WIDTH_SIGMA
 from odocal_ros.calib.wheels.solution import Solution
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
-
-RADIUS_RANGE = 0.05    # of a wheel's factor, where wheels.radius_range says nothing
-RATIO_OF_RANGE = 0.5                   # of that range: a ratio no better is none
-WIDTH_SHARE = 0.05                     # of a track width: a sigma that still says something
-LEARNED_SHARE = 0.5                    # of the prior's sigma: what counts as learned
-NO_SCALE_SIGMA = 0.1                   # relative sigma beyond which there is no scale
-NOISIER_WORTH = 1.25                   # times the stated sigma: worth saying
-WILD_TIMES, LOST_OF_WAY = 5.0, 0.01    # times the stated sigma, and of the way: no track at all
-NO_WEIGHT = 1e-9    # of the other parameters' weight
+from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS, TYRE_SPREAD
 
 
 def correlation(covariance, names=PARAMETERS):
@@ -62,7 +54,7 @@ def without_turns(solution: Solution):
     size = np.sqrt(np.diag(wheels))
     values = np.linalg.eigvalsh(wheels / np.outer(size, size))
     size = np.sqrt(np.diag(normal))
-    size = np.maximum(size, NO_WEIGHT * size.max())     # of one counter for both: no ratio at all
+    size = np.maximum(size, 1e-9 * size.max())      # of one counter for both: no ratio at all
     rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
     variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not told at all
     return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])
@@ -70,7 +62,7 @@ def without_turns(solution: Solution):
 
 def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reason, ...]:
     """Return why left and right cannot be told apart, empty if they can."""
-    limit = RATIO_OF_RANGE * (config.wheels.radius_range or RADIUS_RANGE)
+    limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
     if turn_rate and sigma_ratio <= limit:
         return ()
     condition, _ = without_turns(solution)
@@ -86,13 +78,14 @@ def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reaso
 def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ...]]:
     """Tell whether the drive itself tells the track width, and why not where none is given."""
     width = solution.state.width
-    if solution.width_told and width <= LEAST_WIDTH:
+    if solution.width_told and width <= TRACK_WIDTH.least:
         return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the difference of the wheels does '
-                              f'not follow the turns by gyro: as if less than {LEAST_WIDTH:g} m '
-                              'lay between them'),)
-    told = solution.width_told and sigma < WIDTH_SHARE * width
+                              'not follow the turns by gyro: as if less than '
+                              f'{TRACK_WIDTH.least:g} m lay between them'),)
+    told = solution.width_told and sigma < TRACK_WIDTH.told_share * width
     if told or given:
-        return told and (not given or sigma < LEARNED_SHARE * WIDTH_SIGMA * given), ()
+        learned = sigma < INFORMED_SHARE * TRACK_WIDTH.taped_share * given
+        return told and (not given or learned), ()
     away = solution.eq.yaw
     return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the heading ranges over '
                           f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
@@ -100,7 +93,8 @@ def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ..
 
 def judge_width(width, sigma, given) -> tuple[Reason, ...]:
     """Return what is to be said of a track width told by the drive beside the one given, m."""
-    if not given or abs(width - given) <= 3 * np.hypot(WIDTH_SIGMA * given, sigma):
+    if not given or abs(width - given) <= REMARK_SIGMAS * np.hypot(
+            TRACK_WIDTH.taped_share * given, sigma):
         return ()
     return (Reason(Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'the drive tells a track width of '
                    f'{width:.4f} +- {sigma:.4f} m, odometer.track_width says {given:.4g} m'),)
@@ -141,7 +135,8 @@ def judge_fit(solution: Solution) -> tuple[Reason, ...]:
     n = len(solution.eq.turn)
     residual = solution.residual[:2 * n][solution.fit.use[:2 * n]]
     rms, way = np.sqrt(2 * (residual**2).mean()), solution.eq.length.sum()
-    if noise > WILD_TIMES and rms > LOST_OF_WAY * way:
+    # times the stated sigma, and of the way: judgement, it is no track at all
+    if noise > 5.0 and rms > 0.01 * way:
         reasons += (Reason(Code.TRACK_MISMATCH, f'with the best factors the track is {rms:.1f} m '
                            f'rms from the fixes on {way:.0f} m, {noise:.1f} times as far as they '
                            'say: the gyro does not turn as the vehicle does, or the fixes are '

@@ -22,15 +22,8 @@ from odocal_ros.calib.wheels.model import (
     State,
     WIDTH,
 )
-from odocal_ros.calib.wheels.noise import ANY_WIDTH
-
-EQUAL_RATIO = 0.01         # of wheels whose ratio nothing tells
-ANY_TRACK_WIDTH = 10.0     # m, sigma of a track width of which nothing is known
-CAR_WIDTH_SIGMA = 0.8      # m, sigma of that of a car
-WIDTH_SIGMA = 0.02         # of a track width given: taped, and tyres are wide
-FIRM_SIGMA = 1e-7          # s, relative: the least sigma of latency and gyro scale, 0 asked for
-LAG2_SIGMA = 1.0           # s^2, sigma of fix_lag_square
-LATENCY_GIVES_WAY = 3.0    # sigmas of a latency found from which its prior gives way
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +43,19 @@ class WheelPriors:
     def steps(self, leg: WheelLeg, state: State, told, rounds):
         """Return inverse variances and values, (p,) each, as steps from a state."""
         weight, value = np.zeros((2, len(PARAMETERS)))
-        given = self.width or ANY_WIDTH
-        loose = ANY_TRACK_WIDTH if told else CAR_WIDTH_SIGMA if rounds > 2 else WIDTH_SIGMA * given
-        weight[WIDTH] = 1 / (WIDTH_SIGMA * given if self.width else loose)**2
+        given = self.width or TRACK_WIDTH.of_a_car
+        taped = TRACK_WIDTH.taped_share * given
+        loose = TRACK_WIDTH.any_sigma if told else TRACK_WIDTH.car_sigma if rounds > 2 else taped
+        weight[WIDTH] = 1 / (taped if self.width else loose)**2
         value[WIDTH] = given - state.width
-        # without turns the fixes leave it open, and the mean of both hangs on its square
-        weight[RATIO] = 1.0 if self.turn_rate else 1 / EQUAL_RATIO**2
+        # without turns the fixes leave it open, and the mean of both hangs on its square: wheels
+        # are alike to 1 %
+        weight[RATIO] = 1.0 if self.turn_rate else 1 / 0.01**2
         value[RATIO] = -state.log_ratio
         weight[OFFSET] = 1e-6
         value[OFFSET] = -state.offset
-        weight[NUISANCES] = 1 / np.maximum(self._nuisances(state), FIRM_SIGMA)**2
+        # s, relative: where settings ask for a sigma of 0
+        weight[NUISANCES] = 1 / np.maximum(self._nuisances(state), 1e-7)**2
         value[NUISANCES] = -state.latency, -state.gyro_scale, -state.fix_lag_square
         if leg.start.surveyed:
             variance = np.diag(leg.start.covariance_n)[:2]
@@ -75,5 +71,5 @@ class WheelPriors:
     def _nuisances(self, state):
         # a receiver that smooths over a second is late by one, whatever was thought of its stamps
         late = abs(state.latency)
-        latency = late if late > LATENCY_GIVES_WAY * self.latency else self.latency
-        return [latency, self.gyro_scale, LAG2_SIGMA]
+        latency = late if late > REMARK_SIGMAS * self.latency else self.latency
+        return [latency, self.gyro_scale, 1.0]      # s^2: over a second

@@ -21,7 +21,6 @@ from odocal_ros.calib.wheels.observable import (
     judge_fit,
     judge_heading,
     judge_width,
-    NO_SCALE_SIGMA,
     separable,
     width_told,
     without_turns,
@@ -38,9 +37,6 @@ PARAMETERS = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mo
               'track_width')       # rows of the sources: relative for scales, rad, m
 NOTE = ('heading_error is how far the heading at the start must be turned, counter-clockwise: its '
         'error less the yaw mounting angle, which a drive cannot tell apart')
-BEND_SIGMA = 1.5e-6    # of a scale in town, by simulated fixes of 2 cm and better: a bend between
-# epochs of 40 ms is cut; counts and bins add to it
-LEARNED_BIAS = 0.7    # of the alignment's sigma: a gyro bias that the leg tells better
 
 
 def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
@@ -72,8 +68,8 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
                                    'than five seconds of them'))
     covariance = np.linalg.inv(solution.fit.normal)
     sigma = np.sqrt(np.diag(covariance))
-    if not (np.isfinite(sigma).all() and sigma[SCALE] < NO_SCALE_SIGMA
-            and sigma[HEADING] < HEADING_LIMIT):
+    # relative: a scale no better than 10 % is none
+    if not (np.isfinite(sigma).all() and sigma[SCALE] < 0.1 and sigma[HEADING] < HEADING_LIMIT):
         return refused(leg, Reason(Code.LEG_TOO_SHORT, 'the fixes tell the scale only to '
                                    f'{100 * sigma[SCALE]:.2g} %'))
     reasons = separable(solution, sigma[RATIO], config, turn_rate)
@@ -172,12 +168,13 @@ def _second_order(solution):
     Return what climb and heading not known make of the scale, relative.
 
     Half their mean square over the way shortens the level track; of a normal error its rms is
-    sqrt(3) / 2 of the variance. Epochs that cut bends are in it too.
+    sqrt(3) / 2 of the variance. In it too is what epochs of 40 ms cut off bends, with counts and
+    bins: 1.5 ppm in a town, by simulated fixes of 2 cm and better.
     """
     share = solution.eq.length / max(solution.eq.length.sum(), 1e-9)
     phi = (solution.fit.phi_sigma[:-1]**2 + solution.fit.phi_sigma[1:]**2) / 2
     unknown = np.sqrt(3) / 2 * np.hypot(solution.height.climb_variance, share @ phi)
-    return float(np.hypot(unknown, BEND_SIGMA))
+    return float(np.hypot(unknown, 1.5e-6))
 
 
 def _gyro_bias(leg, solution):
@@ -186,7 +183,7 @@ def _gyro_bias(leg, solution):
     up = solution.eq.phi_axes[-1, 2]
     up = up / max(np.linalg.norm(up), 1e-9)
     before = float(np.sqrt(up**2 @ a.gyro_bias_sigma**2))
-    if sigma > LEARNED_BIAS * before:
+    if sigma > 0.7 * before:        # the leg tells hardly more than the alignment did
         return Estimate(None, None, 'rad/s')
     return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
 

@@ -30,7 +30,6 @@ from odocal_ros.calib.wheels.model import (
 from odocal_ros.calib.wheels.noise import (
     drift_covariance,
     known_parts,
-    LEAST_WIDTH,
     Part,
     phi_loading,
     quantisation,
@@ -38,18 +37,14 @@ from odocal_ros.calib.wheels.noise import (
     unknown_width,
     walk_root,
 )
-from odocal_ros.calib.wheels.priors import WheelPriors, WIDTH_SIGMA
+from odocal_ros.calib.wheels.priors import WheelPriors
 from odocal_ros.calib.wheels.solution import Solution
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
-
-LINEARISATIONS = 5          # of relinearisation, at most
-SETTLED_STEP = 0.01         # sigmas: smaller steps are none
-NO_TURN_RMS = 0.05          # rad rms: less is no turn
-TURNED_OVER_DRIFT = 10.0    # times what the gyro may have drifted: turns that tell the track width
 
 
 class Rounds:
-    """The rounds of relinearisation over one leg."""
+    """The rounds of relinearisation over one leg, five at most."""
 
     def __init__(self, leg, config, bins, turn_rate, width):
         self.leg, self.config, self.turn_rate = leg, config, turn_rate
@@ -63,17 +58,17 @@ class Rounds:
 
     def run(self, state, fixes):
         """Return the solution from a first state."""
-        again, dropped = False, 0
-        for k in range(LINEARISATIONS):
+        again, dropped, small = False, 0, 0.01      # sigmas: of no step that matters
+        for k in range(5):
             eq = equations(self.leg, self.bins, state, self.since)
             height = solve_height(self.leg, eq, self.bins, state, self.since)
             solution, step = self._round(eq, state, height, judge=k == 1 or again)
             state, again = solution.state, self.bad.sum() > dropped
             dropped = self.bad.sum()
-            if k > 1 and not again and np.all(np.abs(step) < SETTLED_STEP):
+            if k > 1 and not again and np.all(np.abs(step) < small):
                 break
         return replace(solution, dropped=fixes - solution.kept,
-                       settled=bool(np.all(np.abs(step) < 10 * SETTLED_STEP)))
+                       settled=bool(np.all(np.abs(step) < 10 * small)))
 
     def _round(self, eq, state, height, judge):
         leg, n = self.leg, len(eq.turn)
@@ -116,14 +111,15 @@ class Rounds:
         way = np.append(0.0, np.cumsum(eq.length))
         away = eq.yaw - np.polyval(np.polyfit(way, eq.yaw, 1), way)     # a ratio makes a line
         turned = np.sqrt((away**2).mean())
-        if turned > TURNED_OVER_DRIFT * np.sqrt(np.diag(self._drift(eq)).mean()):
+        far = turned / 10       # rad rms: judgement
+        if far > np.sqrt(np.diag(self._drift(eq)).mean()):
             return True
-        if self.rounds == 0 or turned < NO_TURN_RMS:
+        if self.rounds == 0 or turned < 0.05:       # rad rms: lanes changed, no turn
             return False
         level = self._used(len(eq.turn))        # the fixes alone may hold the drift
         level[2 * len(eq.turn):] = False
         drift = self._fit(V, r, X, level, state, L, eq).phi_sigma
-        return bool(turned > TURNED_OVER_DRIFT * np.sqrt((drift**2).mean()))
+        return bool(far > np.sqrt((drift**2).mean()))
 
     def _drift(self, eq):
         return drift_covariance(self.leg.alignment, self.bins, eq, self.since)
@@ -169,7 +165,8 @@ class Rounds:
         known = known + self.priors.nuisances(X[turn], state)
         columns = X[turn][:, [RATIO, WIDTH, OFFSET]]
         if self.width:      # given, and so no free column: its prior is part of what is known
-            known = known + np.outer(columns[:, 1], columns[:, 1]) * (WIDTH_SIGMA * self.width)**2
+            taped = TRACK_WIDTH.taped_share * self.width
+            known = known + np.outer(columns[:, 1], columns[:, 1]) * taped**2
             columns = columns[:, [0, 2]]
         rounding = [quantisation(self.leg, eq, self.bins, state, level)[turn, turn]
                     for level in (0.0, 1.0)]
@@ -195,7 +192,8 @@ def _stepped(state, fit, height, widen):
     return replace(
         state, scale=state.scale * float(np.exp(np.clip(step[SCALE], -0.5, 0.5))),
         log_ratio=state.log_ratio + float(np.clip(step[RATIO], -0.5, 0.5)),
-        heading=state.heading + float(step[HEADING]), width=max(state.width + widen, LEAST_WIDTH),
+        heading=state.heading + float(step[HEADING]),
+        width=max(state.width + widen, TRACK_WIDTH.least),
         offset=state.offset + float(step[OFFSET]), pitch=height.pitch,
         start_n=np.append(state.start_n[:2] + step[3:5], height.start),
         phi=np.column_stack([height.phi, fit.phi]), latency=state.latency + float(step[LATENCY]),

@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.slip import acceleration, excess_way, PIN_STEPS, SPIN_GRID
+from odocal_ros.calib.slip import acceleration, excess_way, PIN_STEPS, SPIN_GRID, SPIN_TURN
 from odocal_ros.calib.wheels.wheel_slips import (
     NO_SLIPS,
     SLIP_GRID,
@@ -41,27 +41,17 @@ from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.wheel_pair import pair, runs
+from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 SLIP_SPANS = (10, 30, 80, 200, 500)    # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
-TYRE_BLUR = 0.005    # m, what two tyres on real ground may do in any window, 1 sigma
-TURN_DOUBT = 0.01    # of the track width, in turns: scrub, camber, gyro scale, 1 sigma
-WHEEL_ODDS = 5.0                       # log of the odds at which a wheel is named
-SLIP_BESIDE = 1.0                      # s each side of a slip that acceleration is looked at
-QUIET_TURN = 0.1                       # rad, turn within which acceleration tells the wheel
-SLOPE_STEPS = 200                      # steps over which the slope of the difference is taken
-SLIP_AROUND = 2.0                      # s each side of a slip that may be part of it
-SLIP_OF_WAY = 1 / 16                   # of the way: a slip of less is no change of the wheels
-STANDS_OUT = 2.0    # times a change of the ratio, from where on a slip beside it stands out
-TELLING_WAY = 0.1                      # m, least way by which going on would have shown
-PARTED_SHARE = 4    # of a slip's half, what the mean must at least part from the Imu by
-
-
-NO_TIMES = np.empty(0)
+# 1 sigma of what two wheels on real ground part by without a slip. Physical, judgement: m in any
+# window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)
+TYRE_BLUR, TURN_DOUBT = 0.005, 0.01
 
 
 def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats],
                  between: tuple[float, float], track: Track, latitude: float,
-                 metres_per_unit: float, track_width: float = 0.0, doubt_t: Floats = NO_TIMES,
+                 metres_per_unit: float, track_width: float = 0.0, doubt_t: Floats | None = None,
                  max_deviation: float = 0.35) -> tuple[tuple[Reason, ...], WheelSlips]:
     """
     Return what the gyro finds wrong with wheels that both count, and the slips of one of them.
@@ -82,7 +72,7 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
         Rough scale of the mean of both.
     track_width : float
         m, 0 unknown.
-    doubt_t : (d,) array
+    doubt_t : (d,) array, optional
         s, where travel is in doubt for other reasons (gaps, resets).
     max_deviation : float
         Ratio of the counts less one, from which on it is said.
@@ -92,7 +82,8 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
     Reasons (WHEELS_SWAPPED, WHEEL_COUNTERS_DIFFER, WHEEL_SLIP), and WheelSlips.
 
     """
-    two = pair(left, right, imu, between, SLIP_GRID, doubt_t)
+    two = pair(left, right, imu, between, SLIP_GRID,
+               np.empty(0) if doubt_t is None else doubt_t)
     if two is None or not metres_per_unit:
         return (), NO_SLIPS
     signals = signals_of(two, metres_per_unit)
@@ -110,10 +101,10 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
     events, lasting = _events(two, apart, quantum_m, width)
     found, change = changed(_without(two, events), signals, metres_per_unit)
     reasons += found
-    # what seemed a change and is none is a slip; beside one only what is far steeper is
+    # what seemed a change and is none is a slip; beside one only what is twice as steep is
     events = sorted(events + lasting)
     if change:
-        steep = STANDS_OUT * abs(change) * metres_per_unit
+        steep = 2 * abs(change) * metres_per_unit
         events = [e for e in events if abs(_slope(two, e)) > steep]
     if not events:
         return reasons, replace(NO_SLIPS, change=change)
@@ -129,9 +120,9 @@ def _level(two, apart, quantum_m):
 
     Rounding at a steady speed makes slopes too, of two counts over a window at most: they stay.
     """
-    way = _way(two)
-    run, climb = way[SLOPE_STEPS:] - way[:-SLOPE_STEPS], apart[SLOPE_STEPS:] - apart[:-SLOPE_STEPS]
-    if len(run) < SLOPE_STEPS:
+    way, n = _way(two), 200     # steps over which a slope is taken, 20 s: longer than most slips
+    run, climb = way[n:] - way[:-n], apart[n:] - apart[:-n]
+    if len(run) < n:
         return apart
     moves = run > max(np.median(run) / 2, 2 * two.quantum)
     slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
@@ -141,9 +132,9 @@ def _level(two, apart, quantum_m):
 
 def _without(two, events):
     """Return the wheels with the cells of slips not known."""
-    known = two.known.copy()
+    known, around = two.known.copy(), 2.0       # s each side that may be part of it
     for begin, end, _ in events:
-        known &= (two.t[1:] < begin - SLIP_AROUND) | (two.t[:-1] > end + SLIP_AROUND)
+        known &= (two.t[1:] < begin - around) | (two.t[:-1] > end + around)
     return replace(two, known=known)
 
 
@@ -181,12 +172,12 @@ def _ends(two, apart, event):
     """Tell whether a slip is over: short, or the wheels go on after it as they did before it."""
     way = _way(two)
     begin, end = np.interp(event[:2], two.t, way)
-    if end - begin < SLIP_OF_WAY * way[-1]:
+    if end - begin < way[-1] / 16:      # half a step of the places that `changed` looks at
         return True
     at = np.searchsorted(two.t, event[:2]).clip(0, len(way) - 1)
     for a, b in ((0, at[0]), (at[1], len(way) - 1)):
         would, does = _slope(two, event) * (way[b] - way[a]), apart[b] - apart[a]
-        if abs(would) < TELLING_WAY or abs(does) > abs(would) / 2:
+        if abs(would) < 0.1 or abs(does) > abs(would) / 2:      # m that would have shown
             return False
     return True
 
@@ -209,7 +200,7 @@ def _limit(two, jump, span, quantum_m, width):
     run = way[ends:][:n] - way[:n]
     spread = np.zeros(n)
     if (run > 0).any():
-        usual = np.median(np.abs(jump[run > 0])) / 0.6745
+        usual = np.median(np.abs(jump[run > 0])) / NORMAL_MEDIAN
         spread = usual * np.maximum(1.0, run / np.median(run[run > 0]))
     turn = TURN_DOUBT * width * (turned[ends:][:n] - turned[:n])
     counts = (way[MEAN_STEPS - 1:] - way[:len(way) - MEAN_STEPS + 1]) / max(two.quantum, 1e-9)
@@ -251,18 +242,20 @@ def _which(two, mean, imu, track, latitude, event):
     """
     begin, end, size = event
     grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)
-    span = max(round((end - begin + 2 * SLIP_BESIDE) / SPIN_GRID), 4 * PIN_STEPS)
+    beside = 1.0        # s each side of a slip, in which speeds are pinned
+    span = max(round((end - begin + 2 * beside) / SPIN_GRID), 4 * PIN_STEPS)
     if len(grid) < 3 * span:
         return 0
     a = acceleration(grid, imu[0], imu[2], track, np.array([1.0, 0.0, 0.0]), latitude)
     excess = excess_way(span, a, np.interp(grid, two.t, mean))
     turn = np.interp(grid, two.t, two.turn)[PIN_STEPS:-PIN_STEPS]
-    straight = np.abs(turn[span:] - turn[:-span]) < QUIET_TURN
+    straight = np.abs(turn[span:] - turn[:-span]) < SPIN_TURN
     at = int(np.searchsorted(grid, (begin + end) / 2)) - PIN_STEPS - span // 2
     if not 0 <= at < len(excess) or not straight[at] or straight.sum() < 20:
         return 0
-    sigma = np.median(np.abs(excess[straight])) / 0.6745 + 1e-3
-    odds = excess[at] * size / sigma**2
-    # where it parts by far less than the half, the slip begins or ends elsewhere
-    told = abs(odds) > WHEEL_ODDS and abs(excess[at]) > abs(size) / 2 / PARTED_SHARE
-    return int(np.sign(odds)) if told else 0
+    sigma = np.median(np.abs(excess[straight])) / NORMAL_MEDIAN + 1e-3
+    log_odds = excess[at] * size / sigma**2
+    # once in 150 the other wheel; parts mean and Imu by less than a quarter of the half, the slip
+    # begins or ends elsewhere
+    told = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
+    return int(np.sign(log_odds)) if told else 0

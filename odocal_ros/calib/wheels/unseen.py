@@ -28,15 +28,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import SIDES
 
-UNSEEN_SIGMAS = 5.5                      # sigmas
-NAMED_BEFORE = 5.0                       # of z^2, by which one wheel is named before the other
-KNOWN_SLIP_REACH = 30.0    # s from a slip that is known: its begin and end are no others
-MOST_SLIPS = 4                           # slips looked for
-SLIP_MARGIN = 0.5                        # s each side of a slip that may be part of it
-SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)    # s, of the slips looked for
-SHORT_SLIP = 5.0                         # s, of which begin and end are not told apart
-SLIP_TAIL = 0.15                         # of a slip seen from a tenth to nine tenths, each side
-SLIP_STEP = 1.0                          # s between the steps that make a slip
+SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)    # s, of the slips looked for; those between are seen too
+# statistical: sigmas from which a slip is seen, of 1000 places looked at: once in 25 000 legs
+UNSEEN_SIGMAS = 5.5
 
 
 def solve_with_slips(leg, config, turn_rate=True):
@@ -58,7 +52,8 @@ def solve_with_slips(leg, config, turn_rate=True):
 
     """
     solution, seen = solve(leg, config, turn_rate), []
-    while turn_rate and solution and not leg.uneven and len(seen) < MOST_SLIPS:
+    # four at most: a leg with more slips all the time, and its noise says so
+    while turn_rate and solution and not leg.uneven and len(seen) < 4:
         found = unseen_slip(solution, leg.slips[0])
         if found is None:
             break
@@ -80,8 +75,8 @@ def drawn_out(begin: Floats, end: Floats, size: Floats) -> tuple[Floats, Floats]
     """
     t, steps = [], []
     for a, b, whole in zip(begin, end, size, strict=True):
-        around = SLIP_MARGIN + SLIP_TAIL * (b - a)
-        n = 2 + int((b - a + 2 * around) / SLIP_STEP)
+        around = 0.5 + 0.15 * (b - a)     # s each side: it was seen from a tenth to nine tenths
+        n = 2 + int(b - a + 2 * around)     # a step each second
         at = np.linspace(a - around, b + around, n)
         t.append(at)
         steps.append(np.full(len(at), whole / np.sqrt(len(at))))
@@ -102,14 +97,16 @@ def unseen_slip(solution, known_t=()):
             continue
         far = np.ones(len(spans), bool)
         for t in known_t:
-            far &= (spans[:, 1] < t - KNOWN_SLIP_REACH) | (spans[:, 0] > t + KNOWN_SLIP_REACH)
+            # 30 s from one that is known: its begin and end are no others
+            far &= (spans[:, 1] < t - 30.0) | (spans[:, 0] > t + 30.0)
         z, size = _scores(solution.fit, columns)
         usual = UNSEEN_SIGMAS * np.hypot(TYRE_BLUR, TURN_DOUBT * solution.state.width * turn)
         sure = far & (np.abs(z) > UNSEEN_SIGMAS) & (np.abs(size) > usual)
         score = np.where(sure, np.abs(z), 0.0)
         k, j = np.unravel_index(np.argmax(score), score.shape)
         if score[k, j] > (best[0] if best else 0.0):
-            wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > NAMED_BEFORE else -1
+            # twice the log odds, 12 to 1, at which one wheel is named before the other
+            wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > 5.0 else -1
             best = (score[k, j], tuple(map(float, spans[j])), float(size[k, j]),
                     float(size[k, j] / z[k, j]), wheel)
     return best and best[1:]
@@ -174,7 +171,8 @@ def with_unseen(known: WheelSlips, seen: Iterable[Mapping[str, Any]]) -> WheelSl
 def _said(span, size, sigma, wheel):
     which = 'one of the wheels parts from the other' if wheel < 0 else (
         f'the {SIDES[wheel]} wheel {"spins" if size > 0 else "slides"}')
-    when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < SHORT_SLIP else (
+    # of less than 5 s begin and end are not told apart
+    when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < 5.0 else (
         f'between t = {span[0]:.0f} and {span[1]:.0f} s')
     return Reason(Code.WHEEL_SLIP, f'{which} by {100 * abs(size):.0f} cm (+-{100 * sigma:.1f}) '
                   f'{when}, as turns and fixes before and after tell; the sigmas hold it')

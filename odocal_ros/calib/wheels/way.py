@@ -16,10 +16,6 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_quat
 
-TURN_BY = 1e-6      # rad, of the differences that give the derivatives of the forward axis
-STANDING_TIME = 1.0    # s without a count on either wheel: standing
-TRACK_MARGIN = 1.0     # s of the track beyond the bins, for fixes that are late or early
-
 
 def turned(phi, v):
     """Return vectors turned by rotation vectors, rad: (..., 3); far faster than by matrices."""
@@ -45,8 +41,9 @@ class Way:
     def __init__(self, leg, bins, state, since):
         self.bins, self.state = bins, state
         edges = bins.edges
-        inside = slice(max(0, np.searchsorted(leg.left.t, edges[0] - TRACK_MARGIN) - 1),
-                       np.searchsorted(leg.left.t, edges[-1] + TRACK_MARGIN) + 1)
+        margin = 1.0        # s of the track beyond the bins, for fixes that are late or early
+        inside = slice(max(0, np.searchsorted(leg.left.t, edges[0] - margin) - 1),
+                       np.searchsorted(leg.left.t, edges[-1] + margin) + 1)
         self.t = t = leg.left.t[inside]
         self.s = leg.left.s[inside], leg.right.s[inside]
         self.k = wheel_factors(state.scale, state.log_ratio)
@@ -55,9 +52,10 @@ class Way:
         self.of = np.clip(np.searchsorted(edges, self.middle, side='right') - 1, 0,
                           len(edges) - 2)
         d_b = forward_b(-state.heading, state.pitch)
+        h = 1e-6            # rad: central differences, to 1e-10 of the derivatives
         by_heading, by_pitch = ((forward_b(-state.heading - a, state.pitch + b)
-                                 - forward_b(-state.heading + a, state.pitch - b)) / (2 * TURN_BY)
-                                for a, b in ((TURN_BY, 0.0), (0.0, TURN_BY)))
+                                 - forward_b(-state.heading + a, state.pitch - b)) / (2 * h)
+                                for a, b in ((h, 0.0), (0.0, h)))
         dP = [np.diff(track.P[inside], axis=0) * k
               for track, k in zip((leg.left, leg.right), self.k, strict=True)]
         self.q_nb, self.d_b = leg.left.q_nb[inside], d_b
@@ -151,12 +149,16 @@ class Way:
         return -means[:, -1], means[:, :-1], np.interp(self.bins.edges, self.t, self.yaw)
 
     def rests(self):
-        """Return the share of bins spent in each standstill, seconds in motion, counts."""
+        """
+        Return the share of bins spent in each standstill, seconds in motion, counts.
+
+        A second without a count on either wheel is a standstill.
+        """
         n = len(self.bins.edges) - 1
         stands = (np.diff(self.s[0]) == 0) & (np.diff(self.s[1]) == 0)
         steps = np.diff(np.concatenate([[False], stands, [False]]).astype(int))
         runs = [(a, b) for a, b in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1),
-                                       strict=True) if self.t[b] - self.t[a] >= STANDING_TIME]
+                                       strict=True) if self.t[b] - self.t[a] >= 1.0]
         time = np.maximum(np.bincount(self.of, self.weight, n), 1e-9)
         share = np.zeros((n, len(runs)))
         for r, (a, b) in enumerate(runs):

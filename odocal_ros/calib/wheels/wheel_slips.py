@@ -9,14 +9,19 @@
 
 """Slips of the wheels as they are found and said."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.reasons import Code, Reason
 
-SLIP_GRID = 0.1     # s, between the rows in which slips are looked for
+SLIP_GRID = 0.1     # s between the rows in which slips are looked for: the shortest is a second
+
+
+def _none(kind: type = float) -> NDArray[Any]:
+    return field(default_factory=lambda: np.empty(0, kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +34,10 @@ class WheelSlips:
     change : of the ratio right over left at some place, as much as at half the way does the same.
     """
 
-    begin: NDArray[np.float64]
-    end: NDArray[np.float64]
-    size: NDArray[np.float64]
-    wheel: NDArray[np.int64]
+    begin: NDArray[np.float64] = _none()
+    end: NDArray[np.float64] = _none()
+    size: NDArray[np.float64] = _none()
+    wheel: NDArray[np.int64] = _none(np.int64)
     change: float = 0.0
 
     @property
@@ -41,7 +46,7 @@ class WheelSlips:
         return (self.begin + self.end) / 2
 
 
-NO_SLIPS = WheelSlips(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
+NO_SLIPS = WheelSlips()
 
 
 def slips_of(events, wheel) -> WheelSlips:

@@ -17,18 +17,14 @@ that changes on the way.
 
 import numpy as np
 
+from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import robust_fit
 
-WHOLE_DRIVE_SIGMAS = 6.0              # sigmas
-MEAN_STEPS = 10                       # steps that speed and turn rate are averaged over
-FIT_CELL = 10                         # steps of a cell in the fit
-ANY_TRACK = 3.0                       # m, sigma of a track width that is not told
-BETWEEN_WHEELS = 0.05                 # s, sigma of the delay between wheels, and of wheels to Imu
-LOAD_SIGMA = 2e-3    # s^2/m, sigma of the change of rolling radius by sideways acceleration
-LEAST_TRACK = 0.1                     # m: a track of less is no track
-RATIO_CHANGE = 2e-3    # of the wheels' ratio on the rest of the way: tyres warm up alike
-RATIO_SPLITS = np.arange(1, 8) / 8    # of the way, where the ratio is looked at for a change
+# statistical: sigmas from which wheels part, of tens of thousands of windows in a leg: once in 500
+# million each by chance, whose noise is not quite normal
+WHOLE_DRIVE_SIGMAS = 6.0
+MEAN_STEPS = 10     # steps that speed, turn rate and the ends of a window are averaged over: 1 s
 
 
 def signals_of(two, metres_per_unit):
@@ -53,15 +49,16 @@ def _smooth(x, reach):
 
 def fitted(two, signals, metres_per_unit):
     """Return the coefficients of the signals by cells of a second, and their covariance."""
-    at = np.arange(0, len(two.t), FIT_CELL)
+    at = np.arange(0, len(two.t), MEAN_STEPS)
     A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
     keep = np.logical_and.reduceat(two.known, at[:-1])[:len(y)]
     keep &= np.abs(A[:, 0]) + np.abs(y) > 2 * two.quantum
     if keep.sum() < 20:
         return None, None
-    width = ANY_TRACK / metres_per_unit
-    prior = np.array([np.inf, width, np.inf, BETWEEN_WHEELS,
-                      BETWEEN_WHEELS * 1.5 / metres_per_unit, LOAD_SIGMA])
+    width = TRACK_WIDTH.first_sigma / metres_per_unit
+    late = 0.05     # s, sigma of the delay between the wheels, and of wheels to Imu
+    load = 2e-3     # s^2/m, of the change of rolling radius by sideways acceleration
+    prior = np.array([np.inf, width, np.inf, late, late * 1.5 / metres_per_unit, load])
     prior = np.append(prior, np.full(signals.shape[1] - len(prior), np.inf))
     floor = 0.4 * two.quantum + 1e-3 / metres_per_unit
     x, covariance, _ = robust_fit(A[keep], y[keep], floor, prior)
@@ -69,7 +66,8 @@ def fitted(two, signals, metres_per_unit):
 
 
 def swapped(width, sigma, track_width):
-    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(LEAST_TRACK, track_width / 2):
+    if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
+                                                       track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count alike in turns, too: turn and '
                        f'difference of the wheels give a track width of {width:.3f} m, +-'
                        f'{sigma:.2g} m, as if one counter were sent twice'),)
@@ -77,7 +75,7 @@ def swapped(width, sigma, track_width):
         return (Reason(Code.ODOMETER_CHOSEN, 'no turn tells whether the left wheel and the right '
                        f'one are exchanged (track width by turns {width:.2f} +- {sigma:.2g} m): '
                        'the sides are taken as named'),)
-    if width > -LEAST_TRACK:
+    if width > -TRACK_WIDTH.least:
         return ()
     return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
                    f'difference of the wheels give a track width of {width:.2f} m, +-'
@@ -95,14 +93,14 @@ def changed(two, signals, metres_per_unit):
     """
     way = np.append(0.0, np.cumsum(np.abs(np.diff(two.left))))
     best = (0.0, 0.0, 0.0, 0)
-    for share in RATIO_SPLITS:
+    for share in np.arange(1, 8) / 8:       # of the way
         at = int(np.searchsorted(way, share * way[-1]))
         late = np.where(np.arange(len(way)) > at, two.left - two.left[at], 0.0)
         x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
         if x is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
-        least = max(RATIO_CHANGE, WHOLE_DRIVE_SIGMAS * sigma)
+        least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up alike to that
         if abs(change) > least and abs(change) / sigma > best[0]:
             best = (abs(change) / sigma, float(change), share, at)
     odds, change, share, at = best

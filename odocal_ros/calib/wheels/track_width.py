@@ -1,0 +1,32 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What is known of a track width before the drive: of cars, of one that was measured, of any."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrackWidth:
+    """
+    Track widths and their prior sigmas, m; shares are of the width itself.
+
+    Physical: cars have 1.3 to 1.8 m, small robots 0.2 m, mining trucks 7 m.
+    """
+
+    of_a_car: float = 1.6       # where nothing is known yet
+    least: float = 0.1          # a track of less is none
+    car_sigma: float = 0.8      # of a vehicle that is most likely a car
+    any_sigma: float = 10.0     # of any vehicle, where the drive itself tells it
+    first_sigma: float = 3.0    # of any vehicle, where wheels and gyro alone are compared
+    taped_share: float = 0.02   # 1 sigma of one that is given: taped, and tyres are wide
+    told_share: float = 0.05    # sigma from which a width found says nothing (judgement)
+
+
+TRACK_WIDTH = TrackWidth()
