@@ -93,11 +93,10 @@ class Rows:
             while keep < len(blocks) and before(blocks[keep]).all():
                 keep += 1
             large = max(0, len(self._blocks) - keep)
-            dropped = blocks[:keep]
+            self._size -= sum(map(_size, blocks[:keep]))
+            self._fresh_size -= sum(map(_size, blocks[len(self._blocks):keep]))
             self._blocks = self._blocks[len(self._blocks) - large:]
             self._fresh = blocks[keep + large:]
-            self._size -= sum(map(_size, dropped))
-            self._fresh_size = sum(map(_size, self._fresh))
 
     def _hold(self, blocks: list[Samples]) -> None:
         """Hold these blocks, and no file."""

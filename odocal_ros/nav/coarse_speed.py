@@ -30,7 +30,8 @@ FEW_VALUES, OFTEN_SENT, DIVIDES_CELL = 4, 5, 0.02
 LEAST_CELLS = 3.0          # cells that the values must span
 FEWEST_CELLS = 6           # cells that they must lie in
 GRID_COHERENCE = 0.9       # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
-GRID_CELLS, GRID_PADDED = 2**17, 2**20# of the values' span, and with zeros: frequencies between
+# of the values' span, and with zeros: frequencies between; those that rule out a grid
+GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 COLLINEAR_OF_TOP = 1e-6    # of the top speed: a second difference that vanishes
 KNOT_SHARE = 0.5           # share of the rows that change: more are no knots of an interpolation
 KNOT_STEP = 1.5            # the knots' grid over that of all rows, at least, of an interpolation
@@ -170,9 +171,9 @@ def grid(value: Floats) -> float | None:
                          return_counts=True)
     if len(u) < FEWEST_VALUES:
         return _of_few(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
-    there = np.zeros(GRID_PADDED)
-    there[u] = 1.0
-    phase = np.abs(np.fft.rfft(there)) / len(u)
+    if not _may_be_grid(u):
+        return None
+    phase = _coherence(u, GRID_PADDED)
     f = np.arange(len(phase)) * ((GRID_CELLS - 1) / GRID_PADDED / span)
     high = np.flatnonzero((phase > GRID_COHERENCE) & (f > LEAST_CELLS / span))
     if not len(high):
@@ -182,6 +183,26 @@ def grid(value: Floats) -> float | None:
     step = _refined(value, 1 / float(f[peak]))
     # where a speed bends into a cruise values crowd: at two or three speeds, on some grid
     return step if len(np.unique(np.rint(value / step))) >= FEWEST_CELLS else None
+
+
+def _coherence(u: Ints, size: int) -> Floats:
+    """Return |mean of exp(2 pi i k u / size)| of cells u, (size / 2 + 1,) by k."""
+    there = np.zeros(size)
+    there[u] = 1.0
+    phase: Floats = np.abs(np.fft.rfft(there)) / len(u)
+    return phase
+
+
+def _may_be_grid(u: Ints) -> bool:
+    """
+    Return whether a grid may be among distinct cells u, by a tenth of the work.
+
+    One of GRID_COHERENCE c is within half a step of these frequencies, so at most pi / 4 either
+    side of it in phase: there (c - sqrt(1 - c^2)) / sqrt(2) is left of it at least.
+    """
+    left = (GRID_COHERENCE - np.sqrt(1 - GRID_COHERENCE**2)) / np.sqrt(2)
+    fewest = int(LEAST_CELLS * GRID_ROUGH / GRID_CELLS) - 1
+    return bool(_coherence(u, GRID_ROUGH)[fewest:].max() >= left)
 
 
 def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
