@@ -40,7 +40,7 @@ ROOMS = {
     'apply': 'calib data nav settings',
     'sim': 'data nav settings',
     'paper': 'calib data nav pipeline settings sim',
-    'output': 'calib nav outside paper patent pipeline settings',
+    'output': 'calib data nav outside paper patent pipeline settings',
     'live': 'apply bagio calib data foresee messages output outside pipeline settings',
     'library': 'bagio calib data messages nav output outside pipeline planning screening settings '
                'sim',

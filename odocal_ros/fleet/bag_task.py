@@ -20,6 +20,7 @@ import resource
 import signal
 import threading
 import time
+from typing import Any
 
 from odocal_ros.errors import OdocalError
 from odocal_ros.fleet.bags import at_hand, FleetBag, seen_as
@@ -56,7 +57,7 @@ class BagJob:
         """Return the key of the row where its content is not known: of a bag that failed."""
         return key_of('failed', self.bag.bag, self.settings)
 
-    def failed(self, reason: str, **more) -> Row:
+    def failed(self, reason: str, **more: Any) -> Row:
         """Return the row of the bag, failed."""
         return Row(key=self.place, bag=self.bag.bag, vehicle=self.bag.vehicle,
                    model=self.bag.model, odometer_km=self.bag.odometer_km, status=FAILED,
@@ -99,7 +100,7 @@ def calibrate_bag(job: BagJob) -> Done:
         return Done(row.key, FAILED, row.reason, row.seconds, True)
 
 
-def _known(store, job, seen) -> Row | None:
+def _known(store: RowStore, job: BagJob, seen: str) -> Row | None:
     """Return the row that is there of a bag unchanged."""
     if key := store.known(seen):
         return store.get(key)
@@ -110,7 +111,7 @@ def _known(store, job, seen) -> Row | None:
     return None
 
 
-def _row(job, store, seen, began) -> tuple[Row, bool]:
+def _row(job: BagJob, store: RowStore, seen: str, began: float) -> tuple[Row, bool]:
     """Return the row of a bag, and whether it was computed: a copy of a known one is not."""
     from odocal_ros.bagio.read import bag_sha256, open_bag
     from odocal_ros.library.calibrate_bag import calibrate_bag as calibrated
@@ -132,7 +133,7 @@ def _row(job, store, seen, began) -> tuple[Row, bool]:
                legs=leg_text(list(legs))), True
 
 
-def _worker():
+def _worker() -> Any:
     """Return the Dask worker that runs this, None outside of one."""
     from distributed import get_worker
     try:

@@ -65,7 +65,7 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     return unique
 
 
-def _pattern(text: str) -> re.Pattern:
+def _pattern(text: str) -> re.Pattern[str]:
     try:
         pattern = re.compile(text)
     except re.error as error:
@@ -77,7 +77,7 @@ def _pattern(text: str) -> re.Pattern:
     return pattern
 
 
-def _named(bag: str, pattern: re.Pattern | None) -> FleetBag:
+def _named(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
     if pattern is None:
         return FleetBag(PurePosixPath(bag).parent.name, bag)
     found = pattern.search(bag)
@@ -141,7 +141,8 @@ def file_system(url: str) -> tuple[Any, str]:
     """Return the fsspec file system of a path or URL, and the path in it."""
     from fsspec.core import url_to_fs
     try:
-        return url_to_fs(url)
+        found: tuple[Any, str] = url_to_fs(url)
+        return found
     except (ValueError, ImportError, OSError) as error:      # no such protocol, or its package
         raise BadUsage(f'{url}: {said_by(error)}') from None
 

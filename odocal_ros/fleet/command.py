@@ -9,14 +9,18 @@
 
 """odocal fleet: bags of many vehicles, each a task on Dask, then the vehicles compared."""
 
-from argparse import ArgumentTypeError
+import argparse
 from pathlib import Path
 import re
 import sys
+from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.replay import add_calibration_arguments
 from odocal_ros.offline.say import say, warn
+
+if TYPE_CHECKING:
+    from odocal_ros.fleet.bag_task import BagJob
 
 TIMEOUT = 3600.0      # s for a bag
 GIB = 2**30
@@ -27,7 +31,7 @@ SHOWN = 20            # vehicles that are named on the terminal
 def _bytes(text: str) -> int:
     found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
     if not found or not float(found[1]):
-        raise ArgumentTypeError(f'{text}: want a size, as in 2G or 500M')
+        raise argparse.ArgumentTypeError(f'{text}: want a size, as in 2G or 500M')
     return int(float(found[1]) * UNITS[found[2]])
 
 
@@ -37,11 +41,11 @@ def _positive(text: str) -> int:
     except ValueError:
         number = 0
     if number < 1:
-        raise ArgumentTypeError(f'{text}: want a whole number from 1 on')
+        raise argparse.ArgumentTypeError(f'{text}: want a whole number from 1 on')
     return number
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='a manifest (.csv or .parquet with columns vehicle '
@@ -68,7 +72,7 @@ def add_arguments(parser) -> None:
     add_calibration_arguments(parser)
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Calibrate a fleet; return 0 if all is well (of --accept: all pass), else 1."""
     from odocal_ros.fleet.engine import check_installed
     check_installed()
@@ -97,7 +101,7 @@ def run(args) -> int:
     return OK if exit_code(vehicles, args.strict) == 0 else REJECTED
 
 
-def _computed(client, jobs, args) -> list[str]:
+def _computed(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:
     """Have all rows; return the file of each, and tell how far it is meanwhile."""
     from tqdm import tqdm
 

@@ -84,7 +84,7 @@ def history_of(name: str, driven: Sequence[Driven],
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the variance of what is each leg's own, and the effects of what legs share."""
     own = np.zeros(len(methods))
-    shared: dict[tuple, np.ndarray] = {}
+    shared: dict[tuple[Any, ...], np.ndarray] = {}
     for k, method in enumerate(methods):
         i = method.parameters.index(name)
         for source in method.sources:

@@ -81,7 +81,8 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
 def _workers(memory: int) -> int:
     """Return how many processes cores and free memory allow."""
     import psutil
-    return max(1, min(len(os.sched_getaffinity(0)), psutil.virtual_memory().available // memory))
+    free = int(psutil.virtual_memory().available)
+    return max(1, min(len(os.sched_getaffinity(0)), free // memory))
 
 
 def dashboard(client: Any) -> str:
@@ -132,6 +133,6 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 def _ahead(client: Any) -> int:
     """Return of how many tasks the scheduler is given as many again."""
     try:
-        return max(FEWEST, PER_WORKER * sum(client.nthreads().values()))
+        return max(FEWEST, PER_WORKER * int(sum(client.nthreads().values())))
     except OSError:
         raise EngineLost(LOST) from None

@@ -41,7 +41,7 @@ def fleet_figures(vehicles: Sequence[dict[str, Any]], legs: Path) -> list[tuple[
     return drawn
 
 
-def _population(name: str, rows: list[dict]) -> tuple[str, str, str]:
+def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Draw each vehicle's value against its model's mean, one column a model."""
     from odocal_ros.output.plots_svg import BLUE, evenly, RED, sheet, svg
     models = sorted({row['model'] for row in rows})
@@ -85,7 +85,7 @@ def _within(ax: Any, points: np.ndarray) -> None:
         ax.plot(some[:, 0], np.full(len(some), sign * 0.95 * most), mark, ms=6, color=RED)
 
 
-def _control(vehicles: Sequence[dict], legs: Path) -> tuple[str, str, str] | None:
+def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
     """Draw the scale of legs over dates, those that changed or drift told apart."""
     from odocal_ros.output.plots_svg import BLUE, GREEN, GREY, PINK, RED, sheet, svg
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}

@@ -40,7 +40,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     """
     from odocal_ros.library.asked import config_of, legs_of
     from odocal_ros.offline.replay import asked_config, asked_topics
-    read: dict[str, dict] = {}
+    read: dict[str, dict[str, Any]] = {}
     jobs, topics = [], asked_topics(args)
     before = changed_settings(config_of(config))
     for bag in bags:

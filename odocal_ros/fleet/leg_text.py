@@ -38,7 +38,8 @@ def leg_text(legs: list[LegResult]) -> str:
 
 def legs_from(text: str) -> list[LegResult]:
     """Return the legs of ``leg_text``."""
-    return json.loads(text, object_hook=_built)
+    legs: list[LegResult] = json.loads(text, object_hook=_built)
+    return legs
 
 
 def _plain(x: Any) -> Any:
@@ -59,7 +60,7 @@ def _plain(x: Any) -> Any:
     return [_plain(y) for y in x] if isinstance(x, list) else x
 
 
-def _built(x: dict) -> Any:
+def _built(x: dict[str, Any]) -> Any:
     kind = x.get(IS)
     if kind is None:
         return x

@@ -81,7 +81,7 @@ def _csv(table: Path) -> str:
     return sink.getvalue().decode()
 
 
-def _reports(client: Any, vehicles: Sequence[dict], jobs: Sequence[BagJob], output: Path,
+def _reports(client: Any, vehicles: Sequence[dict[str, Any]], jobs: Sequence[BagJob], output: Path,
              which: str) -> None:
     """Draw single reports, each a task; note in a vehicle's row where it is, or why not."""
     of = {job.bag.bag: job for job in jobs}
@@ -109,7 +109,7 @@ def draw_report(job: ReportJob) -> str:
     return '; '.join(troubles)
 
 
-def said(vehicles: Sequence[dict], output: Path, most: int) -> str:
+def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
     """Return what a person must know of a fleet."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     failed = sum(row['bags_failed'] for row in vehicles)
@@ -124,7 +124,7 @@ def said(vehicles: Sequence[dict], output: Path, most: int) -> str:
                       f'report:  {output / PAGE}'])
 
 
-def remarks(row: dict) -> list[str]:
+def remarks(row: dict[str, Any]) -> list[str]:
     """Return what is worth saying of a vehicle."""
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
@@ -147,7 +147,7 @@ def remarks(row: dict) -> list[str]:
     return [*out, row['why']] if row['why'] else out
 
 
-def exit_code(vehicles: Sequence[dict], strict: bool) -> int:
+def exit_code(vehicles: Sequence[dict[str, Any]], strict: bool) -> int:
     """Return 0 where all vehicles are well: of limits, all that pass."""
     bad = {'FAIL', 'UNDECIDED', Verdict.REJECTED.value} | (
         {Verdict.CAUTION.value} if strict else set())

@@ -19,9 +19,9 @@ from urllib.parse import quote
 import numpy as np
 
 from odocal_ros import __version__
-from odocal_ros.fleet.outcome import file_name, remarks
+from odocal_ros.fleet.outcome import remarks
 from odocal_ros.fleet.population import LEAST, population
-from odocal_ros.fleet.second_stage import COMPARED
+from odocal_ros.fleet.second_stage import COMPARED, file_name
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
 
@@ -47,7 +47,7 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
         left=max(0, len(vehicles) - MOST_ROWS)) + '\n'
 
 
-def _facts(vehicles: Sequence[dict]) -> str:
+def _facts(vehicles: Sequence[dict[str, Any]]) -> str:
     dates = [row[key] for row in vehicles for key in ('first', 'last') if row[key]]
     when = f', {min(dates):%Y-%m-%d} to {max(dates):%Y-%m-%d}' if dates else ''
     bags, failed, legs = (sum(row[key] for row in vehicles)
@@ -57,16 +57,16 @@ def _facts(vehicles: Sequence[dict]) -> str:
             f'{sum(row["driven_h"] for row in vehicles):.1f} h{when}; odocal_ros {__version__}')
 
 
-def _models(vehicles: Sequence[dict]) -> list[tuple[str, str, list[dict]]]:
+def _models(vehicles: Sequence[dict[str, Any]]) -> list[tuple[str, str, list[dict[str, Any]]]]:
     """Return (model, unit of the scale, vehicles), what was rejected left out."""
-    kinds: dict[tuple[str, str], list[dict]] = {}
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in vehicles:
         if row['legs'] and row['verdict'] != 'rejected':
             kinds.setdefault((row['model'], row['unit']), []).append(row)
     return [(model, unit, rows) for (model, unit), rows in sorted(kinds.items())]
 
 
-def _model(model: str, unit: str, rows: list[dict]) -> dict:
+def _model(model: str, unit: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     cells = []
     for name in COMPARED:
         have = [row for row in rows if row[name] is not None]
@@ -87,7 +87,7 @@ def _model(model: str, unit: str, rows: list[dict]) -> dict:
             + (f' and {len(far) - 20} more' if len(far) > 20 else '')}
 
 
-def _row(row: dict) -> dict:
+def _row(row: dict[str, Any]) -> dict[str, Any]:
     values = [_cell(row, 'scale_factor', 1.0), _cell(row, 'yaw_mounting_angle', DEG),
               _cell(row, 'pitch_mounting_angle', DEG), _cell(row, 'drift_per_year', 100.0)]
     drawn = row['report'] == ''
@@ -101,7 +101,7 @@ def _row(row: dict) -> dict:
             'link': f'reports/{quote(file_name(row["vehicle"]))}/report.html' if drawn else ''}
 
 
-def _cell(row: dict, name: str, factor: float) -> str:
+def _cell(row: dict[str, Any], name: str, factor: float) -> str:
     if row[name] is None:
         return '-'
     return with_sigma(row[name], row[f'{name}_sigma'], factor, signed=factor != 1.0)

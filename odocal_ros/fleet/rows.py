@@ -58,7 +58,7 @@ class Row:
         return with_settings(Config(), json.loads(self.settings))
 
 
-def key_of(*parts: object) -> str:
+def key_of(*parts: Any) -> str:
     """Return a name for what the parts are of."""
     return hashlib.sha256(json.dumps([__version__, *parts]).encode()).hexdigest()[:40]
 
@@ -70,7 +70,7 @@ def changed_settings(config: Config) -> dict[str, Any]:
             if repr(value) != repr(default[name])}
 
 
-def settings_key(config: Config, *more: object) -> str:
+def settings_key(config: Config, *more: dict[Any, Any] | tuple[Any, ...]) -> str:
     """Return a name for the settings that touch the legs of a bag, and what else does."""
     return key_of([[name, repr(value)] for name, value in flat(config).items()
                    if name.partition('.')[0] not in NOT_OF_LEGS], *more)

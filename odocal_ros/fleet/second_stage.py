@@ -73,7 +73,7 @@ def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, fil
         groups = [GroupJob(group, str(parts / f'{k:06d}.parquet'),
                            str(folder / 'vehicles') if files else '')
                   for k, group in enumerate(_grouped(jobs))]
-        found: dict[int, list[dict]] = {}
+        found: dict[int, list[dict[str, Any]]] = {}
         for k, rows, error in results(client, group_of, groups, 'vehicles',
                                       [Path(group.part).stem + parts.name for group in groups]):
             if error is not None:
@@ -105,7 +105,7 @@ def group_of(group: GroupJob) -> list[dict[str, Any]]:
     import pyarrow.parquet as pq
     rows = []
     with pq.ParquetWriter(group.part, leg_schema(), compression='zstd') as writer:
-        legs: list[dict] = []
+        legs: list[dict[str, Any]] = []
         for job in group.vehicles:
             vehicle = vehicle_of(job)
             rows.append(vehicle.row)
@@ -140,7 +140,7 @@ def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for name, short in COMPARED.items():
         for row in rows:
             row[f'{short}_deviate'] = None
-        kinds: dict[tuple, list[dict]] = {}
+        kinds: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for row in rows:
             if row[name] is not None and row['verdict'] != 'rejected':
                 kinds.setdefault((row['model'], row['unit']), []).append(row)
@@ -162,7 +162,7 @@ def flagged(row: dict[str, Any]) -> bool:
                 or row['decision'] in ('FAIL', 'UNDECIDED'))
 
 
-def _badness(row: dict[str, Any]) -> tuple:
+def _badness(row: dict[str, Any]) -> tuple[bool | float | str, ...]:
     judged = row['decision'] or row['verdict']
     far = max(abs(row[f'{short}_deviate'] or 0.0) for short in COMPARED.values())
     return (not row['legs'] and -1 or 0, WORST.index(judged), not row['outlier'],

@@ -58,7 +58,7 @@ class Vehicle:
     legs: list[dict[str, Any]]
     calibration: Calibration | None = None
     config: Config | None = None
-    inputs: tuple[dict, ...] = ()
+    inputs: tuple[dict[str, Any], ...] = ()
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
@@ -110,7 +110,7 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
-def _periods(histories: dict, driven: Sequence[Driven]) -> list[int]:
+def _periods(histories: dict[str, Any], driven: Sequence[Driven]) -> list[int]:
     """Return with which leg each period begins in which nothing changed, the first at 0."""
     return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
                          for change in found.changes})
@@ -140,7 +140,7 @@ def _told(calibration: Calibration, config: Config, driven: Sequence[Driven],
         'reasons': ' '.join(dict.fromkeys(r.code.name for r in calibration.reasons))}
 
 
-def _changes(histories: dict, driven: Sequence[Driven]) -> dict[str, Any]:
+def _changes(histories: dict[str, Any], driven: Sequence[Driven]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
     found = []
     for name, (number, told, _) in histories.items():
@@ -163,7 +163,7 @@ def _size(name: str, change: Change) -> float:
 
 
 def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
-             histories: dict) -> dict[str, Any]:
+             histories: dict[str, Any]) -> dict[str, Any]:
     model = next((b.model for b in job.bags if b.model), '')
     return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
         'period': sum(start <= k for start in starts),

@@ -11,9 +11,13 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.config import Config, with_settings
+
+if TYPE_CHECKING:
+    from odocal_ros.library.legs import LegSpan
 
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
@@ -39,7 +43,7 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
     return with_settings(with_settings(Config(), journal or {}), asked or {})
 
 
-def legs_of(asked: Iterable[Leg] | Leg | None):
+def legs_of(asked: Iterable[Leg] | Leg | None) -> 'list[LegSpan | str]':
     """
     Return legs as ``find_legs`` takes them.
 
@@ -55,16 +59,16 @@ def legs_of(asked: Iterable[Leg] | Leg | None):
     from odocal_ros.library.legs import EACH_STOP, parse_leg
     if asked is None:
         return []
-    if isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked):
-        asked = [asked]
-    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in asked]
+    one_alone = isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked)
+    wanted: Iterable[Any] = [asked] if one_alone else asked
+    return [one if one == EACH_STOP else parse_leg(_text(one)) for one in wanted]
 
 
-def _is_pair(asked):
+def _is_pair(asked: tuple[Any, ...]) -> bool:
     return len(asked) == 2 and not any(isinstance(edge, (str, tuple)) for edge in asked)
 
 
-def _text(leg) -> str:
+def _text(leg: Any) -> str:
     if isinstance(leg, str):
         return leg
     if not (isinstance(leg, tuple) and _is_pair(leg)):

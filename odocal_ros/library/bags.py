@@ -12,7 +12,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.outside.names import one_line
 from odocal_ros.settings.config import Config, flat
@@ -68,7 +70,8 @@ def unlike_settings(configs: list[Config]) -> list[str]:
             if any(repr(other[name]) != repr(value) for other in others)]
 
 
-def told_apart(paths: list[Path], legs: list[list], inputs: list[dict]):
+def told_apart(paths: list[Path], legs: list[list[LegResult]],
+               inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
     """
     Return legs and inputs named so that no two bags have one name: by their paths if need be.
 

@@ -13,12 +13,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, UTC
 from pathlib import Path
+from typing import Any
 
+from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import config_of, Leg, legs_of, Settings
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.hearer import Hearer, Notes
-from odocal_ros.library.read_bag import read_bag, readers_of
+from odocal_ros.library.read_bag import read_bag, readers_of, Recording
+from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
 NAMED = {'m/pulse': 'm/pulse (a counter)', 'm/rad': 'm/rad (a joint)', '1': 'm per m (a speed)'}
@@ -87,11 +90,11 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
 class _Asked:
     topics: dict[str, str]
     config: Settings
-    legs: list
+    legs: list[Any]
     holdout: bool
 
 
-def _look(path, asked) -> None:
+def _look(path: Path, asked: _Asked) -> None:
     """Open a bag and see that it has what is wanted of it."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.library.journal import journal_notes
@@ -106,14 +109,14 @@ class _BagLegs:
     """What is kept of a bag: the results of its legs, not its rows."""
 
     path: Path
-    entry: dict
+    entry: dict[str, Any]
     config: Config
     imu_frame: str
     unit: str
-    legs: list
+    legs: list[LegResult]
 
 
-def _each(paths, asked, heard):
+def _each(paths: list[Path], asked: _Asked, heard: Notes) -> list[_BagLegs]:
     """Return what is kept of each bag that is used."""
     from odocal_ros.library.bags import about
     done: list[_BagLegs] = []
@@ -134,11 +137,11 @@ def _each(paths, asked, heard):
     return done
 
 
-def _one(path, asked, unit, heard) -> _BagLegs:
+def _one(path: Path, asked: _Asked, unit: str | None, heard: Notes) -> _BagLegs:
     """Read a bag and calibrate its legs; ``unit`` is that of the scale in the bags before."""
     bag = read_bag(path, asked.topics, asked.config, hearer=heard)
     own = bag.form.scale_unit
-    if own != (unit or own):
+    if unit and own != unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '
                        f'{NAMED[own]}, that of the bags before in {NAMED[unit]}: there is no '
                        'mean of them; calibrate them apart, or name topics of one kind')
@@ -146,7 +149,7 @@ def _one(path, asked, unit, heard) -> _BagLegs:
                     bag.config, bag.imu_frame, own, _legs_of(bag, asked, heard))
 
 
-def _settings_of_all(done, heard):
+def _settings_of_all(done: list[_BagLegs], heard: Notes) -> Config:
     """Return the settings of the last bag; a note tells what others have otherwise."""
     from odocal_ros.library.bags import unlike_settings
     if unlike := unlike_settings([one.config for one in done]):
@@ -155,7 +158,7 @@ def _settings_of_all(done, heard):
     return done[-1].config
 
 
-def _legs_of(bag, asked, heard):
+def _legs_of(bag: Recording, asked: _Asked, heard: Notes) -> list[LegResult]:
     """Return the results of a bag's legs."""
     from odocal_ros.library.legs import open_ended, OPEN_LEG
     if bag.dropped and not asked.legs:
@@ -172,22 +175,25 @@ def _legs_of(bag, asked, heard):
     return results
 
 
-def _calibrated(bag, spans, notes, holdout, heard):
+def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[Reason, ...]],
+                holdout: bool, heard: Notes) -> list[LegResult]:
     from odocal_ros.pipeline.parts import calibrate_parts
     results = []
     with heard.phase('calibrating') as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
             which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
-            parts = calibrate_parts(
-                leg, bag.config, notes=notes[number - 1], holdout=holdout,
-                progress=lambda share, stage, done=number - 1, which=which: progress(
-                    (done + share) / len(spans), which + stage))
+
+            def of_leg(share: float, stage: str, done: int = number - 1,
+                       which: str = which) -> None:
+                progress((done + share) / len(spans), which + stage)
+            parts = calibrate_parts(leg, bag.config, notes=notes[number - 1], holdout=holdout,
+                                    progress=of_leg)
             results += [replace(one, bag=bag.name) for one in parts]
     return results
 
 
-def _worth_keeping(results, heard):
+def _worth_keeping(results: list[LegResult], heard: Notes) -> list[LegResult]:
     """Return legs found by themselves but for those that are no good, as the node has it."""
     from odocal_ros.pipeline.automatic import refusal
     why = [refusal(leg) for leg in results]

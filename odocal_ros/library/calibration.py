@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib import result
+from odocal_ros.calib.evidence import Evidence
 from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.residuals import residuals
@@ -30,7 +31,7 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec='seconds')
 
 
-def frame_of(columns: dict[str, Any]):
+def frame_of(columns: dict[str, Any]) -> Any:
     """Return columns as a pandas.DataFrame."""
     try:
         import pandas
@@ -51,7 +52,7 @@ class Calibration:
 
     result: result.Calibration
     config: Config = Config()
-    inputs: tuple[dict, ...] = ()
+    inputs: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
     created: str = field(default_factory=_now)
 
@@ -92,7 +93,7 @@ class Calibration:
         from odocal_ros.output.files import as_json
         return as_json(self.result, self.config, list(self.inputs), self.created)
 
-    def to_frame(self):
+    def to_frame(self) -> Any:
         """Return a pandas.DataFrame, a row for each value: value, sigma, unit, method."""
         found = self._estimates()
         columns = {name: [getattr(e, name) for e in found.values()]
@@ -111,7 +112,7 @@ class Calibration:
         """Return what is left over of each sensor, with its sigma; see ``residuals.residuals``."""
         return residuals(self.result)
 
-    def plot_track(self, ax, leg: int = 1):
+    def plot_track(self, ax: Any, leg: int = 1) -> Any:
         """Draw a leg's track over its fixes on matplotlib axes; return these."""
         from odocal_ros.output.plots import draw_track
         from odocal_ros.output.track_table import before_label
@@ -119,7 +120,7 @@ class Calibration:
         ax.legend()
         return ax
 
-    def plot_residuals(self, ax, leg: int = 1):
+    def plot_residuals(self, ax: Any, leg: int = 1) -> Any:
         """Draw dead reckoning less fix over the way on matplotlib axes; return these."""
         from odocal_ros.output.plots import draw_residuals
         draw_residuals(ax, self._drawable(leg))
@@ -152,7 +153,7 @@ class Calibration:
         from odocal_ros.library.export import export
         return export(self.result, files)
 
-    def _drawable(self, leg):
+    def _drawable(self, leg: int) -> Evidence:
         if not 1 <= leg <= len(self.result.legs):
             raise BadUsage(f'leg {leg}: there are legs 1 to {len(self.result.legs)}')
         found = self.result.legs[leg - 1].evidence

@@ -110,16 +110,16 @@ def notes(stored: list[Stored]) -> list[str]:
     return out
 
 
-def _order(name):
+def _order(name: str) -> tuple[int, str]:
     return (ORDER.index(name) if name in ORDER else len(ORDER), name)
 
 
-def _differently_mounted(stored) -> bool:
+def _differently_mounted(stored: list[Stored]) -> bool:
     """Return whether the mounting angles are measured from different nominal mountings."""
     return len({str(s.config.get('imu.mounting_rpy')) for s in stored}) > 1
 
 
-def _change(name, stored) -> Change:
+def _change(name: str, stored: list[Stored]) -> Change:
     have = [i for i, s in enumerate(stored) if s.value(name) is not None]
     unit = stored[have[0]].estimates[name].unit
     entries = []
@@ -136,11 +136,14 @@ def _change(name, stored) -> Change:
     return Change(name, unit, tuple(entries))
 
 
-def _difference(name, stored, since, index) -> Difference | None:
+def _difference(name: str, stored: list[Stored], since: int | None,
+                index: int) -> Difference | None:
     if since is None:
         return None
     a, b = stored[since], stored[index]
     old, new = a.estimates[name], b.estimates[name]
+    assert old.value is not None     # what has no value is no entry
+    assert new.value is not None
     change = new.value - old.value
     if name in ANGLES:      # of an Imu that faces backwards they lie about +-pi
         change = float(wrap(change))
@@ -155,5 +158,5 @@ def _difference(name, stored, since, index) -> Difference | None:
                       _over(change, least) if common else None)
 
 
-def _over(change, sigma) -> float | None:
+def _over(change: float, sigma: float) -> float | None:
     return change / sigma if sigma > 0 else None

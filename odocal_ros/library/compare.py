@@ -9,7 +9,7 @@
 
 """Calibrations of one vehicle beside one another, to see whether it has changed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class Comparison:
         """Return the comparison as plain dicts and lists."""
         names = [s.name for s in self.stored]
 
-        def difference(d):
+        def difference(d: Difference | None) -> dict[str, Any] | None:
             return None if d is None else {
                 'since': names[d.since], 'change': d.change, 'sigma': d.sigma,
                 'sigmas': d.sigmas, 'sigmas_if_shared_cancels': d.sigmas_if_shared_cancels}
@@ -86,7 +86,7 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
     return Comparison(tuple(stored), tuple(found), tuple(notes(stored)), *_verdict(found, stored))
 
 
-def _verdict(found, stored) -> tuple[str, bool | None]:
+def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | None]:
     """Return one sentence on all changes, and whether any counts; None: nothing to judge."""
     if not found:
         return ('nothing to judge: no value is in two calibrations that are not rejected', None)
@@ -105,14 +105,21 @@ def _verdict(found, stored) -> tuple[str, bool | None]:
             f'{label(change.parameter)}, {size:.1f} sigma'), False
 
 
-def _cause(change, difference, stored):
+def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     words = change.parameter.split('_')
     cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
-    if 'scale' in words and abs(
-            difference.change) > ANOTHER_SCALE * stored[difference.since].value(change.parameter):
+    if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * _value_before(
+            change, difference, stored):
         cause = f'{OTHER}; compare calibrations of one odometer'
     return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
-            f'({abs(difference.sigmas):.1f} sigma) since {stored[difference.since].name}: {cause}')
+            f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
+            f'{stored[difference.since].name}: {cause}')
+
+
+def _value_before(change: Change, difference: Difference, stored: Sequence[Stored]) -> float:
+    value = stored[difference.since].value(change.parameter)
+    assert value is not None      # what has none is no entry
+    return value
 
 
 def label(parameter: str) -> str:
@@ -120,24 +127,23 @@ def label(parameter: str) -> str:
     return parameter.replace('_', ' ').replace(' angle', '')
 
 
-def amount(change: Change, difference: Difference, stored) -> str:
+def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> str:
     """Return a change as people read it: scales in per cent or ppm, angles in deg."""
-    old = stored[difference.since].estimates[change.parameter].value
     if change.parameter.startswith('scale_'):
-        return change_in_words(difference.change / old)
+        return change_in_words(difference.change / _value_before(change, difference, stored))
     if change.unit == 'rad':
         return f'{57.29577951308232 * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'
 
 
-def hints(found, stored) -> Iterator[str]:
+def hints(found: tuple[Change, ...], stored: tuple[Stored, Stored]) -> Iterator[str]:
     """Yield what would count if the errors that the legs share were the same each time."""
     for change in found:
         last = change.entries[-1]
         for d in (last.to_first, last.to_previous):
-            if d is not None and stored[last.index].usable and not d.beyond \
-                    and abs(d.sigmas_if_shared_cancels or 0.0) > CHANGED:
+            sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
+            if d is not None and stored[last.index].usable and not d.beyond and sigmas > CHANGED:
                 yield (f'note: the change of the {label(change.parameter)} would be '
-                       f'{abs(d.sigmas_if_shared_cancels):.1f} sigma if the errors of heading '
+                       f'{sigmas:.1f} sigma if the errors of heading '
                        'source, lever arm and the like were the same in both')
                 break

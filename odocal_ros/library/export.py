@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
 import tempfile
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,7 +23,7 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.residuals import left_in, residuals
+from odocal_ros.library.residuals import Left, left_in, residuals
 from odocal_ros.library.series import Series, stacked, states, trajectory
 from odocal_ros.outside.whole import whole_file
 
@@ -88,7 +89,7 @@ def mcap(result: Calibration, path: Path) -> None:
         next(bag.glob('*.mcap')).replace(path)
 
 
-def _topics(result) -> list[encode.Topic]:
+def _topics(result: Calibration) -> list[encode.Topic]:
     pose, bias = (_by_time(make(result)) for make in (trajectory, states))
     t, n = pose['stamp_ns'], len(pose['stamp_ns'])
     whole = np.zeros(n, np.int64)
@@ -104,8 +105,8 @@ def _topics(result) -> list[encode.Topic]:
             *_residual_topics(result)]
 
 
-def _residual_topics(result) -> list[encode.Topic]:
-    sensors: dict[str, list] = {}
+def _residual_topics(result: Calibration) -> list[encode.Topic]:
+    sensors: dict[str, list[Any]] = {}
     for number, leg in enumerate(result.legs, 1):
         for left in left_in(leg):
             sensors.setdefault(left.sensor, []).append((number, leg, _side_by_side(left)))
@@ -116,7 +117,7 @@ def _residual_topics(result) -> list[encode.Topic]:
                              for sensor, found in sensors.items())]
 
 
-def _side_by_side(left) -> Series:
+def _side_by_side(left: Left) -> Series:
     """Return what is left over of a sensor as columns: each component, then its sigma."""
     columns = {'t': left.t}
     for name, value, sigma in zip(left.components, left.value.T, left.sigma.T, strict=True):
@@ -176,7 +177,7 @@ def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
     return paths
 
 
-def _write(result, file) -> None:
+def _write(result: Calibration, file: Path) -> None:
     name, ending = file.stem, file.suffix[1:]
     if ending == 'mcap':
         mcap(result, file)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from odocal_ros.bagio.numbered import JOURNAL
+from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.data.leg import SLOTS
 from odocal_ros.errors import BadUsage
 from odocal_ros.outside.limits import is_file
@@ -28,7 +29,7 @@ class JournalNotes:
     settings: dict[str, object] = field(default_factory=dict)
     topics: dict[str, str] = field(default_factory=dict)
 
-    def topics_in(self, bag_topics) -> dict[str, str]:
+    def topics_in(self, bag_topics: dict[str, TopicInfo]) -> dict[str, str]:
         """Return slot -> topic of those that have messages in the bag."""
         return {slot: topic for slot, topic in self.topics.items()
                 if topic in bag_topics and bag_topics[topic].count}

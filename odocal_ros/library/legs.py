@@ -9,20 +9,30 @@
 
 """Which legs a recording holds: as asked, as marked by the node, or from its standstills."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
 from decimal import Decimal, InvalidOperation
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.outside.limits import LATEST_NS
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import screen
+from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.settings.config import Config
 
+if TYPE_CHECKING:
+    from odocal_ros.bagio.read import Bag
+    from odocal_ros.library.read_bag import Recording
+
+Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
 EACH_STOP = 'each-stop'
 OPENING = 0.2                 # of the distance: a first stop later than this splits no leg
@@ -62,7 +72,7 @@ def parse_leg(text: str) -> LegSpan:
     return LegSpan(start, stop, (rel_a, rel_b))
 
 
-def _edge(text, whole):
+def _edge(text: str, whole: str) -> tuple[int | None, bool]:
     """Return nanoseconds and whether they are against the bag's first message."""
     if not text:
         return None, False
@@ -88,7 +98,7 @@ def _edge(text, whole):
     return whole_ns, False
 
 
-def marked_legs(bag) -> list[tuple[int, int]]:
+def marked_legs(bag: 'Bag') -> list[tuple[int, int]]:
     """
     Return the legs that a node marked in the bag by its status; cancelled ones are left out.
 
@@ -102,7 +112,7 @@ def marked_legs(bag) -> list[tuple[int, int]]:
     return sorted(legs)
 
 
-def open_ended(spans, marks) -> list[tuple[Reason, ...]]:
+def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Reason, ...]]:
     """
     Return a note for each leg that was marked at its start and not at its end.
 
@@ -113,17 +123,18 @@ def open_ended(spans, marks) -> list[tuple[Reason, ...]]:
             for start, _ in spans]
 
 
-def dropped_legs(bag) -> bool:
+def dropped_legs(bag: 'Bag') -> bool:
     """Return whether the operator cancelled or undid a leg that is marked in the bag."""
     return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
 
 
-def _last_marks(bag) -> list[dict]:
+def _last_marks(bag: 'Bag') -> list[dict[str, str]]:
     """Return the last that was said of each leg."""
-    last: dict[tuple, dict] = {}
+    last: dict[tuple[str, int], dict[str, str]] = {}
     for topic in bag.topics.values():
         if topic.msgtype != STATUS_TYPE:
             continue
+        message: Any
         for _, message in bag.messages(topic.name):
             for status in message.status:
                 if status.name.endswith(STATUS_NAME):
@@ -132,7 +143,7 @@ def _last_marks(bag) -> list[dict]:
     return list(last.values())
 
 
-def _remember(last, values):
+def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str]) -> None:
     try:
         start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
     except (KeyError, ValueError):
@@ -148,7 +159,9 @@ def _remember(last, values):
     last[leg_id] = values | {'leg_event': event}
 
 
-def find_legs(recorder, bag, asked, marks, config, inputs=None) -> list[tuple[int, int]]:
+def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[LegSpan | str],
+              marks: Sequence[tuple[int, int]], config: Config,
+              inputs: Inputs | None = None) -> Spans:
     """
     Return (start, stop) stamps of the legs of one bag.
 
@@ -175,7 +188,7 @@ def find_legs(recorder, bag, asked, marks, config, inputs=None) -> list[tuple[in
 
     """
     first, last = _common(recorder)
-    legs = [_placed(a, bag, first, last) for a in asked if a != EACH_STOP]
+    legs = [_placed(a, bag, first, last) for a in asked if isinstance(a, LegSpan)]
     if EACH_STOP in asked:
         legs += _each_stop(recorder, first, last, config, inputs)
     if legs:
@@ -187,7 +200,7 @@ def find_legs(recorder, bag, asked, marks, config, inputs=None) -> list[tuple[in
     return [_by_standstill(recorder, first, last, config, inputs)]
 
 
-def _marked(marks, last, bag):
+def _marked(marks: Sequence[tuple[int, int]], last: int, bag: 'Bag | Recording') -> Spans:
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
@@ -197,7 +210,7 @@ def _marked(marks, last, bag):
     return legs
 
 
-def _common(recorder):
+def _common(recorder: LegRecorder) -> tuple[int, int]:
     """Return the first and the last stamp at which all of Imu, odometer and fix are there."""
     stamps = [recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')]
     stamps = [s[s > 0] for s in stamps]
@@ -210,7 +223,7 @@ def _common(recorder):
     return first, max(last, first + 1)
 
 
-def _placed(span, bag, first, last):
+def _placed(span: LegSpan, bag: 'Bag | Recording', first: int, last: int) -> tuple[int, int]:
     start = first if span.start_ns is None else span.start_ns + bag.start_ns * span.relative[0]
     stop = last if span.stop_ns is None else span.stop_ns + bag.start_ns * span.relative[1]
     # stamps may be of another clock than the bag's times, as of a drive that was played again
@@ -222,11 +235,12 @@ def _placed(span, bag, first, last):
     return start, stop
 
 
-def _s(stamp, bag):
+def _s(stamp: int, bag: 'Bag | Recording') -> str:
     return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
 
 
-def _stops(recorder, first, last, config, inputs):
+def _stops(recorder: LegRecorder, first: int, last: int, config: Config,
+           inputs: Inputs | None) -> tuple[Ints, tuple[Floats, float] | None]:
     """Return standstills of the whole recording, stamps, and metres driven before each time."""
     if inputs is None:
         inputs, _ = screen(recorder.close(first, last, preroll=0.0), config)
@@ -239,7 +253,7 @@ def _stops(recorder, first, last, config, inputs):
     return first + np.round(spans * 1e9).astype(np.int64), (metres, float(way[-1]))
 
 
-def by_themselves(recorder, last, config) -> list[tuple[int, int]]:
+def by_themselves(recorder: LegRecorder, last: int, config: Config) -> Spans:
     """Return the legs that the node would have begun and ended by itself."""
     search = LegSearch(config)
     for slot in ('fix', 'imu', 'odometer'):
@@ -248,10 +262,11 @@ def by_themselves(recorder, last, config) -> list[tuple[int, int]]:
             if (leg.stop_ns or last) > leg.start_ns]
 
 
-def _by_standstill(recorder, first, last, config, inputs):
+def _by_standstill(recorder: LegRecorder, first: int, last: int, config: Config,
+                   inputs: Inputs | None) -> tuple[int, int]:
     """Return one leg, from the first standstill to the last; intermediate stops never split."""
     stops, driven = _stops(recorder, first, last, config, inputs)
-    if not len(stops):
+    if driven is None or not len(stops):
         return first, last
     metres, whole = driven
     start, stop = first, last
@@ -264,10 +279,12 @@ def _by_standstill(recorder, first, last, config, inputs):
     return start, stop
 
 
-def _each_stop(recorder, first, last, config, inputs):
+def _each_stop(recorder: LegRecorder, first: int, last: int, config: Config,
+               inputs: Inputs | None) -> Spans:
     """Return a leg from each standstill to the next that is long enough."""
     stops, driven = _stops(recorder, first, last, config, inputs)
-    legs, lengths = [], []
+    legs: Spans = []
+    lengths = []
     if driven is None:
         return legs
     metres, _ = driven

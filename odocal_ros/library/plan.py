@@ -129,7 +129,8 @@ def plan(*, distance: float | None = None, speed: float | None = None,
         raise BadUsage(f'--standstill and --turns go with --distance, not with --{given[0]}')
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise BadUsage(f'--speed {speed:g}: want a number above 0; a drive must move')
-    settings, own = config_of(config), {}
+    settings = config_of(config)
+    own: dict[str, Any] = {}
     if scenario:
         drive = planned_drives.from_scenario(scenario, duration)
     elif gpx:
@@ -137,6 +138,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     elif bag:
         drive, own = planned_drives.from_bag(Path(bag), settings, dict(topics or {}))
     else:
+        assert distance is not None
         drive = _of_figures(distance, speed, standstill, turns, acceleration)
     if 'fix' in figures:
         own |= {'fix_up': None}
@@ -144,7 +146,8 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     return Planned(drive, sigmas, plan_methods(drive, sigmas))
 
 
-def _of_figures(distance, speed, standstill, turns, acceleration):
+def _of_figures(distance: float, speed: float | None, standstill: float | None, turns: int | None,
+                acceleration: float) -> PlannedDrive:
     if speed is None:
         raise BadUsage('--distance needs --speed, m/s')
     return planned_drives.from_figures(speed, distance, 30.0 if standstill is None else standstill,

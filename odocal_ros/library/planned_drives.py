@@ -12,12 +12,15 @@
 from datetime import UTC
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.planning.drive import DRIVE_STEP, from_rates, marked, PlannedDrive
+from odocal_ros.settings.config import Config
 
 TURN_TIME = 8.0          # s of a turn of 90 deg
 MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
@@ -101,7 +104,7 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
     return _from_points(path, t, position_n, geodetic[0])
 
 
-def _gpx_points(path):
+def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
     """Return times since the first point, s (None: none given), and (n, 3) geodetic, rad, m."""
     import xml.etree.ElementTree as ElementTree
     try:
@@ -118,14 +121,13 @@ def _gpx_points(path):
                        'export a track, not waypoints')
     try:
         level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
-        heights = [float(_child(p, 'ele') or 'nan') for p in points]
+        heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
         times = [_seconds(_child(p, 'time')) for p in points]
     except ValueError as error:
         raise BadUsage(f'{path}: a track point is not readable ({error})') from None
     lat, lon = np.deg2rad(level).T
     if not (np.abs(lat) < np.pi / 2).all() or not (np.abs(lon) <= 2 * np.pi).all():
         raise BadUsage(f'{path}: a track point lacks a latitude or longitude in range')
-    heights = np.array(heights)
     known = np.isfinite(heights)
     heights = np.interp(np.arange(len(heights)), np.flatnonzero(known), heights[known]) \
         if known.any() else np.zeros(len(heights))
@@ -135,11 +137,12 @@ def _gpx_points(path):
     return np.array(times) - times[0], geodetic
 
 
-def _child(point, name):
+def _child(point: Any, name: str) -> str | None:
+    """Return the text of the child of an element that has a name."""
     return next((c.text for c in point if c.tag.rpartition('}')[2] == name), None)
 
 
-def _seconds(text):
+def _seconds(text: str | None) -> float | None:
     """Return seconds since 1970 of an ISO 8601 date, None where there is none."""
     from datetime import datetime
     if text is None:
@@ -148,7 +151,7 @@ def _seconds(text):
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def _from_points(path, t, position_n, start) -> PlannedDrive:
+def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> PlannedDrive:
     """Return the drive through points; nearer than GPX_STEP they tell no direction."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, p = t[rising], position_n[rising]
@@ -180,14 +183,16 @@ def _from_points(path, t, position_n, start) -> PlannedDrive:
                   latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
 
 
-def _smooth(x, wide):
+def _smooth(x: Floats, wide: int) -> Floats:
     """Return means over so many rows, odd; the ends go on as they are."""
     padded = np.pad(x, wide // 2, mode='edge')
     total = np.concatenate([[0.0], np.cumsum(padded)])
-    return (total[wide:] - total[:-wide]) / wide
+    mean: Floats = (total[wide:] - total[:-wide]) / wide
+    return mean
 
 
-def from_bag(path: Path, config, topics: dict[str, str], quiet: bool = True):
+def from_bag(path: Path, config: Config, topics: dict[str, str],
+             quiet: bool = True) -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder

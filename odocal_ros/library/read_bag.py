@@ -20,7 +20,8 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
 from odocal_ros.library.hearer import Hearer
 from odocal_ros.library.journal import journal_notes, JournalNotes
-from odocal_ros.messages.decode import make_reader
+from odocal_ros.library.legs import LegSpan
+from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
@@ -59,7 +60,7 @@ class Recording:
         rows: Samples = self.recorder.rows(slot)
         return rows
 
-    def spans(self, legs: list) -> list[tuple[int, int]]:
+    def spans(self, legs: list[LegSpan | str]) -> list[tuple[int, int]]:
         """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
         from odocal_ros.library.legs import find_legs
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
@@ -71,7 +72,7 @@ class Recording:
 
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
-               journal: JournalNotes | None):
+               journal: JournalNotes | None) -> tuple[dict[str, str], dict[str, Reader]]:
     """Return slot -> topic of a bag, and topic -> reader; those named go before a journal's."""
     from odocal_ros.library.topics import choose_topics
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)

@@ -76,7 +76,7 @@ def residuals(result: Calibration) -> Series:
     return stacked(found)
 
 
-def _rows(leg, left) -> Series:
+def _rows(leg: LegResult, left: Left) -> Series:
     m, c = left.value.shape
     told = np.isfinite(left.sigma).ravel()
     t, e = np.repeat(left.t, c), leg.evidence

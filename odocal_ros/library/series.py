@@ -15,16 +15,20 @@ time. Names tell the unit, but for SI and rad. At most 5000 rows of a leg. What 
 sensors: residuals.py.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.calib.smoother.state import C_bv
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 
-Series = dict[str, NDArray]
+Series = dict[str, NDArray[Any]]
 NONE = ('no leg has a fit of the smoother, which gives this series; see the reasons, or take the '
         'method auto')
 
@@ -62,7 +66,8 @@ def states(result: Calibration) -> Series:
     return _of_fits(result, _state)
 
 
-def _of_fits(result: Calibration, columns) -> Series:
+def _of_fits(result: Calibration,
+             columns: Callable[[LegResult, dict[str, Any]], Series]) -> Series:
     """Return the columns of each leg that the smoother fitted: (leg, its details) to them."""
     found = [(number, leg, columns(leg, leg.methods['smoother'].details))
              for number, leg in enumerate(result.legs, 1)
@@ -72,19 +77,22 @@ def _of_fits(result: Calibration, columns) -> Series:
     return stacked(found)
 
 
-def _rows(smoothed, column):
+def _rows(smoothed: dict[str, Any], column: Floats) -> Floats:
     """Return the rows of what each keyframe has at which the track was kept."""
-    return column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
+    rows: Floats = column[np.searchsorted(smoothed['key_t'], smoothed['track_t'])]
+    return rows
 
 
-def _vehicle(leg, smoothed):
+def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
     found = leg.methods['smoother'].estimates
-    angles = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
-    return _rows(smoothed, smoothed['key_C_nb']) @ C_bv(*angles)
+    yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
+    C_nv: Floats = _rows(smoothed, smoothed['key_C_nb']) @ C_bv(yaw, pitch)
+    return C_nv
 
 
-def _pose(leg, smoothed) -> Series:
+def _pose(leg: LegResult, smoothed: dict[str, Any]) -> Series:
+    assert leg.origin is not None
     track_n = smoothed['track_n']
     latitude, longitude, height = Origin(*leg.origin).to_geodetic(track_n).T
     quaternion = quat_from_matrix(_vehicle(leg, smoothed))
@@ -95,7 +103,7 @@ def _pose(leg, smoothed) -> Series:
             **dict(zip(('qx', 'qy', 'qz', 'qw'), quaternion.T, strict=True))}
 
 
-def _state(leg: LegResult, smoothed) -> Series:
+def _state(leg: LegResult, smoothed: dict[str, Any]) -> Series:
     angles = rpy_from_matrix(_vehicle(leg, smoothed))
     columns = {'t': smoothed['track_t'],
                **dict(zip(('roll', 'pitch', 'yaw'), np.transpose(angles), strict=True))}

@@ -97,7 +97,7 @@ def _write_beside(out: Path, drive: Drive, heading_sigma: float | None) -> None:
                     f'What an operator of {out.name} would know.')
 
 
-def _write_yaml(path: Path, content: dict, title: str) -> None:
+def _write_yaml(path: Path, content: dict[str, Any], title: str) -> None:
     """Write a file whole or not at all."""
     import yaml
     try:

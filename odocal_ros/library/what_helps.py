@@ -65,7 +65,8 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     return found + _second_leg(drive, sigmas, before)
 
 
-def _other_drives(drive, sigmas, before) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
+def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
+                  before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield longer drives, and such with more to see in them."""
     yield (f'{length(drive.distance)} more, straight on', drive.lengthened(drive.distance),
            sigmas)
@@ -82,7 +83,8 @@ def _other_drives(drive, sigmas, before) -> Iterator[tuple[str, PlannedDrive, Si
                farthest, sigmas)
 
 
-def _better_sensors(drive, sigmas, before) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
+def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
+                    before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield fixes, heading and Imu that are better than what there is."""
     if sigmas.fix > 2 * RTK:
         yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
@@ -99,7 +101,7 @@ def _better_sensors(drive, sigmas, before) -> Iterator[tuple[str, PlannedDrive, 
         yield f'an Imu of {GRADES[grade + 1]} grade', drive, replace(sigmas, config=finer)
 
 
-def _until_farthest(drive, sigmas):
+def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
     """Return the drive up to where it is farthest from the start, None if that is the end."""
     inside = drive.t >= 0
     ds = np.gradient(drive.travel[inside])
@@ -113,12 +115,12 @@ def _until_farthest(drive, sigmas):
     return drive.until(float(drive.t[min(moving[-1] + 1, len(drive.t) - 1)]), rest)
 
 
-def _second_leg(drive, sigmas, before):
+def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
     """Return two legs combined, the second the other way: each value by its method."""
     if before.sigma(SCALE) is None:
         return []
     other = {'two_point': predict(drive.turned_around(), sigmas).method}
-    left = {}
+    left: dict[str, float | None] = {}
     for parameter in (SCALE, YAW):
         name = before.by(parameter)
         if not name:

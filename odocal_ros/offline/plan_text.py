@@ -12,12 +12,13 @@
 import math
 import textwrap
 
+from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
 from odocal_ros.planning.methods import NOT_PREDICTED
-from odocal_ros.planning.smoother import SWAY_RATE, WHITE_SHARE
+from odocal_ros.planning.smoother import SWAY_RATE
 
 SHOWN = 0.01          # share of the variance from which a source has its row
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}

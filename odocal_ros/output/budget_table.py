@@ -11,7 +11,9 @@
 
 import math
 import textwrap
+from typing import Any
 
+from odocal_ros.calib.result import MethodResult
 from odocal_ros.output.figures import two_digits
 
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
@@ -20,7 +22,7 @@ HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
 NAME, WIDTHS = 24, (13, 15, 15)      # with 'shared' within 80 columns
 
 
-def largest_source(method, name: str) -> tuple[str, float]:
+def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
     """Return the largest source of an estimate's error, and its share of the variance; '' none."""
     if method is None or name not in method.parameters:
         return '', 0.0
@@ -30,8 +32,9 @@ def largest_source(method, name: str) -> tuple[str, float]:
     return (largest, parts[largest] / whole) if whole else ('', 0.0)
 
 
-def budget_lines(table: dict, scale: float, shown: float, hidden=(), width=98,
-                 small_too=True) -> list[str]:
+def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: float,
+                 hidden: list[str] | set[str] | tuple[Any, ...] = (), width: int = 98,
+                 small_too: bool = True) -> list[str]:
     """
     Return the lines of a budget, none without one.
 

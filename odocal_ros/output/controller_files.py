@@ -10,6 +10,7 @@
 """Parameters of the drive controllers of ros2_controllers, from a calibration."""
 
 from math import tau
+from typing import Any
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.file_head import head
@@ -26,7 +27,8 @@ RADIUS = {'ackermann_steering_controller': 'traction_wheels_radius',
           'tricycle_controller': 'wheel_radius'}
 
 
-def controllers(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+def controllers(calibration: Calibration, config: Config,
+                content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name, nothing when no value of it was determined."""
     blocks = {}
     multipliers = _multipliers(calibration, config)
@@ -47,7 +49,7 @@ def controllers(calibration: Calibration, config: Config, content: dict) -> dict
     return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
 
 
-def _multipliers(calibration, config) -> dict[str, float]:
+def _multipliers(calibration: Calibration, config: Config) -> dict[str, float]:
     """Return those of diff_drive_controller: each wheel's own factor where there is one."""
     estimates = calibration.estimates
     common = known(estimates, 'scale_ratio').value

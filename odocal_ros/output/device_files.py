@@ -10,6 +10,7 @@
 """What positioning systems with a wheel input want to be told of the wheel."""
 
 import textwrap
+from typing import Any
 
 from odocal_ros.calib.result import Calibration
 from odocal_ros.output.figures import with_sigma
@@ -21,7 +22,7 @@ DEVICES = 'wheel_input.txt'
 MICRO = 1e6
 
 
-def devices(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name; nothing without a scale factor in metres per pulse."""
     scale = known(calibration.estimates, 'scale_factor')
     if scale.value is None or scale.unit != 'm/pulse':

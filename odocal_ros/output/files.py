@@ -14,6 +14,7 @@ from contextlib import contextmanager
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,8 @@ ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
           'pitch_mounting_angle': 'rad'}
 
 
-def as_json(calibration: Calibration, config: Config, inputs: list[dict], created: str) -> dict:
+def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
+            created: str) -> dict[str, Any]:
     """
     Return the content of calibration.json.
 
@@ -57,7 +59,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
     Plain dicts and lists, no NaN: a number that does not exist is None.
 
     """
-    result: dict = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
+    result: dict[str, Any] = {name: {'value': None, 'sigma': None, 'unit': unit, 'method': None}
                     for name, unit in ALWAYS.items()}
     result |= {name: e.as_dict() | {'method': e.method or None}
                for name, e in calibration.estimates.items()}
@@ -67,14 +69,14 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
                               'rpy': calibration.imu_rotation_rpy}
     checks = {name: overall([(getattr(leg, name), leg.fixes) for leg in calibration.legs])
               for name in ('before', 'after')}
-    left: dict = {}
+    left: dict[str, Any] = {}
     if (acceptance := accept(calibration, config)) is not None:
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         left['imu'] = calibration.carried.only(IMU_CONSTANTS, IMU_KEEPS).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
-    return _plain({
+    content: dict[str, Any] = _plain({
         'schema': SCHEMA, 'software': f'odocal_ros {__version__}', 'created': created,
         'vehicle': config.vehicle,
         'verdict': calibration.verdict.value,
@@ -86,9 +88,10 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict], create
             'per_distance': _per_distance(calibration.legs)},
         'inputs': inputs,
         'config': flat(config)} | left)
+    return content
 
 
-def _method(method: MethodResult) -> dict:
+def _method(method: MethodResult) -> dict[str, Any]:
     # arrays among the details are for code, not for readers
     more = {k: v for k, v in method.details.items() if not isinstance(v, np.ndarray)}
     return {'verdict': method.verdict.value, 'reasons': [r.as_dict() for r in method.reasons],
@@ -96,18 +99,18 @@ def _method(method: MethodResult) -> dict:
             'correlation': {}, 'budget': {}} | more
 
 
-def _estimate(estimate: Estimate) -> dict:
+def _estimate(estimate: Estimate) -> dict[str, Any]:
     return {'value': estimate.value, 'sigma': estimate.sigma, 'unit': estimate.unit}
 
 
-def _check(check: TrackCheck | None) -> dict | None:
+def _check(check: TrackCheck | None) -> dict[str, Any] | None:
     if check is None:
         return None
     return {name: getattr(check, name)
             for name in ('rms', 'max', 'mean', 'end', 'percent_of_distance')}
 
 
-def _leg(leg: LegResult) -> dict:
+def _leg(leg: LegResult) -> dict[str, Any]:
     return {'bag': leg.bag, 'start': leg.start_ns * 1e-9, 'stop': leg.stop_ns * 1e-9,
             'start_ns': leg.start_ns, 'stop_ns': leg.stop_ns,
             'distance': leg.distance, 'duration': leg.duration, 'imu_samples': leg.imu_samples,
@@ -118,11 +121,11 @@ def _leg(leg: LegResult) -> dict:
                       'per_distance': _per_distance([leg])}}
 
 
-def _per_distance(legs) -> list[dict]:
+def _per_distance(legs: list[LegResult] | tuple[LegResult, ...]) -> list[dict[str, Any]]:
     return [{'length': x.length, 'before': x.before, 'after': x.after} for x in in_pieces(legs)]
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """Return a value as JSON knows it: no numpy, no tuples, None for what is not finite."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
@@ -135,8 +138,8 @@ def _plain(value):
     return value
 
 
-def write_results(calibration: Calibration, config: Config, directory: Path, inputs: list[dict],
-                  created: str, force: bool = False,
+def write_results(calibration: Calibration, config: Config, directory: Path,
+                  inputs: list[dict[str, Any]], created: str, force: bool = False,
                   tell: Callable[[str], None] = lambda note: None) -> list[Path]:
     """
     Write the result files and return their paths, calibration.json first, the report last.
@@ -167,7 +170,7 @@ class Results:
     """
 
     def __init__(self, calibration: Calibration, config: Config, directory: Path,
-                 inputs: list[dict], created: str) -> None:
+                 inputs: list[dict[str, Any]], created: str) -> None:
         self.directory = Path(directory)
         self.has_report = 'report' in config.output.formats
         self.report = [self.directory / REPORT] * self.has_report

@@ -15,7 +15,7 @@ cannot be (a mount, a folder that holds other things too), files are exchanged o
 main file taken away first and put there last: it vouches for the others.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack, suppress
 import ctypes
 import errno
@@ -23,6 +23,7 @@ import os
 from pathlib import Path
 import re
 import shutil
+from typing import Any
 import uuid
 
 from odocal_ros.errors import BadUsage
@@ -44,7 +45,7 @@ class ResultFolder:
     def __init__(self, place: Path, main: str, ours: frozenset[str]) -> None:
         self.place = Path(os.path.realpath(place))
         self._main, self._ours = main, ours
-        self._main_file: tuple = ()       # which file the one put there is
+        self._main_file: tuple[Any, ...] = ()       # which file the one put there is
 
     @property
     def written(self) -> bool:
@@ -154,7 +155,7 @@ def _which(path: Path) -> tuple[int, int]:
 
 def _swap(one: Path, other: Path) -> None:
     """Exchange two folders in one step where the system can, else in two."""
-    rename: Callable | None = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
     names = [os.fsencode(path) for path in (one, other)]
     if rename is not None:
         if rename(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE) == 0:

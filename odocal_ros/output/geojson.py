@@ -14,10 +14,12 @@ Four features a leg: the corrected track, the track as configured, the fixes, th
 """
 
 import json
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.output.summary import sentence
 from odocal_ros.settings.config import Config
@@ -31,7 +33,7 @@ ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoni
 PLACES, HEIGHT_PLACES = 8, 3     # 1e-8 deg: 1 mm
 
 
-def geojson(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name, nothing when no leg has a track."""
     most = max(2, min(MOST, MOST_OF_ALL // (3 * max(1, len(calibration.legs)))))
     features = [feature for n, leg in enumerate(calibration.legs, 1)
@@ -44,7 +46,7 @@ def geojson(calibration: Calibration, config: Config, content: dict) -> dict[str
     return {TRACK: json.dumps(whole, allow_nan=False, ensure_ascii=False) + '\n'}
 
 
-def _features(number: int, leg: LegResult, most: int) -> list[dict]:
+def _features(number: int, leg: LegResult, most: int) -> list[dict[str, Any]]:
     if leg.origin is None:
         return []
     out = []
@@ -63,15 +65,16 @@ def _features(number: int, leg: LegResult, most: int) -> list[dict]:
     return out
 
 
-def _feature(geometry, number, leg, kind, more):
+def _feature(geometry: dict[str, Any], number: int, leg: LegResult, kind: str,
+             more: dict[str, Any]) -> dict[str, Any]:
     return {'type': 'Feature', 'geometry': geometry,
             'properties': {'kind': kind, 'leg': number, 'bag': leg.bag,
                            'verdict': leg.verdict.value} | more}
 
 
-def _positions(rows_n, leg, most) -> np.ndarray:
+def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
     """Return rows of n, m, as (k, 2 or 3) longitude, latitude, deg, and height, m, if known."""
-    if rows_n is None or not len(rows_n):
+    if rows_n is None or leg.origin is None or not len(rows_n):
         return np.empty((0, 3))
     few = np.linspace(0, len(rows_n) - 1, min(len(rows_n), most)).round().astype(int)
     rows_n = np.array(rows_n, dtype=float)[few]
@@ -84,20 +87,21 @@ def _positions(rows_n, leg, most) -> np.ndarray:
     return np.column_stack([degrees, geodetic[:, 2].round(HEIGHT_PLACES)])
 
 
-def _points(positions):
+def _points(positions: Floats) -> dict[str, Any]:
     return {'type': 'MultiPoint', 'coordinates': positions.tolist()}
 
 
-def _line(positions):
+def _line(positions: Floats) -> dict[str, Any]:
     """Return a line, cut where it crosses the 180th meridian (RFC 7946, 3.1.9)."""
     jumps = np.flatnonzero(np.abs(np.diff(positions[:, 0])) > 180)
     if len(positions) < 2:
         return {'type': 'Point', 'coordinates': positions[0].tolist()}
     if not len(jumps):
         return {'type': 'LineString', 'coordinates': positions.tolist()}
-    pieces, begin = [], []
+    pieces: list[list[list[float]]] = []
+    begin: list[list[float]] = []
     for piece, after in zip(np.split(positions, jumps + 1), [*(jumps + 1), None], strict=True):
-        end = []
+        end: list[list[float]] = []
         if after is not None:
             end, following = _crossing(positions[after - 1], positions[after])
         pieces.append([*begin, *piece.tolist(), *end])
@@ -105,7 +109,7 @@ def _line(positions):
     return {'type': 'MultiLineString', 'coordinates': pieces}
 
 
-def _crossing(before, after):
+def _crossing(before: Floats, after: Floats) -> tuple[list[list[float]], list[list[float]]]:
     """Return the point on the 180th meridian between two points, as seen from either side."""
     side = 180.0 if before[0] > 0 else -180.0
     beyond = after[0] + 2 * side

@@ -12,9 +12,10 @@
 import csv
 from datetime import datetime, UTC
 import io
+from typing import Any
 
 from odocal_ros.calib.choice import leg_estimates
-from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult
 from odocal_ros.output.summary import known
 from odocal_ros.outside.names import for_table
 from odocal_ros.settings.config import Config
@@ -25,7 +26,7 @@ SHOWN = {'scale_factor': '', 'scale_ratio': '1', 'scale_factor_left': '',
          'pitch_mounting_angle': 'rad'}
 
 
-def leg_table(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+def leg_table(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name, nothing without legs."""
     if not calibration.legs:
         return {}
@@ -37,7 +38,7 @@ def leg_table(calibration: Calibration, config: Config, content: dict) -> dict[s
     return {LEGS: text.getvalue()}
 
 
-def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
+def _row(number: int, leg: LegResult, calibration: Calibration) -> dict[str, Any]:
     """Return a row; what a leg does not know is an empty cell."""
     giving = {e.method for e in calibration.estimates.values() if e.value is not None}
     reasons = [*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons
@@ -60,7 +61,7 @@ def _row(number: int, leg: LegResult, calibration: Calibration) -> dict:
     return row
 
 
-def _estimate(leg, calibration, name):
+def _estimate(leg: LegResult, calibration: Calibration, name: str) -> Estimate:
     """Return a leg's value by the method whose value the calibration gives, else by its own."""
     method = leg.methods.get(calibration.estimates[name].method)
     return known(leg_estimates(leg) if method is None else method.estimates, name)

@@ -10,6 +10,7 @@
 """The picture of odocal paper: the track of figure 1, and how each error grows."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,11 +50,11 @@ def draw(tables: PaperTables, path: Path) -> None:
     save_figure(figure, path)
 
 
-def _track(axes, tables):
+def _track(axes: Any, tables: PaperTables) -> None:
     """Draw figure 1: reference, dead reckoning as configured, and calibrated."""
     result = tables.outcomes['all'].result
     reference, before, after = (p[:, :2] / 1000 for p in (
-        result.reference_n, result.track_before_n, result.track_n))
+        result.reference_n, result.track_before_n, result.track_n) if p is not None)
     axes.plot(*reference.T, color='0.75', linewidth=6, solid_capstyle='round',
               label='reference (fixes)')
     axes.plot(*before.T, color='#D55E00', linewidth=1.6, label='dead reckoning as configured')
@@ -69,7 +70,7 @@ def _track(axes, tables):
     axes.legend(loc='upper left', frameon=False, fontsize=9)
 
 
-def _growth(upper, lower, tables):
+def _growth(upper: Any, lower: Any, tables: PaperTables) -> None:
     """Draw yaw and position error by time: lines by the error model, dots by the pipeline."""
     for source, (colour, dash) in STYLES.items():
         growth = tables.growths[source]

@@ -10,6 +10,7 @@
 """The picture of odocal patent: the valley that 441 combinations see, and how each line does."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def draw(table: Embodiment, path: Path) -> None:
     save_figure(figure, path)
 
 
-def _valley(figure, axes, table):
+def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
     """Draw the mean distance over the errors of both radii, the heading as each likes it best."""
     levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * MM
     mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
@@ -57,7 +58,7 @@ def _valley(figure, axes, table):
                   facecolor='0.75', fontsize=9)
 
 
-def _lines(axes, table):
+def _lines(axes: Any, table: Embodiment) -> None:
     """Draw mean and largest distance of each line of the table."""
     names = [f'{table.rows[k - 1].name}, {row.name.strip()}' if row.name.startswith(' ')
              else row.name for k, row in enumerate(table.rows)]

@@ -11,6 +11,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from odocal_ros.errors import BadUsage
 
@@ -32,7 +33,7 @@ def check_picture(path: Path) -> None:
                        'python3-matplotlib)')
 
 
-def new_figure(width: float, height: float):
+def new_figure(width: float, height: float) -> Any:
     """Return an empty figure, inches, that no window will show."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -41,7 +42,7 @@ def new_figure(width: float, height: float):
     return figure
 
 
-def save_figure(figure, path: Path) -> None:
+def save_figure(figure: Any, path: Path) -> None:
     """
     Write a figure.
 

@@ -9,12 +9,17 @@
 
 """The figures of a leg, from its evidence: track, residuals, scale by section, speed, fixes."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.calib.evidence import Evidence
+from odocal_ros.data.arrays import Floats
 from odocal_ros.output.plots_svg import (
     BAND,
     BLUE,
+    Drawing,
     evenly,
     GREEN,
     GREY,
@@ -37,7 +42,8 @@ STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
 
 
 def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
-                before_word: str = 'as configured', smoothed: dict | None = None) -> list[tuple]:
+                before_word: str = 'as configured',
+                smoothed: dict[str, Any] | None = None) -> list[Drawing]:
     """
     Draw a leg.
 
@@ -75,7 +81,8 @@ def leg_figures(found: Evidence, name: str, scale_sigma: float | None = None,
     return figures
 
 
-def draw_track(ax, found, before_word='as configured', slips=()):
+def draw_track(ax: Any, found: Evidence, before_word: str = 'as configured',
+               slips: list[dict[str, float]] | tuple[Any, ...] = ()) -> None:
     """Draw on axes the track as configured and as calibrated over the fixes."""
     start = found.track_n[0]
     factor, unit = lengths(np.ptp(found.track_n[:, :2], axis=0).max())
@@ -99,7 +106,8 @@ def draw_track(ax, found, before_word='as configured', slips=()):
     ax.margins(0.06)
 
 
-def _track(found, name, before_word, slips):
+def _track(found: Evidence, name: str, before_word: str,
+           slips: list[dict[str, float]] | tuple[Any, ...]) -> tuple[str, str, str]:
     figure, (ax,) = sheet(5.2)
     draw_track(ax, found, before_word, slips)
     key(figure, ax)
@@ -108,7 +116,8 @@ def _track(found, name, before_word, slips):
     return 'Track', says, svg(figure, f'{name}-track', says)
 
 
-def _marks(ax, found, at, slips):
+def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
+           slips: list[dict[str, float]] | tuple[Any, ...]) -> None:
     """Mark on the track what is odd: fixes not used, gaps, slips, and where the fit ends."""
     few = found.t_excluded[evenly(len(found.t_excluded))]
     if len(few):
@@ -120,8 +129,8 @@ def _marks(ax, found, at, slips):
     said = set()
     for label, begin, end in gaps:
         ends = np.clip((begin, end), found.t[0], found.t[-1])
-        ax.plot(*at(np.linspace(*ends, 50)), '-', color=PAUSE[label], linewidth=4, alpha=0.6,
-                zorder=1, solid_capstyle='butt', label=None if label in said else label)
+        ax.plot(*at(np.linspace(ends[0], ends[1], 50)), '-', color=PAUSE[label], linewidth=4,
+                alpha=0.6, zorder=1, solid_capstyle='butt', label=None if label in said else label)
         if label != 'no fix used':       # some are short: the cut is seen by its ends
             ax.plot(*at(ends), '|', color=PAUSE[label], markersize=12, markeredgewidth=2)
         said.add(label)
@@ -133,7 +142,7 @@ def _marks(ax, found, at, slips):
                 markersize=6, markerfacecolor=GREEN, zorder=5, label='slip')
 
 
-def draw_residuals(ax, found):
+def draw_residuals(ax: Any, found: Evidence) -> None:
     """Draw on axes dead reckoning less fix along and across, as calibrated."""
     factor, unit = lengths(found.distance[-1])
     way = factor * found.fix_distance
@@ -145,7 +154,7 @@ def draw_residuals(ax, found):
     ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning less fix, m')
 
 
-def _band(ax, way, sigma):
+def _band(ax: Any, way: Floats, sigma: Floats) -> None:
     band = evenly(len(way))
     ax.fill_between(way[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
                     label='± sigma of a fix')
@@ -154,7 +163,7 @@ def _band(ax, way, sigma):
         ax.plot(way[band], edge, '--', color='black', linewidth=0.6)
 
 
-def _residuals(found, name, before_word):
+def _residuals(found: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
     factor, unit = lengths(found.distance[-1])
     way = factor * found.fix_distance
     figure, axes = sheet(5.2, 3)
@@ -179,7 +188,7 @@ def _residuals(found, name, before_word):
     return 'Residuals', says, svg(figure, f'{name}-residuals', says)
 
 
-def _sections(found, name, scale_sigma):
+def _sections(found: Evidence, name: str, scale_sigma: float | None) -> tuple[str, str, str]:
     part = found.sections
     factor, unit = lengths(found.distance[-1])
     middle, half = factor * (part.begin + part.end) / 2, factor * (part.end - part.begin) / 2
@@ -203,7 +212,7 @@ def _sections(found, name, scale_sigma):
     return 'Scale by section', says, svg(figure, f'{name}-sections', says)
 
 
-def _motion(found, name):
+def _motion(found: Evidence, name: str) -> tuple[str, str, str]:
     figure, (upper, lower) = sheet(3.6, 2)
     speed, turn = 3.6 * found.speed, np.rad2deg(found.yaw_rate)
     rows = thinned(speed)
@@ -220,7 +229,7 @@ def _motion(found, name):
     return 'Speed and turn rate', says, svg(figure, f'{name}-motion', says)
 
 
-def _fixes(found, name):
+def _fixes(found: Evidence, name: str) -> tuple[str, str, str]:
     figure, (ax,) = sheet(2.7)
     for status in np.unique(found.fix_status):
         rows = np.flatnonzero(found.fix_status == status)
@@ -241,7 +250,7 @@ def _fixes(found, name):
     return 'Fix quality', says, svg(figure, f'{name}-fixes', says)
 
 
-def _biases(t, biases, name):
+def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
     figure, axes = sheet(3.6, 2)
     for ax, columns, factor, word in zip(axes, biases, (np.rad2deg(3600.0), 1e3), (
             'gyro bias, deg/h', 'accelerometer bias, mm/s²'), strict=True):

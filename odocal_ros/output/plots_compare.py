@@ -11,15 +11,17 @@
 
 import math
 
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.output.plots_svg import BAND, BLUE, GREEN, GREY, PINK, RED, relative, sheet, svg
 from odocal_ros.output.summary import ANGLES, DEG, known
 
 STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))
 MOST_LEGS = 40
+# title, (text, method, value, sigma) of what has one, band of the result: middle and half width
+Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 
 
-def compared(calibration: Calibration, name: str) -> list[tuple]:
+def compared(calibration: Calibration, name: str) -> list[tuple[str, str, str]]:
     """Draw scale, yaw and pitch by method and leg; empty where there is but one to show."""
     rows = [(f'all legs, {m.replace("_", " ")}', m, found.estimates)
             for m, found in calibration.methods.items()] if len(calibration.legs) > 1 else []
@@ -32,19 +34,20 @@ def compared(calibration: Calibration, name: str) -> list[tuple]:
     return [_draw(panels, name, len(calibration.legs))] if panels else []
 
 
-def _scale(calibration, rows):
-    """Return title, (text, method, value, sigma) of what has one, and the band of the result."""
+def _scale(calibration: Calibration,
+           rows: list[tuple[str, str, dict[str, Estimate]]]) -> Panel:
     result = known(calibration.estimates, 'scale_factor')
-    found = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
+    all_of = [(text, method, known(estimates, 'scale_factor')) for text, method, estimates in rows]
     found = [(text, method, e.value / result.value - 1, (e.sigma or 0.0) / abs(result.value))
-             for text, method, e in found if e.value is not None and result.value]
+             for text, method, e in all_of if e.value is not None and result.value]
     times, word = relative(max((abs(off) + sigma for _, _, off, sigma in found), default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * times) if result.value else None
     return f'scale less result, {word}', [
         (text, method, off * times, sigma * times) for text, method, off, sigma in found], band
 
 
-def _angle(calibration, rows, name):
+def _angle(calibration: Calibration, rows: list[tuple[str, str, dict[str, Estimate]]],
+           name: str) -> Panel:
     result = known(calibration.estimates, name)
     points = []
     for text, method, estimates in rows:
@@ -55,7 +58,7 @@ def _angle(calibration, rows, name):
     return f'{ANGLES[name]} mounting angle, deg', points, band
 
 
-def _draw(panels, name, legs):
+def _draw(panels: list[Panel], name: str, legs: int) -> tuple[str, str, str]:
     heights = [0.24 * len(points) for _, points, _ in panels]
     whole = sum(heights) + 0.75 * len(panels)
     figure, axes = sheet(whole, len(panels), sharex=False, heights=heights)

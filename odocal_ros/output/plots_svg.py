@@ -9,35 +9,43 @@
 
 """How figures become parts of a page: one look, SVG with text as text, nothing left outside."""
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 import io
 import re
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
 
 # Okabe and Ito's colours, told apart by colour-blind eyes too; shapes and dashes tell in grey
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
+Drawing = tuple[str, str, str]      # title, what it says, SVG
 WIDTH = 5.6          # inch
 GRID = {'color': '0.90', 'linewidth': 0.6}
 MOST_POINTS = 1200   # of a line
 MOST_MARKS = 400     # of single marks
-LOOK = {'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
-        'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
-        'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
-        'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
-        'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
+LOOK: dict[Any, Any] = {
+    'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
+    'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,
+    'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.unicode_minus': True, 'path.simplify': True,
+    'legend.frameon': False, 'lines.linewidth': 1.4, 'mathtext.default': 'regular'}
 
 
 @contextmanager
-def look():
+def look() -> Iterator[None]:
     """Hold the look while figures are made and written; nothing of it stays."""
     from matplotlib import rc_context
     with rc_context(LOOK):
         yield
 
 
-def sheet(height, rows=1, sharex=True, heights=None):
+def sheet(height: float, rows: int = 1, sharex: bool = True,
+          heights: list[float] | None = None) -> tuple[Any, NDArray[Any]]:
     """
     Return a figure of ``height`` inch and its axes, one above the other, as an array.
 
@@ -53,7 +61,7 @@ def sheet(height, rows=1, sharex=True, heights=None):
     return figure, axes
 
 
-def key(figure, axes, columns=3):
+def key(figure: Any, axes: Any, columns: int = 3) -> None:
     """Put the legend above the axes, where it hides nothing."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
@@ -61,7 +69,7 @@ def key(figure, axes, columns=3):
                       handlelength=2.2, columnspacing=1.4, borderaxespad=0.2)
 
 
-def svg(figure, name: str, says: str) -> str:
+def svg(figure: Any, name: str, says: str) -> str:
     """
     Return a figure as an svg element.
 
@@ -92,7 +100,7 @@ def svg(figure, name: str, says: str) -> str:
     return f'<svg {box} role="img" aria-label="{escape(says, quote=True)}">{rest}'
 
 
-def thinned(y, most=MOST_POINTS):
+def thinned(y: Floats, most: int = MOST_POINTS) -> Ints:
     """
     Return rows of a line that keep its peaks, and both its ends: (m,) int.
 
@@ -111,17 +119,17 @@ def thinned(y, most=MOST_POINTS):
     return np.array(sorted(keep))
 
 
-def evenly(n, most=MOST_MARKS):
+def evenly(n: int, most: int = MOST_MARKS) -> Ints:
     """Return at most ``most`` row numbers of n, both ends included: (m,) int."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else \
         np.empty(0, int)
 
 
-def lengths(metres):
+def lengths(metres: float) -> tuple[float, str]:
     """Return the factor and the unit for lengths up to so many metres."""
     return (1e-3, 'km') if metres > 3000 else (1.0, 'm')
 
 
-def relative(most):
+def relative(most: float) -> tuple[float, str]:
     """Return the factor and the unit for relative figures up to so much."""
     return (100.0, '%') if most > 0.005 else (1e6, 'ppm')

@@ -12,7 +12,9 @@
 from dataclasses import replace
 import re
 import textwrap
+from typing import Any
 
+from odocal_ros.calib.result import LegResult
 from odocal_ros.reasons import Reason, Verdict
 
 FEW = 2      # reasons of a code that differ from leg to leg, told one by one
@@ -21,7 +23,7 @@ OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     """Return reasons with those of several legs joined that differ in nothing but the leg."""
-    joined: dict[tuple, list[str]] = {}
+    joined: dict[tuple[Any, ...], list[str]] = {}
     for reason in reasons:
         match = OF_LEG.fullmatch(reason.text)
         number, text = match.groups() if match else ('', reason.text)
@@ -32,7 +34,7 @@ def shared(reasons: tuple[Reason, ...]) -> tuple[Reason, ...]:
     return tuple(line for found in of_code.values() for line in _of_legs(found))
 
 
-def _of_legs(found):
+def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
     """Return the reasons of a code with their legs; of many that differ, the first one."""
     if not found[0][1][0]:
         return [found[0][0]]
@@ -45,7 +47,7 @@ def _of_legs(found):
                                  f'{reason.text}')]
 
 
-def _legs(numbers):
+def _legs(numbers: list[str]) -> str:
     """Return leg numbers, rising, as people say them."""
     if len(numbers) == 1:
         return f'leg {numbers[0]}'
@@ -60,7 +62,7 @@ def _legs(numbers):
     return f'legs {", ".join(said[:-1])} and {said[-1]}' if len(said) > 1 else f'legs {said[0]}'
 
 
-def bag_lines(legs, width: int) -> list[str]:
+def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
     """Return which legs are from which bag, nothing where there is but one."""
     of_bag: dict[str, list[str]] = {}
     for number, leg in enumerate(legs, 1):
@@ -89,6 +91,6 @@ def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -
     return lines
 
 
-def _wrapped(text, indent, width):
+def _wrapped(text: str, indent: str, width: int) -> list[str]:
     return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent + '   ',
                          break_long_words=False, break_on_hyphens=False)

@@ -13,11 +13,13 @@ from collections import Counter
 from datetime import datetime, UTC
 from html import escape
 from importlib.resources import files
+from typing import Any
 
 from odocal_ros.calib.choice import ABOUT, leg_estimates
-from odocal_ros.calib.result import Calibration, LegResult
+from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
 from odocal_ros.output import report_tables as tables
 from odocal_ros.output.figures import length, time_span
+from odocal_ros.output.plots_svg import Drawing
 from odocal_ros.output.reason_lines import shared
 from odocal_ros.output.summary import DEG, known, MEANING, sentence
 from odocal_ros.output.track_table import before_label, check_table
@@ -30,7 +32,7 @@ TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Take care',
           Verdict.ACCEPTED: 'Notes'}
 
 
-def report_html(calibration: Calibration, config: Config, content: dict) -> str:
+def report_html(calibration: Calibration, config: Config, content: dict[str, Any]) -> str:
     """
     Return the page of a calibration.
 
@@ -64,7 +66,8 @@ def report_html(calibration: Calibration, config: Config, content: dict) -> str:
                        **_context(calibration, config, content)) + '\n'
 
 
-def report_or_why(calibration: Calibration, config: Config, content: dict) -> tuple[str, str]:
+def report_or_why(calibration: Calibration, config: Config,
+                  content: dict[str, Any]) -> tuple[str, str]:
     """
     Return the page and why it could not be drawn, empty when it was.
 
@@ -81,7 +84,7 @@ def report_or_why(calibration: Calibration, config: Config, content: dict) -> tu
             'calibration.json.</p></body></html>\n', why)
 
 
-def _context(calibration, config, content):
+def _context(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, Any]:
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     methods = _leading(calibration.methods, calibration.estimates)
@@ -103,7 +106,7 @@ def _context(calibration, config, content):
         'digits': tables.full_digits(content)}
 
 
-def _why(reasons) -> Reason | None:
+def _why(reasons: tuple[Reason, ...]) -> Reason | None:
     """Return the gravest reason that keeps a result from being accepted, the first of such."""
     groups = grouped(reasons)
     if not groups or groups[0][0] == Verdict.ACCEPTED.value:
@@ -118,19 +121,20 @@ def grouped(reasons: tuple[Reason, ...]) -> list[tuple[str, str, list[Reason]]]:
     return [group for group in groups if group[2]]
 
 
-def _leading(methods, estimates):
+def _leading(methods: dict[str, MethodResult],
+             estimates: dict[str, Estimate]) -> dict[str, MethodResult]:
     """Return methods, those first that gave most of the result."""
     given = Counter(e.method for e in estimates.values() if e.value is not None)
     return dict(sorted(methods.items(), key=lambda item: -given[item[0]]))
 
 
-def _degrees(calibration):
+def _degrees(calibration: Calibration) -> str:
     # + 0.0: no minus before a zero
     return ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                      for angle in calibration.imu_rotation_rpy or ())
 
 
-def _made(created):
+def _made(created: str) -> str:
     """Return a date as people write it, or as it is."""
     try:
         return f'{datetime.fromisoformat(created).astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC'
@@ -138,12 +142,12 @@ def _made(created):
         return created
 
 
-def _budgets(methods):
+def _budgets(methods: dict[str, MethodResult]) -> list[tuple[str, dict[str, Any]]]:
     found = [(tables.label(name), tables.budget_table(m)) for name, m in methods.items()]
     return [(name, table) for name, table in found if table]
 
 
-def _drawn(calibration):
+def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
     """
     Return what is told of each leg, the figure of all, and the numbers of legs without figures.
 
@@ -153,14 +157,14 @@ def _drawn(calibration):
     from odocal_ros.output.plots_compare import compared
     from odocal_ros.output.plots_svg import look
     numbered, size = list(enumerate(calibration.legs, 1)), 0
-    figures: dict[int, list] = {}
-    shown = [(number, leg) for number, leg in numbered if leg.evidence is not None]
+    figures: dict[int, list[Drawing]] = {}
+    shown = [(number, leg, leg.evidence) for number, leg in numbered if leg.evidence is not None]
     with look():
         together = compared(calibration, 'all')
-        for number, leg in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
+        for number, leg, evidence in sorted(shown, key=lambda one: one[1].start_ns, reverse=True):
             if figures and size > MOST_BYTES:
                 break
-            drawn = leg_figures(leg.evidence, f'leg{number}', _relative(leg),
+            drawn = leg_figures(evidence, f'leg{number}', _relative(leg),
                                 before_label([leg]), _smoothed(leg))
             size += sum(len(drawing) for _, _, drawing in drawn)
             if not figures or size <= MOST_BYTES:
@@ -173,7 +177,8 @@ def _drawn(calibration):
     return legs, together, [number for number in had if number not in figures]
 
 
-def _leg(number, leg: LegResult, figures, several):
+def _leg(number: int, leg: LegResult, figures: list[Drawing],
+         several: bool) -> dict[str, Any]:
     rows, findings = tables.left_out(leg)
     methods = _leading(leg.methods, leg_estimates(leg))
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
@@ -189,19 +194,19 @@ def _leg(number, leg: LegResult, figures, several):
             'normalised': _smoothed(leg).get('residuals', {}).get('normalised')}
 
 
-def _smoothed(leg):
+def _smoothed(leg: LegResult) -> dict[str, Any]:
     """Return what the smoother tells of a leg beside its values, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
 
 
-def _relative(leg):
+def _relative(leg: LegResult) -> float | None:
     """Return the relative sigma of the leg's scale, None without one."""
     scale = known(leg_estimates(leg), 'scale_factor')
     return scale.sigma / abs(scale.value) if scale.value and scale.sigma else None
 
 
-def _utc(stamp_ns):
+def _utc(stamp_ns: int) -> str:
     try:
         return f'{datetime.fromtimestamp(stamp_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC'
     except (ValueError, OverflowError, OSError):

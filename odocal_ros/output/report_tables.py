@@ -11,6 +11,7 @@
 
 from collections import Counter
 import math
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def in_units(name: str, estimate: Estimate) -> tuple[str, str, str]:
     return native, '', ''
 
 
-def value_rows(calibration: Calibration) -> list[dict]:
+def value_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Return the rows of the result: name, value in both units, relative sigma, method, cause."""
     rows = []
     for name in calibration.estimates:
@@ -87,12 +88,13 @@ def undetermined(calibration: Calibration) -> list[str]:
     return [f'{word} {", ".join(found)}'.rstrip() for word, found in axes.items()]
 
 
-def _largest(method, name):
+def _largest(method: MethodResult | None, name: str) -> str:
     largest, share = largest_source(method, name)
     return f'{label(largest)} ({share:.0%})' if largest else ''
 
 
-def method_table(methods: dict[str, MethodResult], legs: tuple[LegResult, ...]) -> dict | None:
+def method_table(methods: dict[str, MethodResult],
+                 legs: tuple[LegResult, ...]) -> dict[str, Any] | None:
     """
     Return any set of methods side by side: heads, verdicts, rows of (name, cells).
 
@@ -114,7 +116,7 @@ def method_table(methods: dict[str, MethodResult], legs: tuple[LegResult, ...]) 
             'reasons': [(label(n), r) for n, m in methods.items() for r in m.reasons]}
 
 
-def budget_table(method: MethodResult) -> dict | None:
+def budget_table(method: MethodResult) -> dict[str, Any] | None:
     """
     Return a method's error budget: heads, rows of (source, shared, cells), small sources.
 
@@ -140,12 +142,12 @@ def budget_table(method: MethodResult) -> dict | None:
     return {'heads': heads, 'rows': rows, 'small': small, 'totals': totals} if rows else None
 
 
-def _number(row, name):
+def _number(row: dict[str, Any], name: str) -> float:
     value = row.get(name, 0.0)
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
 
 
-def _column(name, estimate):
+def _column(name: str, estimate: Estimate) -> tuple[str, float]:
     """Return the head of a budget's column, and the factor on its numbers."""
     if name.startswith('scale'):
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
@@ -180,7 +182,7 @@ def changed_settings(config: Config) -> list[tuple[str, str, str]]:
                 SETTINGS[name].default)]
 
 
-def _shown(value) -> str:
+def _shown(value: Any) -> str:
     if isinstance(value, tuple):
         return f'[{", ".join(_shown(v) for v in value)}]'
     if isinstance(value, bool):
@@ -188,7 +190,7 @@ def _shown(value) -> str:
     return repr(value) if isinstance(value, float) else str(value) or "''"
 
 
-def full_digits(content: dict) -> list[tuple[str, str, str, str, str]]:
+def full_digits(content: dict[str, Any]) -> list[tuple[str, str, str, str, str]]:
     """Return each number of the result as calibration.json has it: name, value, sigma, ..."""
     rows = []
     for name, entry in content['result'].items():

@@ -10,11 +10,13 @@
 """Texts of the files that other programs load unchanged."""
 
 import re
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from odocal_ros.calib.result import BESIDE, Calibration
+from odocal_ros.data.arrays import Floats
 from odocal_ros.output.controller_files import CONTROLLERS, controllers
 from odocal_ros.output.device_files import DEVICES, devices
 from odocal_ros.output.file_head import about, head
@@ -36,7 +38,7 @@ TWO_WHEELS = ('scale_factor_left', 'scale_factor_right', 'heading_error', 'track
 AXES = 'xyz'
 
 
-def texts(calibration: Calibration, config: Config, content: dict) -> dict[str, str]:
+def texts(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """
     Return file texts by name for the formats asked.
 
@@ -55,7 +57,7 @@ def texts(calibration: Calibration, config: Config, content: dict) -> dict[str, 
     return out
 
 
-def _params(calibration, content) -> str:
+def _params(calibration: Calibration, content: dict[str, Any]) -> str:
     unknown = dict.fromkeys(TWO_WHEELS, {'value': None, 'sigma': None})
     result: dict[str, object] = {}
     for name, entry in (unknown | content['result']).items():
@@ -71,7 +73,7 @@ def _params(calibration, content) -> str:
             'points left of forward\n' + parameters({'result': result}))
 
 
-def _autoware(calibration, config, content) -> dict[str, str]:
+def _autoware(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     out = {}
     top = head(calibration, content)
     factor, bias_i = _speed_factor(calibration), _gyro_bias_i(calibration, config)
@@ -82,7 +84,7 @@ def _autoware(calibration, config, content) -> dict[str, str]:
     return out
 
 
-def _speed_factor(calibration) -> float | None:
+def _speed_factor(calibration: Calibration) -> float | None:
     """Return what to multiply reported speeds by; pulses have one only against a nominal K0."""
     scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
@@ -90,23 +92,25 @@ def _speed_factor(calibration) -> float | None:
     return None if ratio is None else ratio.value
 
 
-def _velocity_converter(factor, frame) -> str:
+def _velocity_converter(factor: float, frame: str) -> str:
     return ('# for autoware vehicle_velocity_converter, in place of its param file of this name;\n'
             '# the two stddev are its defaults, not measured here\n' + parameters({
                 'speed_scale_factor': factor, 'velocity_stddev_xx': 0.2,
                 'angular_velocity_stddev_zz': 0.1, 'frame_id': frame}))
 
 
-def _gyro_bias_i(calibration, config):
+def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
     """Return the gyro bias in the Imu's own axes and unit as sent, (3,), None if unknown."""
-    bias = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
+    found = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
+    bias = [e.value for e in found if e is not None and e.value is not None]
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
-    if C_bi is None or any(e is None or e.value is None for e in bias):
+    if C_bi is None or len(bias) < len(AXES):
         return None
-    return np.asarray(C_bi).T @ [e.value for e in bias] / config.imu.gyro_scale
+    bias_i: Floats = np.asarray(C_bi).T @ bias / config.imu.gyro_scale
+    return bias_i
 
 
-def _imu_corrector(bias_i) -> str:
+def _imu_corrector(bias_i: Floats) -> str:
     offsets = {f'angular_velocity_offset_{axis}': float(b)
                for axis, b in zip(AXES, bias_i, strict=True)}
     return ('# for autoware imu_corrector, in place of its param file of this name;\n'
@@ -114,7 +118,8 @@ def _imu_corrector(bias_i) -> str:
                 offsets | {f'angular_velocity_stddev_{axis}{axis}': 0.03 for axis in AXES}))
 
 
-def _transform(calibration, config, content) -> dict[str, str]:
+def _transform(calibration: Calibration, config: Config,
+               content: dict[str, Any]) -> dict[str, str]:
     if calibration.imu_rotation_rpy is None:
         return {}
     xyz = [repr(float(v)) for v in config.imu.lever_arm]
@@ -144,7 +149,7 @@ def _transform(calibration, config, content) -> dict[str, str]:
             COMMAND: command}
 
 
-def _xml(root, note: str) -> str:
+def _xml(root: Any, note: str) -> str:
     """Return an element as text after a comment."""
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding='unicode')

@@ -9,8 +9,10 @@
 
 """What the search of CN104359492A found on each leg, where it was asked for, as lines."""
 
+from odocal_ros.calib.result import LegResult
 
-def search_lines(legs) -> list[str]:
+
+def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
     """Return a table of each leg's search, empty where there was none."""
     lines = []
     for k, leg in enumerate(legs, 1):

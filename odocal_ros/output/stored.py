@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import json
 import math
 from pathlib import Path
+from typing import Any, TypeVar
 
 from odocal_ros.calib.carried import Carried, carried_from
 from odocal_ros.calib.result import BESIDE, Estimate
@@ -21,6 +22,7 @@ from odocal_ros.output.files import MAIN, SCHEMA
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, flat
 
+T = TypeVar('T')
 # what the Imu's constants are of
 SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade')
 BIGGEST = 2**28      # bytes; a day of legs is a thousandth of it
@@ -42,7 +44,7 @@ class Stored:
     estimates: dict[str, Estimate]
     legs: frozenset[tuple[int, int]]
     bags: frozenset[str]
-    config: dict
+    config: dict[str, Any]
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
     carried: Carried | None = None      # what it leaves for legs to come, with leg.automatic
@@ -87,11 +89,11 @@ def read_stored(path: Path) -> Stored:
         raise BadUsage(f'{name}: no calibration.json as odocal writes it ({why})') from None
 
 
-def _no_constant(text):
+def _no_constant(text: str) -> None:
     raise ValueError(f'{text} is no number')
 
 
-def stored_from(content, name: str) -> Stored:
+def stored_from(content: dict[str, Any], name: str) -> Stored:
     """Return the calibration of the content of a calibration.json; ValueError where it is none."""
     if not isinstance(content, dict):
         raise ValueError('no object at the top')
@@ -148,17 +150,18 @@ def known_imu(config: Config) -> Carried | None:
     return found.imu
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _part(content, key, kind):
+def _part(content: dict[str, Any], key: str, kind: type[T]) -> T:
     if not isinstance(content.get(key), kind):
         raise ValueError(f'{key!r} is missing or of the wrong kind')
-    return content[key]
+    part: T = content[key]
+    return part
 
 
-def _estimate(entry, key) -> Estimate:
+def _estimate(entry: dict[str, Any], key: str) -> Estimate:
     if not isinstance(entry, dict) or not {'value', 'sigma', 'unit'} <= set(entry):
         raise ValueError(f'result.{key} lacks value, sigma or unit')
     value, sigma = (_number(entry[part], f'result.{key}.{part}') for part in ('value', 'sigma'))
@@ -179,7 +182,7 @@ def check_estimate(name: str, value: float | None, sigma: float | None) -> None:
         raise ValueError(f'result.{name}: its value is not positive')
 
 
-def _number(value, what) -> float | None:
+def _number(value: float | None, what: str) -> float | None:
     if value is None:
         return None
     try:
@@ -191,7 +194,8 @@ def _number(value, what) -> float | None:
         raise ValueError(f'{what} is too large') from None
 
 
-def _shares(methods, method, parameter) -> dict[str, tuple[float, bool]]:
+def _shares(methods: dict[str, dict[str, Any]], method: str | None,
+            parameter: str) -> dict[str, tuple[float, bool]]:
     """Return the budget of a parameter; empty where the file has none that can be read."""
     entry = methods.get(method) if isinstance(method, str) else None
     budget = entry.get('budget') if isinstance(entry, dict) else None

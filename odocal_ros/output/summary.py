@@ -117,12 +117,12 @@ def inverse(scale: Estimate) -> str:
     return f'{with_sigma(1 / scale.value, sigma)} {COUNTS[scale.unit]}'
 
 
-def _with_unit(estimate):
+def _with_unit(estimate: Estimate) -> str:
     unit = '' if estimate.unit == '1' else f' {estimate.unit}'
     return with_sigma(estimate.value, estimate.sigma) + unit
 
 
-def _head(calibration, styled):
+def _head(calibration: Calibration, styled: bool) -> list[str]:
     legs = calibration.legs
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     verdict = calibration.verdict.value.upper()
@@ -133,7 +133,7 @@ def _head(calibration, styled):
             f'{time_span(duration)}']
 
 
-def _values(calibration, width):
+def _values(calibration: Calibration, width: int) -> list[str]:
     estimates = calibration.estimates
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
     lines = [_line('scale factor', _scale_text(scale) + _mostly(calibration, 'scale_factor'))]
@@ -169,7 +169,7 @@ def _values(calibration, width):
             else re.split(f'   (?:{"|".join(MOSTLY)}) ', line)[0] for line in lines if line]
 
 
-def _gyro_scale(calibration):
+def _gyro_scale(calibration: Calibration) -> str:
     """Return by what the gyro's turns are to be multiplied, '' where that is near 1."""
     method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
@@ -178,7 +178,7 @@ def _gyro_scale(calibration):
     return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
 
-def _arm(estimates, arm, word):
+def _arm(estimates: dict[str, Estimate], arm: str, word: str) -> str:
     """Return the coordinates of a lever arm that are known, '' without any."""
     found = {axis: known(estimates, f'{arm}_{axis}') for axis in 'xyz'}
     found = {axis: e for axis, e in found.items() if e.value is not None}
@@ -186,7 +186,7 @@ def _arm(estimates, arm, word):
     return _line(f'{word} {", ".join(found)}', f'{shown} m') if found else ''
 
 
-def _mostly(calibration, name):
+def _mostly(calibration: Calibration, name: str) -> str:
     """Return which source makes most of an estimate's sigma, or the most of all."""
     estimate = calibration.estimates.get(name, NONE)
     if estimate.value is None:
@@ -196,11 +196,11 @@ def _mostly(calibration, name):
     return f'   {MOSTLY[share <= 0.5]} {label}' if largest else ''
 
 
-def _line(label, text):
+def _line(label: str, text: str) -> str:
     return f'  {label:<19} {text}'.rstrip()
 
 
-def _scale_text(scale):
+def _scale_text(scale: Estimate) -> str:
     if scale.value is None:
         return 'not determined'
     relative = '' if not (scale.sigma and scale.value) else (
@@ -208,16 +208,16 @@ def _scale_text(scale):
     return _with_unit(scale) + relative
 
 
-def _angle_text(angle, width):
+def _angle_text(angle: Estimate, width: int) -> str:
     if angle.value is None:
         return 'not determined'
     rad = f'   ({with_sigma(angle.value, angle.sigma, signed=True)} rad)' if width >= WIDTH else ''
     return f'{with_sigma(angle.value, angle.sigma, DEG, signed=True)} deg{rad}'
 
 
-def _leg_table(legs, width):
-    rows = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes', 'scale factor', 'yaw, deg',
-             'verdict')]
+def _leg_table(legs: tuple[LegResult, ...], width: int) -> list[str]:
+    rows: list[tuple[str, ...]] = [('leg', 'start, UTC', 'distance', 'min:s', 'fixes',
+                                    'scale factor', 'yaw, deg', 'verdict')]
     rows += [(str(number), *_leg_row(leg), verdict) for number, (leg, verdict) in enumerate(
         zip(legs, leg_verdicts(legs), strict=True), 1)]
     if width < WIDTH:        # without the date, the duration and the number of fixes
@@ -226,18 +226,19 @@ def _leg_table(legs, width):
     return _columns(rows) + bag_lines(legs, width) if legs else []
 
 
-def _columns(rows):
+def _columns(rows: list[tuple[str, ...]]) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ['  ' + '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)
                              ).rstrip() for row in rows]
 
 
-def _method_table(calibration):
+def _method_table(calibration: Calibration) -> list[str]:
     """Return the methods side by side, nothing for one."""
     methods = calibration.methods
     if len(methods) < 2:
         return []
-    rows = [('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
+    rows: list[tuple[str, ...]] = [
+        ('method', 'scale factor', 'yaw, deg', 'pitch, deg', 'verdict')]
     for name, method in methods.items():
         scale, *angles = (known(method.estimates, n) for n in ('scale_factor', *ANGLES))
         rows.append((name, '-' if scale.value is None else with_sigma(scale.value, scale.sigma),
@@ -246,7 +247,7 @@ def _method_table(calibration):
     return _columns(rows)
 
 
-def _leg_row(leg: LegResult):
+def _leg_row(leg: LegResult) -> tuple[str, ...]:
     estimates = leg_estimates(leg)
     scale, yaw = (known(estimates, n) for n in ('scale_factor', 'yaw_mounting_angle'))
     started = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
@@ -257,7 +258,7 @@ def _leg_row(leg: LegResult):
             '-' if yaw.value is None else with_sigma(yaw.value, yaw.sigma, DEG, signed=True))
 
 
-def _budget(calibration, width, small):
+def _budget(calibration: Calibration, width: int, small: bool) -> list[str]:
     estimates = calibration.estimates
     scale = known(estimates, 'scale_factor')
     method = calibration.methods.get(scale.method)

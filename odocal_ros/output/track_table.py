@@ -11,7 +11,7 @@
 
 import math
 
-from odocal_ros.calib.result import PerDistance, TrackCheck
+from odocal_ros.calib.result import LegResult, PerDistance, TrackCheck
 from odocal_ros.output.figures import length
 
 SIDES = 'before', 'after'
@@ -35,7 +35,7 @@ def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:
            for name in ('max', 'end', 'percent_of_distance')})
 
 
-def in_pieces(legs) -> list[PerDistance]:
+def in_pieces(legs: list[LegResult] | tuple[LegResult, ...]) -> list[PerDistance]:
     """Return the error per distance driven of all legs, pooled over pieces."""
     found: dict[float, list[PerDistance]] = {}
     for one in (x for leg in legs for x in leg.per_distance):
@@ -49,14 +49,14 @@ def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
                        math.sqrt(sum(x.pieces * x.after**2 for x in parts) / whole), whole)
 
 
-def before_label(legs) -> str:
+def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
     """Return what the track before the correction rests on: settings, or none of the scale."""
     configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
                      for leg in legs for m in leg.methods.values())
     return 'as configured' if configured else 'with a rough scale'
 
 
-def check_table(legs) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Return heads and rows (label, cells) of dead reckoning against the fixes, none without."""
     pieces = in_pieces(legs)
     rows = []
@@ -72,7 +72,7 @@ def check_table(legs) -> tuple[list[str], list[tuple[str, list[str]]]]:
     return [*heads, 'rms', 'max', 'mean', 'at end', 'of way'], rows
 
 
-def track_lines(legs, width: int) -> list[str]:
+def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
     """Return the table of dead reckoning against the fixes, as wide as there is room."""
     heads, rows = check_table(legs)
     if not rows:

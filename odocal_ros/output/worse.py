@@ -48,7 +48,7 @@ def is_worse(old: Stored, new: Stored) -> str:
     return ''
 
 
-def _worse(label, old, new) -> str:
+def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
     if old is None or old.value is None or not old.sigma:
         return ''
     if new is None or new.value is None:
