@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.outside import GIVEN, Heading, HEADING_RATE
+from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, HEADING_RATE
 from odocal_ros.calib.smoother.state import M, State
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.alignment import HEADING_LIMIT
@@ -135,7 +135,7 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     """Return the heading that the settings promise; a course is none, and none a gyrocompass."""
     asked, sigma = config.alignment.heading_source, config.alignment.heading_sigma
     if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
-        t, noise, asked = np.zeros(1), GIVEN, 'fixed'
+        t, noise, asked = np.zeros(1), GIVEN_HEADING_NOISE, 'fixed'
     elif asked in SENT and sigma <= HEADING_LIMIT:
         t = _times(t_begin, drive.duration, HEADING_RATE, spacing)
         noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * HEADING_RATE))

@@ -17,7 +17,7 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother import bound
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.priors import ANY_SPEED, ANY_WAY, ANYWHERE
+from odocal_ros.calib.smoother.priors import START_SIGMAS
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.rests import STILL_SPEED, STILL_TURN
 from odocal_ros.calib.smoother.state import BARE, E, M, SLOW, WITH_SLOW
@@ -84,7 +84,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
             power = correlation_time / 2 * np.array([levels['slow']] * 2 + [levels['slow_up']])
             add(np.concatenate([-decay * single[SLOW], single[SLOW]], axis=1),
                 (block(k), block(k + 1)), np.diag(1 / np.sqrt(power * (1 - decay**2))))
-    first = np.concatenate([np.full(3, ANYWHERE), np.full(3, ANY_SPEED), ANY_WAY,
+    first = np.concatenate([*(np.broadcast_to(sigma, 3) for _, sigma in START_SIGMAS.values()),
                             problem.priors.gyro_bias, problem.priors.accel_bias])
     add(single[:15], (block(0),), np.diag(1 / first))
     if n == WITH_SLOW:

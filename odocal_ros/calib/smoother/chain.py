@@ -30,8 +30,7 @@ from odocal_ros.data.mapped import let_go, room
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
-INTERVALS_AT_A_TIME = 64    # intervals worked on at a time: their matrices stay in the cache
-LET_GO_AFTER = 512          # intervals worked on, the same of what lies in a file
+LET_GO_AFTER = 512          # intervals worked on until what lies in a file is let go
 SHORT_LEG = 1200            # intervals of a leg so short that what is made of them may be kept
 
 
@@ -170,7 +169,8 @@ def blocks(n: int) -> Iterator[slice]:
     those of a stack, and results are to be the same whatever the chunks. What lies in files is let
     go now and then.
     """
-    edges = np.linspace(0, n, max(1, -(-n // INTERVALS_AT_A_TIME)) + 1).astype(int)
+    at_a_time = 64      # their matrices stay in the cache
+    edges = np.linspace(0, n, max(1, -(-n // at_a_time)) + 1).astype(int)
     for first, last in pairwise(edges.tolist()):
         yield slice(first, last)
         if last // LET_GO_AFTER > first // LET_GO_AFTER or last == n:

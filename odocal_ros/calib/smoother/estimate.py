@@ -24,7 +24,8 @@ from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.part import JUMP, SPREAD
+from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
+from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.state import (
@@ -38,34 +39,50 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 
-MOST_PASSES = 40    # iterations
-# sigmas of a step from which residuals are noise, and are no more; the first step with derivatives
-# by the fitted signal takes back what those with noise in them made of it, however much
-FITTED_BELOW, MEASURED_ABOVE = 1.0, 4.0
-SETTLED_SIGMAS = 0.03    # sigmas that the constants may still move
-CREEPING_SIGMAS = 0.5    # the same: values that are worth having, with wider sigmas
-NEARLY_SIGMAS = 0.1    # the same of scale and mounting at the end, if but a delay goes to and fro
-SETTLED_WEIGHT = np.where(np.arange(M) < 3, 1.0, 0.3)# how sharply each constant is held to that
-# rad: an angle known no better drifts where the cost is flat, and is refused (lever arms: m)
-FLAT_ANGLE = np.where(np.isin(np.arange(M), (YAW, PITCH)), 0.1, np.inf)
-FIRST_TAILS, LAST_TAILS = 3, 15    # iterations in which heavy tails are looked for
-QUIET_SIGMAS = 0.01                # relative change of the sigmas of scale and mounting, the same
-# pseudo-observations that a level is as first believed (Imu), or as it is (the others: more of
-# them end the way to a small noise too early)
-SENSOR = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
-LEVEL_INERTIA = 1.0
-# power on the steps of a level: at first (the fixed point is slow where a noise is small), more
-# with each step the same way, less with each that turns back
-RELAXATION, SPEED_UP, SLOW_DOWN, MOST_RELAXATION = 1.6, 1.25, 0.5, 3.0
+
+@dataclass(frozen=True)
+class Settling:
+    """
+    When a fit has settled: by how much of its sigma a constant may still move.
+
+    Judgement: what is left of a step is then far below what is stated.
+    """
+
+    # residuals are noise from the first on, and no more from the second; the first step with
+    # derivatives by the fitted signal takes back what noise made of it, however much
+    fitted_below: float = 1.0
+    measured_above: float = 4.0
+    moves: float = 0.03         # a constant may still
+    others: float = 0.3         # weight of what is not scale or mounting, in that
+    nearly: float = 0.1         # scale and mounting, after the last pass
+    creeping: float = 0.5       # the same: values that are worth having, with wider sigmas
+    sigmas: float = 0.01        # relative change of the sigmas of scale and mounting
+    # rad, sigma: an angle known no better drifts where the cost is flat, and is refused
+    flat_angle: float = 0.1
+    spread: float = 0.05        # relative change of a slip's variance from which it moves
+
+
+@dataclass(frozen=True)
+class OverRelaxation:
+    """Powers on the steps of a level: the fixed point is slow where a noise is small."""
+
+    first: float = 1.6          # from 2 on a level by itself goes to and fro: its steps overshoot
+    faster: float = 1.25        # times, with each step the same way
+    slower: float = 0.5         # times, with each that turns back
+    most: float = 3.0
+
+
+SETTLING, RELAXATION = Settling(), OverRelaxation()
+# pseudo-observations that a level of the Imu is as its prior has it. Judgement: a few seconds'
+# worth
+PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 # levels of rows that slips and jumps are factors on
 SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
 JUMPING = ('slow', 'slow_up', 'correlation_time')
-SLIP_STIRS = 0.05    # relative change of a slip's variance from which it moves
-SLIP_SIGMAS = 3.0    # sigmas beyond which an interval of the odometer is a slip
-PRIOR_GIVES_WAY = 2.0    # sigmas of a prior beyond which it gives way
-MOST_WIDENED = 30.0                                            # times its own sigma
+# sigmas of a prior beyond which it gives way to the data. Statistical: one sound prior in 22
+PRIOR_GIVES_WAY = 2.0
 SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there or is not
-KNOWN_SHARE = 0.5    # of the prior's variance: what is left where the data know as much
+AGAIN_PASSES = 6    # of a fit that sets out from one that settled, but for a prior: few are needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +127,7 @@ class Fit(Outline):
         return solve(self.weighted.normal()).neighbours()
 
 
-def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, frozen=False,
+def fit(problem: Problem, state: State, levels: Levels, most=40, *, frozen=False,
         about: WarmStart | None = None, trace=None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
@@ -133,7 +150,11 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, fro
     was_fitted = fitted
     priors, first = (about.priors, about.first) if about else (problem.priors,) * 2
     spread = about.spread if about else np.ones((len(state.t) - 1, SPREAD))
-    tails, slipping = 1 if about else FIRST_TAILS, False
+    # passes in which heavy tails are looked for: before, residuals are none, and in the end they
+    # rest
+    tails, last_tails, slipping = 1 if about else 3, 15, False
+    of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
+    flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
     count = 0
     while True:
@@ -142,35 +163,36 @@ def fit(problem: Problem, state: State, levels: Levels, most=MOST_PASSES, *, fro
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
         solved = solve(weighted.normal())
         sigma = np.sqrt(np.diag(solved.covariance))
-        weight = np.where(sigma < FLAT_ANGLE, SETTLED_WEIGHT, 0.0)
+        weight = np.where(sigma < flat, of_all, 0.0)
         move = np.abs(solved.step_border / sigma * weight).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(fitted and not slipping and move < SETTLED_SIGMAS
-                       and (frozen or change < QUIET_SIGMAS and count > tails + 2))
+        settled = bool(fitted and not slipping and move < SETTLING.moves
+                       and (frozen or change < SETTLING.sigmas and count > tails + 2))
         first_fitted, was_fitted = fitted and not was_fitted, fitted
-        fitted = bool(first_fitted or move < (MEASURED_ABOVE if fitted else FITTED_BELOW))
+        fitted = bool(first_fitted or move < (
+            SETTLING.measured_above if fitted else SETTLING.fitted_below))
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
             trace(count, state, levels, weighted, solved)
         if settled or count >= most:
             still = np.abs(solved.step_border / sigma)[:3].max()
-            settled = settled or bool(max(still, change) < NEARLY_SIGMAS)
+            settled = settled or bool(max(still, change) < SETTLING.nearly)
             break
         if not frozen:
             near = solved.neighbours()
-            tail = tails <= count <= LAST_TAILS
+            tail = tails <= count <= last_tails
             # slips and the levels of what slips are factors on the same rows: never in one pass
             found = slips(weighted, near, spread) if tail and not slipping else spread
-            slipping = bool(np.abs(np.log(found / spread)).max() > SLIP_STIRS)
+            slipping = bool(np.abs(np.log(found / spread)).max() > SETTLING.spread)
             levels = update(weighted, near, levels, problem, pace, slipping)
             spread = found
             if tail:
                 priors = widened(first, priors, state, solved, near, fitted)
             del near
         del sums, weighted, solved      # the most that a long leg takes
-    creeping = not settled and bool(still < CREEPING_SIGMAS and change < CREEPING_SIGMAS)
+    creeping = not settled and bool(max(still, change) < SETTLING.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
                likelihood, weighted, solved)
@@ -188,14 +210,15 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
         if slipping and name in SLIPPING + JUMPING:
             continue
         level = levels[name]
-        pseudo = SENSOR.get(name, LEVEL_INERTIA)
-        pull = pseudo * (problem.first_levels[name] / level if name in SENSOR else 1.0)
+        # the others have one that a level is as it is: more end the way to a small noise too early
+        pseudo = PRIOR_ROWS.get(name, 1.0)
+        pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
         step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
                                     0.03, 30.0)))
-        first = RELAXATION if name in SLIPPING or name in SENSOR else 1.0
-        relaxation, last = pace.get(name, (first, 0.0))
-        relaxation = relaxation * (SLOW_DOWN if step * last < 0 else SPEED_UP if last else 1.0)
-        pace[name] = min(relaxation, MOST_RELAXATION), step
+        first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
+        power, last = pace.get(name, (first, 0.0))
+        power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
+        pace[name] = min(power, RELAXATION.most), step
         move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
         new[name] = max(level * float(np.exp(move)), problem.least[name])
     return levels.but(**new)
@@ -210,7 +233,7 @@ def slips(weighted, neighbours, spread):
     noise, found = (np.concatenate(x, axis=1) for x in zip((noise, found), jumps, strict=True))
     z2 = noise**2 / np.maximum(found, 1e-12)
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
-    wanted = np.clip(spread * z2 / SLIP_SIGMAS**2, 1.0, 1e6)
+    wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
     return wanted
@@ -228,7 +251,8 @@ def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Pr
     P0 = np.diagonal(neighbours[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    untold = SMALL & ((variance > KNOWN_SHARE * now.constants**2) | (not fitted))
+    # of the prior's variance half is left where the data know as much
+    untold = SMALL & ((variance > now.constants**2 / 2) | (not fitted))
     constants[untold] = now.constants[untold]
     constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
     return replace(
@@ -239,9 +263,13 @@ def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Pr
 
 
 def _wider(first, now, off, variance):
-    """Return sigmas at which ``off`` is no more than PRIOR_GIVES_WAY, none below the first."""
+    """
+    Return sigmas at which ``off`` is no more than PRIOR_GIVES_WAY, none below the first.
+
+    30 times the first is the most: a prior so far off is a setting that is wrong, and said.
+    """
     held = np.isfinite(first)
     first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
     z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)
-    wide = np.clip(now_ * np.sqrt(z2) / PRIOR_GIVES_WAY, first_, MOST_WIDENED * first_)
+    wide = np.clip(now_ * np.sqrt(z2) / PRIOR_GIVES_WAY, first_, 30 * first_)
     return np.where(held, wide, np.inf)

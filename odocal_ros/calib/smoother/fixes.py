@@ -11,6 +11,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
@@ -34,9 +35,6 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew
-
-NO_HEIGHT = 1e6       # m, sigma of a height that is not there
-LEAST_FIX = 0.005     # m
 
 
 class Fixes(PointRows):
@@ -103,7 +101,7 @@ class Fixes(PointRows):
     @classmethod
     def first_levels(cls, problem):
         """Return first levels, factors on the stated variance, and their least."""
-        least = (LEAST_FIX / problem.fix_sigma)**2
+        least = (LEAST.fix / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
@@ -133,5 +131,5 @@ def whitener(covariance_n, no_height):
     """Return inverse roots of covariances, lower triangular: level rows know no height."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0
-    C[no_height, 2, 2] = NO_HEIGHT**2
+    C[no_height, 2, 2] = 1e6**2     # m^2, of a height that is not there
     return np.linalg.inv(np.linalg.cholesky(C))

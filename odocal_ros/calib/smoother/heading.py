@@ -11,11 +11,10 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
 from odocal_ros.calib.smoother.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI
 from odocal_ros.nav.angles import arctan2, wrap
-
-LEAST_HEADING_SIGMA = 5e-4    # rad: no receiver is better
 
 
 class HeadingRows(OutsideRows):
@@ -31,7 +30,7 @@ class HeadingRows(OutsideRows):
     @staticmethod
     def least(sent):
         """Return the least level."""
-        return {'heading': (LEAST_HEADING_SIGMA / float(np.median(sent.noise)))**2}
+        return {'heading': (LEAST.heading / float(np.median(sent.noise)))**2}
 
 
 def _heading(sent, state, points):

@@ -26,18 +26,14 @@ import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
-from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit
 from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR
 from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K
 
-THERE = 0.5                       # probability that an imperfection is there
-NO_ERROR_SHARE = 1e-3                  # of the usual sigma: as good as no error
-KIND_ROUNDS, SAME_SIGMAS = 20, 1e-3    # over the kinds; relative change of the sigmas that is none
-STAYS_SHARE = 0.98                     # of the usual variance
-REMOVAL_PASSES = 6                     # passes to take out what is not there
+SAME_SIGMAS = 1e-3      # relative change of prior sigmas that is none
 
 
-def mixture_prior(data, pull, odds=THERE):
+def mixture_prior(data, pull, odds=0.5):
     """
     Return how large errors of one kind are to be taken for.
 
@@ -48,11 +44,12 @@ def mixture_prior(data, pull, odds=THERE):
     pull : (k, k) array
         Outer square of the gradient at no error, of the same; ``data`` where there are none.
     odds : float
-        Probability that they are there.
+        Prior probability that they are there; more costs where they are not (docs/decisions/0008).
 
     Returns
     -------
-    (k,) array of prior variances, NO_ERROR_SHARE^2 to 1, and the weight of the usual ones.
+    (k,) array of prior variances, 1e-6 (as good as no error) to 1, and the weight of the usual
+    ones.
 
     """
     one = np.eye(len(data))
@@ -63,7 +60,7 @@ def mixture_prior(data, pull, odds=THERE):
     square = weight * np.diag(wide) + weight * (1 - weight) * mean_square
     rest = 1 / square - 1 / np.diag(np.linalg.inv(data))     # less what the data tell of each
     taken = np.where(rest > 1.0, 1 / np.maximum(rest, 1e-300), 1.0)
-    return np.clip(taken, NO_ERROR_SHARE**2, 1.0), float(weight)
+    return np.clip(taken, 1e-3**2, 1.0), float(weight)
 
 
 def weigh_kinds(data, gradient, kinds):
@@ -74,7 +71,7 @@ def weigh_kinds(data, gradient, kinds):
     for errors that are not there.   kinds : slices.
     """
     prior = np.ones(len(data))
-    for _ in range(KIND_ROUNDS):
+    for _ in range(20):     # rounds over the kinds, at most
         before = prior.copy()
         for kind in kinds:
             own = np.arange(len(data))[kind]
@@ -113,13 +110,21 @@ def judged_priors(now: Fit, grade, found=True):
     kinds = [np.isin(there, np.arange(len(usual))[kind]) for kind in KINDS]
     prior = weigh_kinds(data, both @ (now.state.constants[pick] / sigma) if found else None,
                         [kind for kind in kinds if kind.any()])
-    # what is there may be more than usual: then the prior has given way, and stays so
-    taken = np.where(prior > STAYS_SHARE, np.maximum(last, sigma), np.sqrt(prior) * sigma)
+    taken = _taken(prior, last, sigma)
     if np.abs(np.log(taken / last)).max() < SAME_SIGMAS:
         return now.priors
     sigmas = np.full(len(usual), NO_ERROR)
     sigmas[there] = taken
     return with_imperfect(now.priors, sigmas)
+
+
+def _taken(prior, last, sigma):
+    """
+    Return prior sigmas of variances in units of the usual ones: (k,) each.
+
+    What is there may be more than usual: then the prior has given way, and stays so.
+    """
+    return np.where(prior > 0.98, np.maximum(last, sigma), np.sqrt(prior) * sigma)
 
 
 def weighed_together(borders, steps) -> list[Border]:
@@ -145,7 +150,7 @@ def weighed_together(borders, steps) -> list[Border]:
     kind = [np.isin(at, [of.names.index(n) for n in CONSTANTS[IMPERFECT][own]]) for own in KINDS]
     prior = weigh_kinds(data + 1e-3 * np.eye(len(at)), gradient * sigma,
                         [own for own in kind if own.any()])
-    taken = np.where(prior > STAYS_SHARE, np.maximum(of.used[at], sigma), np.sqrt(prior) * sigma)
+    taken = _taken(prior, of.used[at], sigma)
     return legs.believing(at, taken)
 
 
@@ -176,6 +181,6 @@ def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
         return now
     outline = about.outline()
     del now, about      # the equations of one fit at a time
-    last = fit(problem, outline.state, outline.levels, REMOVAL_PASSES, about=outline, frozen=True,
+    last = fit(problem, outline.state, outline.levels, AGAIN_PASSES, about=outline, frozen=True,
                trace=trace)
     return replace(last, iterations=outline.iterations + last.iterations)

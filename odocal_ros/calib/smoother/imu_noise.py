@@ -11,19 +11,15 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.data.pieces import by_step, chunks
-
-LEAST_REST = 15      # second differences over 1 s at rest, to know a noise by
-# noises of the Imu, a tenth of navigation grade: settings may say 0, and an Imu with a dead band
-# (or a simulator's) is silent at rest
-LEAST_SENSOR = {'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7}
 
 
 def sensor_noise(grade) -> dict[str, float]:
     """Return the roots of the Imu's noise levels by its grade, SI: white ones and walks."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
-    return {name: max(sigma, LEAST_SENSOR[name]) for name, sigma in stated.items()}
+    return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
 
 
 def at_rest(imu, leg, still) -> dict:
@@ -44,9 +40,9 @@ def at_rest(imu, leg, still) -> dict:
             d = np.diff((x / T)[run], n=2, axis=0) * np.sqrt(T[run][1:-1] / 6)
             sums[i] += (d**2).sum() / 3
         freedom += len(run) - 2
-    if freedom < LEAST_REST:
+    if freedom < 15:        # of three axes each: a variance by fewer is good to 20 % at best
         return {}
-    return {name: max(float(total / freedom), LEAST_SENSOR[name]**2)
+    return {name: max(float(total / freedom), LEAST.imu[name]**2)
             for name, total in zip(('gyro', 'accel'), sums, strict=True)}
 
 

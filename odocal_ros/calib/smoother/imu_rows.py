@@ -26,7 +26,6 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.strapdown import rotation_increments
 
 Floats = NDArray[np.float64]
-ROWS_AT_A_TIME = 8192    # samples worked on at a time: their arrays stay in the cache
 
 
 def keyframes(t, t_begin, t_end, spacing):
@@ -73,8 +72,8 @@ class ImuRows:
 
     def parts(self):
         """Yield first and last of the keyframes of some intervals, and their rows."""
-        K = len(self.key) - 1
-        per = max(1, int(ROWS_AT_A_TIME * K / (self.key[-1] - self.key[0] + 1)))
+        K, at_a_time = len(self.key) - 1, 8192      # rows, whose arrays stay in the cache
+        per = max(1, int(at_a_time * K / (self.key[-1] - self.key[0] + 1)))
         for first in range(0, K, per):
             last = min(first + per, K)
             yield first, last, self.between(first, last)

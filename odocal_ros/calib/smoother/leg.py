@@ -20,8 +20,8 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
-COARSE_STEP = 0.05    # m/s: a speed in finer steps is added up, what it rounds a noise
-BEFORE_MARK = 30.0    # s: a standstill that ended longer before the start mark is another drive
+# s: a standstill that ended longer before the start mark is another drive. Judgement
+BEFORE_MARK = 30.0
 
 
 def _none(*shape):
@@ -60,9 +60,14 @@ class SmootherLeg:
 
     @property
     def by_steps(self) -> bool:
-        """Tell whether the odometer is heard by the steps of its speed, not by its way."""
+        """
+        Tell whether the odometer is heard by the steps of its speed, not by its way.
+
+        A speed in steps of less than 0.05 m/s is added up, what it rounds a noise: a cruise of a
+        minute in one cell is then 1 m off at most.
+        """
         coarse = self.travel.coarse
-        return coarse is not None and coarse.step * self.rough_scale > COARSE_STEP
+        return coarse is not None and coarse.step * self.rough_scale > 0.05
 
 
 def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:

@@ -16,13 +16,9 @@ from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-WORSE_THAN_GRADE = 3.0      # times the grade's noise or bias that is another sensor
-ODD_FIXES = 0.15            # share of the fixes with little weight
-ODD_ROAD = 0.15             # share of the intervals in which a wheel slips
-SLIDING_NOISE = 0.2         # m/sqrt(s) sideways: no vehicle on wheels
-HEADING_OFF_SIGMAS = 3.0    # sigmas of the outside heading beyond which it is said to be wrong
-MISFIT_WIDENING = 2.0       # factor on the sigmas where the model does not hold
+WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: grades are 5 apart
 BY_SHAKING = 'the Imu errs more than its grade, in ways that are not white noise'
 SHAKEN = ('What shakes an Imu is no white noise; the sigmas were widened. Mount it firmly and '
           'away from the engine.')
@@ -47,29 +43,29 @@ def mismatch(problem, fit, config):
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; estimated from the drive instead',
                               '' if any('gyro' in x for x in worse) else OF_FORCE))
-    widen, odd = 1.0, ['the noise levels had not settled'] * fit.creeping
+    odd = ['the noise levels had not settled'] * fit.creeping
+    odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
     if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
         odd.append(BY_SHAKING)
     share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
-    if share > ODD_FIXES:
+    if share > odd_share:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
     share = float((fit.spread[:, 0] > 1.5).mean())
-    if share > ODD_ROAD:
+    if share > odd_share:
         odd.append(f'the wheel slips in {100 * share:.0f} % of the time')
-    if max(level['side'], level['side_turn']) > SLIDING_NOISE:
+    if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
         odd.append(f"the odometer's point moves sideways by "
                    f'{max(level["side"], level["side_turn"]):.2f} m in a second')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
-        widen = MISFIT_WIDENING
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
                               SHAKEN if odd == [BY_SHAKING] else ''))
-    return widen, reasons
+    return 2.0 if odd else 1.0, reasons      # judgement: nothing tells by how much it is off
 
 
 def _heading(heading, error):
     """Say where the outside heading is farther from that of the drive than its sigma allows."""
-    if not len(heading.t) or abs(error) < HEADING_OFF_SIGMAS * heading.sigma:
+    if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
                    f'{np.rad2deg(error):+.2f} deg from that of the drive, '

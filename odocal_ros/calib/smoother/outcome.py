@@ -43,16 +43,13 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import INFORMED_SHARE
 
-YAW_LIMIT = np.deg2rad(0.5)          # a mounting angle no better than this and asked is not known
-SCALE_LIMIT = 0.05                   # the same of the scale, relative
-INFORMED = 0.5                       # posterior over prior: above it the data say little
-FIT_BACKWARDS = np.deg2rad(135.0)    # of yaw from nominal: no mounting, but the other way round
+SCALE_LIMIT = 0.05      # relative sigma: a scale no better is not known. Judgement
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-NO_IMU = 0.2        # relative, of a scale: twenty times what a consumer's is off
 SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
 # estimates where the drive tells them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
@@ -83,7 +80,7 @@ def no_imu(fit) -> list[Reason]:
     """Return why a fit is not to be believed whose Imu no maker would sell, empty else."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
-    if abs(c[worst]) <= NO_IMU:
+    if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off
         return []
     return [Reason(Code.NOT_CONVERGED, 'the fit settled where the '
                    f'{CONSTANTS[worst].replace("_", " ")} is {100 * c[worst]:+.0f} % off, as no '
@@ -118,7 +115,7 @@ def outcome(leg, problem, fit, config) -> MethodResult:
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
         ratio[name] = float(bias_sigma[i] / fit.first.gyro_bias[i])
-        if ratio[name] < INFORMED:
+        if ratio[name] < INFORMED_SHARE:
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
     unsaid = [name for name in ratio if name in found and found[name].value is None]
     if unsaid:
@@ -170,13 +167,14 @@ def told(value, sigma, ratio, scale_unit, nominal, config, doubt=1.0):
         found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
         if nominal:
             found['scale_ratio'] = Estimate(K / nominal, float(K / nominal * sigma[LN_K]), '1')
-    limit = max(YAW_LIMIT, config.verdict.max_yaw_sigma)
+    # a mounting angle no better than half a degree, or as asked, is not known
+    limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
     for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
                            ('pitch_mounting_angle', PITCH, pitch)):
         if doubt * sigma[i] <= limit:
             found[name] = Estimate(angle, float(sigma[i]), 'rad')
     for i in OPTIONAL:
-        if ratio[i] < INFORMED:
+        if ratio[i] < INFORMED_SHARE:
             found[CONSTANTS[i]] = Estimate(float(value[i]), float(sigma[i]), UNITS[CONSTANTS[i]])
     return found, _undetermined(sigma, limit / doubt, config, yaw)
 
@@ -218,7 +216,7 @@ def _undetermined(sigma, limit, config, yaw):
         reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'the drive tells the yaw mounting to '
                               f'{np.rad2deg(sigma[YAW]):.1f} deg only{wanted}: too little '
                               'acceleration and too few turns'))
-    elif off > FIT_BACKWARDS:
+    elif off > np.deg2rad(135.0):       # no mounting, but the other way round
         reasons.append(Reason(Code.ODOMETER_REVERSED, 'the odometer runs against the Imu: '
                               'positive counts mean backwards, or the Imu faces backwards (yaw '
                               f'{np.rad2deg(yaw):+.1f} deg)'))

@@ -27,9 +27,9 @@ from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
 
 Floats = NDArray[np.float64]
-VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say
-HEADING_RATE = 5.0          # Hz, more says nothing new
-GIVEN = 1e-4                # rad, noise of a heading given at the mark, beside its error
+VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say: physical, Doppler
+HEADING_RATE = 5.0          # Hz: receivers' errors of a heading stay longer than that
+GIVEN_HEADING_NOISE = 1e-4  # rad, of a heading given at the mark, beside its error: next to none
 
 
 def _none(*shape):
@@ -89,8 +89,8 @@ def outside_heading(inputs, config, origin) -> Heading:
     given = not np.isnan(alignment.heading)
     if given and asked in ('auto', 'fixed'):
         yaw = yaw_from_heading(alignment.heading) + _convergence(inputs, np.zeros(1), origin)
-        return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN), alignment.heading_sigma,
-                       'fixed')
+        return Heading(np.zeros(1), wrap(yaw), np.full(1, GIVEN_HEADING_NOISE),
+                       alignment.heading_sigma, 'fixed')
     if asked in ('auto', 'heading_topic'):
         return _sent(inputs, inputs.t_heading, inputs.q_heading, inputs.heading_variance,
                      alignment.heading_offset, config, origin, np.eye(3), 'heading_topic')

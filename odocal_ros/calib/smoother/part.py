@@ -21,15 +21,17 @@ from typing import ClassVar
 
 import numpy as np
 
+from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.smoother.chain import blocks
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
 
-# factors on the odometer's variances along, to the side and up (slips), and on that of what drives
-# the slow fix error (a receiver that jumps)
-SPREAD, JUMP = 4, 3
-WANTED = 3    # constants that the budget is of: ln K, yaw, pitch
+# factors on variances of an interval: the odometer's along, to the side and up (slips), and that
+# of what drives the slow fix error (a receiver that jumps)
+FACTORS = ('along', 'side', 'up', 'jump')
+SPREAD, JUMP = len(FACTORS), FACTORS.index('jump')
+WANTED = len(PARAMETERS)    # constants that the budget is of: ln K, yaw, pitch
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,11 +23,12 @@ from odocal_ros.calib.smoother.chain import blocks
 from odocal_ros.calib.smoother.part import Part, Total
 from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
 from odocal_ros.data.mapped import room
+from odocal_ros.settings.levels import NORMAL_MEDIAN
 
-TAIL_SIGMAS = 3.0    # sigmas beyond which a row loses weight as a heavy tail has it
-FEWEST_JUDGED = 5    # of which one may be an outlier
-FEWEST_BINS = 12     # to judge by, over how long errors are alike
-CUT_SIGMAS = 3.0     # robust sigmas at which a residual is cut for that
+# sigmas beyond which a row, or a slip of an interval, has a heavy tail. Statistical: one sound row
+# in 370 loses some of its weight
+TAIL_SIGMAS = 3.0
+FEWEST_JUDGED = 5    # rows, of which one may be an outlier
 
 
 class PointRows(Part):
@@ -210,12 +211,12 @@ def alike(rows: PointRows) -> float:
     """Return how many neighbouring errors are as good as one, by the spread of their means."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # the level ones tell scale and yaw
-    scale = np.median(np.abs(r), axis=0) / 0.6745
-    r = np.clip(r, -CUT_SIGMAS * scale, CUT_SIGMAS * scale)
+    scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN
+    r = np.clip(r, -TAIL_SIGMAS * scale, TAIL_SIGMAS * scale)
     r = r - r.mean(axis=0)
     power = (r**2).mean()
     most, length = 1.0, 2
-    while len(r) >= FEWEST_BINS * length and power > 0:
+    while len(r) >= 12 * length and power > 0:      # bins: their spread is good to 20 %
         bins = r[:len(r) // length * length].reshape(-1, length, r.shape[1])
         most = max(most, float(length * (bins.mean(axis=1)**2).mean() / power))
         length *= 2

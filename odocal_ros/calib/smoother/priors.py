@@ -32,7 +32,9 @@ from odocal_ros.calib.smoother.state import (
     V,
 )
 
-ANYWHERE, ANY_SPEED, ANY_WAY = 1e4, 100.0, np.array([1.0, 1.0, 10.0])    # m, m/s, rad
+# where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up
+START_SIGMAS = {'position': (P, 1e4), 'velocity': (V, 100.0),
+                'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
 # believed of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
@@ -71,7 +73,7 @@ class PriorRows(Part):
 
     def add(self, out):
         """Add the rows to normal equations; the start is held but loosely, where it is."""
-        for columns, sigma in ((P, ANYWHERE), (V, ANY_SPEED), (PHI, ANY_WAY)):
+        for columns, sigma in START_SIGMAS.values():
             hold(out, 0, columns, sigma**2, 0.0)
         for columns, value, sigma in self._biases():
             hold(out, 0, columns, sigma**2, value)

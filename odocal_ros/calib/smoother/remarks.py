@@ -15,14 +15,12 @@ from odocal_ros.calib.receiver_lag import lag_reasons
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import imperfect_sigmas
 from odocal_ros.calib.smoother.state import (
-    ACCEL,
     BA,
     BY_SPEED,
     BY_TIME,
     CONSTANTS,
     FIX_LAG2,
     GNSS_ARM,
-    GYRO,
     IMPERFECT,
     LN_K,
     ODO_ARM,
@@ -34,15 +32,11 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G, grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-IMU_SCALES = (*range(GYRO.start, GYRO.start + 3), *range(ACCEL.start, ACCEL.start + 3))
-AXIS_XY, AXIS_ZX = ACCEL.start + 3, ACCEL.start + 4
-SCALES_OFF = 4.0    # of the grade's sigma: another Imu
-AXES_OFF = 3.0
-LEAST_CHANGE = 3e-4        # of the scale within the leg, worth a word
-LEAST_ARM = 0.3            # m, the same; that of the wheel up is where a body tilts about
-NOISIER_THAN_SAID = 1.5    # of the sigma that fixes state
-NEXT_DRIVE = 1e-3          # by how much the scale of one vehicle differs from drive to drive
-# what the model does not hold (docs/conventions.md): relative, rad
+IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
+    ('gyro_scale', 'accelerometer_scale')))
+AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer_axis_zx'))
+# 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
+# body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
@@ -76,7 +70,8 @@ def beside(value, covariance, grade) -> dict:
     for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
         out[f'{name}_mounting_angle_housing_sigma'] = _figure(
             _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
-    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], NEXT_DRIVE), '1')
+    next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
+    out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], next_drive), '1')
     return out
 
 
@@ -117,13 +112,13 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma
-    if off[[AXIS_XY, AXIS_ZX]].max() > AXES_OFF:
+    if off[[AXIS_XY, AXIS_ZX]].max() > REMARK_SIGMAS:
         worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
         said.append(Reason(Code.IMU_AXES_SKEW, 'the axes of the accelerometer are off a right '
                            f'angle by {np.rad2deg(abs(c[worst])):.2f} deg, {off[worst]:.0f} times '
                            f'the {config.imu.grade} grade; the values allow for it'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
-    if off[worst] > SCALES_OFF:
+    if off[worst] > 4.0:        # of the grade's sigma: another Imu
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade; the values allow for it'))
@@ -134,7 +129,7 @@ def _noisy(problem, levels):
     """Say where fixes, white and slow errors together, err by more than they state."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
-    if factor <= NOISIER_THAN_SAID:
+    if factor <= 1.5:       # worth a word: receivers state their errors no better
         return []
     return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'white and slow errors together, the fixes '
                    f'err {factor:.1f} times as much as their covariance says')]
@@ -147,7 +142,7 @@ def _varies(fit, sigma):
     for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from slow to fast'),
                           (BY_TIME, motion.from_mean[:, 1], 'from begin to end')):
         change = c[i] * np.ptp(span)
-        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > LEAST_CHANGE:
+        if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > 3e-4:     # worth a word
             said.append(f'{100 * change:+.2f} % {what}')
     if not said:
         return []
@@ -161,7 +156,7 @@ def _arms(c, sigma, leg):
     for name, where, axes in (('odometer.lever_arm', ODO_ARM, 'xy'),
                               ('gnss.lever_arm', GNSS_ARM, 'xyz')):
         for i, axis in zip(range(where.start, where.stop), axes, strict=False):
-            if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], LEAST_ARM):
+            if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], 0.3):     # m
                 said.append(f'{name} {axis} by {c[i]:+.2f} m +- {sigma[i]:.2f}')
     if not said:
         return []

@@ -28,7 +28,6 @@ from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 DAY = 86400e9        # ns
-ROUNDING = 1e-9      # of a correlation: there is none
 
 
 def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
@@ -130,7 +129,7 @@ def _sources(used, C, floor) -> tuple[Source, ...]:
     """Return the budget: what is believed of the vehicle, and what is the legs' own."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
-              if alike[i].max() > ROUNDING]
+              if alike[i].max() > 1e-9]      # of a correlation: rounding
     apart = np.diag(floor**2) + sum(s.effects @ s.effects.T for s in shared)
     size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
     return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),

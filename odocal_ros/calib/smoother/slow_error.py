@@ -11,13 +11,13 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.part import hold, JUMP, link, Part
 from odocal_ros.calib.smoother.state import SLOW
 
-LEAST_SLOW = 0.005    # m
-# s that errors stay: receivers over open land by a minute to a quarter of an hour; how much about
-# that by e-fold; the least that can be told from white
-USUAL_TIME, TIME_SPREAD, SHORTEST_TIME = 100.0, 0.6, 5.0
+# prior of the correlation time, log-normal: s, and sigma of the logarithm. Physical: errors of
+# receivers over open land stay for a minute or several (docs/decisions/0009)
+USUAL_TIME, TIME_SPREAD = 100.0, 0.6
 
 
 class SlowError(Part):
@@ -41,8 +41,8 @@ class SlowError(Part):
         """Return first levels by what the fixes state, and their least."""
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
-            'slow': 2 * LEAST_SLOW**2 / USUAL_TIME, 'slow_up': 2 * LEAST_SLOW**2 / USUAL_TIME,
-            'correlation_time': SHORTEST_TIME}
+            **dict.fromkeys(('slow', 'slow_up'), 2 * LEAST.fix**2 / USUAL_TIME),
+            'correlation_time': 5.0}      # s: less is not told from white
 
     def in_use(self, levels):
         """Tell whether slow errors are estimated."""

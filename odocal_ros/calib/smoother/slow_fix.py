@@ -24,25 +24,18 @@ from odocal_ros.calib.smoother.estimate import Fit, fit, Outline
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME
 
-RESIDUAL_BIN = 2.0                           # s over which residuals are averaged
-# correlation of neighbouring bins, and its sigmas: a fit with slow errors costs time where there
-# are none, one without them the truth of sigmas; of RTK's centimetre little is left to be seen
-SLOW_CORRELATION, SLOW_SIGMAS = 0.05, 1.5
-HIDDEN_SIGMAS = 4.0
-SMOOTHED_SHARE = 0.2    # of the stated sigma: a fix so much better was filtered
-FIXES_S = 90.0    # s of fixes in which errors that stay for a minute show as alike
-SLOW_SHARE, WHITE_SHARE = 0.9, 0.2           # of the variance, to start from
+WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
 
 
-def correlation(t, residual):
+def correlation(t, residual, width=2.0):
     """
     Return the correlation of neighbouring bins of residuals and its sigma, were they white.
 
-    t : (m,) s.   residual : (m, c) in sigmas.
+    t : (m,) s.   residual : (m, c) in sigmas.   width : of a bin, s.
     """
     if len(t) < 4:
         return 0.0, 1.0
-    cell = np.floor((t - t[0]) / RESIDUAL_BIN).astype(int)
+    cell = np.floor((t - t[0]) / width).astype(int)
     at, first = np.unique(cell, return_index=True)
     count = np.diff(np.append(first, len(t)))
     mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
@@ -58,24 +51,27 @@ def are_slow(problem, first: Fit) -> bool:
     """Tell whether the errors of the fixes stay for a while: as told, or by a first fit."""
     if not np.isnan(problem.fix_time):
         return problem.fix_time > 0.0
-    if first.levels['fix'] < SMOOTHED_SHARE**2:
+    if first.levels['fix'] < 0.2**2:        # a fix so much better than it says was filtered
         return True
     t = problem.leg.t_fix[problem.use]
     alike, sigma = correlation(t, first.weighted[Fixes].r[:, :2])
-    return alike > max(SLOW_CORRELATION, SLOW_SIGMAS * sigma) or _hidden(t, first.levels['fix'])
+    # a fit with slow errors costs time where there are none, one without them the truth of sigmas:
+    # 1.5 sigmas, one white leg in 15; of RTK's centimetre little is left to be seen: 0.05
+    return alike > max(0.05, 1.5 * sigma) or _hidden(t, first.levels['fix'])
 
 
 def _hidden(t, level) -> bool:
     """
     Tell whether the fixes of a short leg scatter less than they say.
 
-    In less than FIXES_S a slow error passes for another scale and heading, and what is left of it
-    is hardly alike: what a receiver says of its errors and does not show as scatter is slow.
+    In less than 90 s a slow error passes for another scale and heading, and what is left of it
+    is hardly alike: what a receiver says of its errors and does not show as scatter is slow, if it
+    is beyond 4 sigmas (one white leg in 30 000).
 
     t : (m,) s.   level : variance of the scatter, of the stated; good to 1 / sqrt(m) of itself,
     two components each.
     """
-    return t[-1] - t[0] < FIXES_S and level < 1 - HIDDEN_SIGMAS / np.sqrt(len(t))
+    return t[-1] - t[0] < 90.0 and level < 1 - 4 / np.sqrt(len(t))
 
 
 def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
@@ -93,7 +89,7 @@ def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
 
     """
     time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
-    gain, gain_up = (2 / time * SLOW_SHARE * np.median(problem.leg.covariance_n[:, i, i])
+    gain, gain_up = (2 / time * 0.9 * np.median(problem.leg.covariance_n[:, i, i])
                      for i in (0, 2))
     white, up = first.levels['fix'], first.levels['fix_up']
     levels = problem.first_levels.but(

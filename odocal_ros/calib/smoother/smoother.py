@@ -28,10 +28,6 @@ from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import State
 from odocal_ros.reasons import Code, Reason
 
-FEWEST_FIXES, SHORTEST_LEG = 10, 20.0    # s
-ROUGH_PASSES = 3    # iterations to tell starts apart and slow fix errors from white ones
-UNSURE_HEADING = 0.1    # rad: a heading from accelerations worse than this is one of several
-
 
 def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
     """
@@ -81,7 +77,7 @@ def likeliest_fit(problem, config, trace=None):
     fits = []
     start = first_state(problem.leg, problem.imu, problem.priors)
     starts = [start]
-    if start.yaw_sigma > UNSURE_HEADING:
+    if start.yaw_sigma > 0.1:       # rad: a heading by accelerations worse than this is one of two
         yaw = config.imu.nominal_yaw
         starts.append(first_state(problem.leg, problem.imu, problem.priors,
                                   0.0 if np.isnan(yaw) else yaw))
@@ -89,7 +85,8 @@ def likeliest_fit(problem, config, trace=None):
         sigma = float(np.sqrt(np.median(problem.leg.covariance_n[:, 0, 0])))
         wide = max(1.0, (one.fix_spread / sigma)**2)
         levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
-        fits.append(fit(problem, one.state, levels, ROUGH_PASSES, trace=trace))
+        # passes that tell starts apart, and slow fix errors from white ones
+        fits.append(fit(problem, one.state, levels, 3, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
     problem.per_effective = {name: alike(best.weighted.parts[name])
                     for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
@@ -101,10 +98,11 @@ def likeliest_fit(problem, config, trace=None):
 
 def too_little(fixes: int, seconds: float) -> Reason | None:
     """Return why so many fixes in so many seconds of a leg are too few, None if they are not."""
-    if fixes >= FEWEST_FIXES and seconds >= SHORTEST_LEG:
+    fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
+    if fixes >= fewest and seconds >= shortest:
         return None
     return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s: the smoother '
-                  f'needs {FEWEST_FIXES} in {SHORTEST_LEG:.0f} s at least')
+                  f'needs {fewest} in {shortest:.0f} s at least')
 
 
 def bound(leg: SmootherLeg, config, truth: State, levels: Levels, imperfect=None):

@@ -18,20 +18,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import Fit, fit
+from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit
 from odocal_ros.calib.smoother.state import SPEED_OFFSET
-
-TELLING_ODDS = 1e3      # of one against the other, by what the drive finds
-NEAR_SIGMAS = 3.5       # sigmas from that one
-EXACT_SHARE = 1e-3      # of a step, sigma of what is known
-OFFSET_PASSES = 6       # passes
 
 
 def judge_offset(problem, now: Fit, trace=None) -> Fit:
     """
     Return a fit with the offset of a coarse speed taken as that of truncation or of rounding.
 
-    As it was where the drive does not tell which, or where it is neither.
+    As it was where the drive does not tell which, 1000 to 1, or where it is neither: 3.5 sigmas
+    from the nearer, one sound drive in 2000.
     """
     coarse = problem.leg.travel.coarse
     if coarse is None:
@@ -40,16 +36,16 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
     found = float(now.state.constants[SPEED_OFFSET])
     known = coarse.step / 2 if found > coarse.step / 4 else 0.0
     off, other = (abs(found - x) / sigma for x in (known, coarse.step / 2 - known))
-    if off > NEAR_SIGMAS or other**2 - off**2 < 2 * np.log(TELLING_ODDS):
+    if off > 3.5 or other**2 - off**2 < 2 * np.log(1e3):
         return now
     constants = now.state.constants.copy()
     constants[SPEED_OFFSET] = known
     outline = now.outline()
     del now             # the equations of one fit at a time
-    sure = EXACT_SHARE * coarse.step
+    sure = 1e-3 * coarse.step       # as good as exact
     about = replace(outline, priors=_held(outline.priors, known, sure),
                     first=_held(outline.first, known, sure))
-    last = fit(problem, replace(about.state, constants=constants), about.levels, OFFSET_PASSES,
+    last = fit(problem, replace(about.state, constants=constants), about.levels, AGAIN_PASSES,
                about=about, frozen=True, trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 

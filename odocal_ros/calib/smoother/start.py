@@ -31,10 +31,8 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.rotations import skew
 
-LIVELY_FORCE = 1.0    # m/s^2 that an acceleration over 1 s may be of
-SPEED_WINDOW = 0.4    # s each side, over which a speed is taken
-UNSURE_SHARE = 0.2    # of the rotation found from accelerations: more is no heading
-START_EDGE = 0.5      # s
+# s each side, over which a speed is taken: some rows of an odometer (judgement)
+SPEED_WINDOW = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +45,11 @@ class Start:
 
 
 def standing(leg, t):
-    """Tell which of the times lie well inside a standstill: (N,) bool."""
+    """Tell which of the times lie inside a standstill, half a second from its ends: (N,) bool."""
     def within(t):
         inside = np.zeros(len(t), bool)
         for begin, end in leg.standstills:
-            inside |= (t >= begin + START_EDGE) & (t <= end - START_EDGE)
+            inside |= (t >= begin + 0.5) & (t <= end - 0.5)
         return inside
     return by_row(within, t)
 
@@ -107,7 +105,7 @@ def first_state(leg, imu, priors, yaw=None) -> Start:
     chi = track.chi
     if yaw is not None:
         psi = chi + yaw
-    elif yaw_sigma > UNSURE_SHARE:
+    elif yaw_sigma > 0.2:       # rad: the nearest of four ways to mount is in doubt
         psi = chi
     return Start(_state(leg, t, C_nL(psi) @ C_Lk, bias, track, wrap(psi - chi)),
                  yaw_sigma, track.spread)
@@ -133,7 +131,8 @@ def _level(leg, sums, C_0k, bias_sigma):
     g = gravity(leg.origin.latitude, leg.origin.height)
     up = np.median(force, axis=0)
     up = up / np.linalg.norm(up)
-    weight = np.sqrt(T) / LIVELY_FORCE
+    lively = 1.0        # m/s^2 that an acceleration over 1 s may be of: physical, of a car
+    weight = np.sqrt(T) / lively
     change = np.zeros(3)
     for _ in range(3):
         J = np.concatenate([np.broadcast_to(np.eye(3) * g, (len(T), 3, 3)),

@@ -11,10 +11,9 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.part import hold, Part
 from odocal_ros.calib.smoother.state import E
-
-LEAST_TRAVEL_ERROR = 1e-3    # m
 
 
 class TravelError(Part):
@@ -31,7 +30,7 @@ class TravelError(Part):
     def first_levels(cls, problem):
         """Return the level of rounding to a count, which is the least too."""
         leg = problem.leg
-        least = LEAST_TRAVEL_ERROR / leg.rough_scale
+        least = LEAST.travel / leg.rough_scale
         level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
         return level, level
 

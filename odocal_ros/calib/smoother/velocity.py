@@ -11,6 +11,7 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
 from odocal_ros.calib.smoother.preintegrate import turn
@@ -31,8 +32,6 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.nav.rotations import skew
 
-LEAST_SPEED = 0.005     # m/s: no receiver is better
-
 
 class VelocityRows(OutsideRows):
     """Residuals of a velocity (sent less predicted) and their derivatives at one state."""
@@ -48,8 +47,8 @@ class VelocityRows(OutsideRows):
     def least(sent):
         """Return the least levels."""
         sigma = np.median(sent.sigma, axis=0)
-        return {'velocity': (LEAST_SPEED / sigma[0])**2,
-                'velocity_up': (LEAST_SPEED / sigma[2])**2}
+        return {'velocity': (LEAST.velocity / sigma[0])**2,
+                'velocity_up': (LEAST.velocity / sigma[2])**2}
 
 
 def _velocity(problem, state, points, later):

@@ -29,9 +29,6 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW
 from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
 
-SAME_KEY = 1e-6       # s, keyframes that are the same
-NEWEST_KEYS = 3.0     # s, last part of the old keyframes that may be others
-
 
 def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
     """
@@ -53,10 +50,11 @@ def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
 def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     """Return what the last look ended with, reckoned on; None where the keyframes are others."""
     t, old = problem.imu.t[problem.imu.key], last.state.t
-    at = np.clip(np.searchsorted(old, t - SAME_KEY), 0, len(old) - 1)
-    same = np.abs(old[at] - t) < SAME_KEY
+    rounding = 1e-6     # s
+    at = np.clip(np.searchsorted(old, t - rounding), 0, len(old) - 1)
+    same = np.abs(old[at] - t) < rounding
     n = len(t) if same.all() else int(np.argmin(same))
-    if n < 2 or t[n - 1] < old[-1] - NEWEST_KEYS:
+    if n < 2 or t[n - 1] < old[-1] - 3.0:       # s at the end, where rows may have come late
         return None
     at = at[:n]
     state = State(**{name: value if name == 'constants' else value[at]

@@ -26,7 +26,9 @@ from odocal_ros.calib.wheels.model import Bins
 # m/sqrt(s)
 SLOW_VARIANCES = np.append(0.0, np.geomspace(0.003, 300.0, 34))
 SLIP_NOISES = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
-NOTHING_LASTS_PRIOR = 0.8    # prior probability of no slow error, and of no slip: judgement
+# prior probability of no slow error, and of no slip. Tuned: with 0.9 sigmas are smaller than
+# errors where there is a little of either (docs/decisions/0007)
+NOTHING_LASTS_PRIOR = 0.8
 # priors of sizes, log-normal: median, and sigma of the logarithm. Judgement
 SIZE_PRIORS = {
     'stated': (1.0, 0.5),       # variance of the fixes, of that stated

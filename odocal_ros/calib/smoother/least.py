@@ -1,0 +1,34 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The least noises that are believed: data may seem to have less, settings may say 0."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class LeastNoise:
+    """
+    1 sigma, below which a variance component does not go.
+
+    Physical: of receivers what the best of today have; of an Imu a tenth of navigation grade,
+    since one with a dead band is silent at rest.
+    """
+
+    fix: float = 0.005          # m, east or north or up, of white and of slow errors each
+    velocity: float = 0.005     # m/s, of one from outside
+    heading: float = 5e-4       # rad, of one from outside
+    travel: float = 1e-3        # m, of a reading of the odometer
+    road: float = 2e-4          # m/sqrt(s) along: grain of a road under a tyre
+    # gyro rad/s/sqrt(Hz), accelerometer m/s^2/sqrt(Hz), their walks rad/s/sqrt(s), m/s^2/sqrt(s)
+    imu: dict[str, float] = field(default_factory=lambda: {
+        'gyro': 3e-8, 'accel': 1e-5, 'gyro_walk': 2e-11, 'accel_walk': 1e-7})
+
+
+LEAST = LeastNoise()
