@@ -72,14 +72,22 @@ def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> d
     r = D[-1] - D
     dt = np.diff(t)
     # e = integral of (C_nb db) x r
-    turn = -skew(r) @ C_nb
-    bias = np.einsum('nij,n->ij', (turn[:-1] + turn[1:]) / 2, dt) * alignment.gyro_bias_sigma
+    turn = by_step(_turn, r, C_nb)
+    bias = np.einsum('nij,n->ij', turn, dt) * alignment.gyro_bias_sigma
     # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
     slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
     R = np.concatenate([np.cumsum(slices[::-1], axis=0)[::-1], np.zeros((1, 3))])
     return {f'gyro_bias_{axis}': bias[:, i:i + 1] for i, axis in enumerate('xyz')} | {
             'gyro_noise': alignment.gyro_noise * _root(_spread(r, dt)),
             'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
+
+
+def _turn(r: Floats, C_nb: Floats) -> Floats:
+    """Return the mean of (C_nb db) x r over each step: (n, 3), (n, 3, 3) to (n - 1, 3, 3)."""
+    turn = -skew(r) @ C_nb
+    mean = turn[:-1] + turn[1:]
+    mean /= 2
+    return mean
 
 
 def _spread(r: Floats, dt: Floats) -> Floats:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from odocal_ros.calib.drive import knots_of
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import TrackCheck
 from odocal_ros.calib.slow_errors import window_means
@@ -152,15 +153,11 @@ def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,
     stretch : (k,) how long the track is beside the fixes.
 
     """
-    need = max(10.0, 20 * sigma)     # m; a direction is then good to sqrt(2) / 20 rad
-    a, cuts = 0, []
-    for b in range(1, len(fixes_2d)):
-        if np.hypot(*(fixes_2d[b] - fixes_2d[a])) >= need:
-            cuts.append((a, b))
-            a = b
-    if not cuts:
+    # a direction is then good to sqrt(2) / 20 rad
+    knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)
+    if len(knots) < 2:
         return (np.empty(0),) * 4
-    a, b = np.array(cuts).T
+    a, b = knots[:-1], knots[1:]
     track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
     return ((t[a] + t[b]) / 2, arctan2(*track.T[::-1]), arctan2(*fix.T[::-1]),
             np.hypot(*track.T) / np.hypot(*fix.T))

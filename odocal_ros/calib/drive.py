@@ -12,9 +12,8 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Track
-from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
 from odocal_ros.settings.levels import FASTEST, NORMAL_MEDIAN, TYRE_SPREAD
@@ -22,8 +21,25 @@ from odocal_ros.settings.levels import FASTEST, NORMAL_MEDIAN, TYRE_SPREAD
 
 def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
                 leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
+    """Judge a drive between the marks: its way, as ``judge_way`` does, and its turns."""
+    distance, found = judge_way(track, t_stop, metres_per_unit, leg)
+    inside = (track.t >= 0) & (track.t <= t_stop)
+    t, s = track.t[inside], track.s[inside] * metres_per_unit
+    if len(t) < 2:
+        return distance, found
+    step, yaw = np.abs(np.diff(s)), np.unwrap(yaw_from_quat(track.q_nb[inside]))
+    turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
+    share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
+    if share > 0.1:     # judgement: a manoeuvre at either end is less
+        found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
+                         f'in turns above {leg.max_yaw_rate:g} rad/s'),)
+    return distance, found
+
+
+def judge_way(track: Track, t_stop: float, metres_per_unit: float,
+              leg: LegConfig) -> tuple[float, tuple[Reason, ...]]:
     """
-    Judge a drive between the marks.
+    Judge how far and how fast was driven between the marks.
 
     Parameters
     ----------
@@ -43,8 +59,7 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     """
     inside = (track.t >= 0) & (track.t <= t_stop)
     t, s = track.t[inside], track.s[inside] * metres_per_unit
-    step = np.abs(np.diff(s))
-    distance = float(step.sum())
+    distance = float(np.abs(np.diff(s)).sum())
     found: tuple[Reason, ...] = ()
     if distance < leg.min_distance:
         found += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks, '
@@ -55,13 +70,6 @@ def judge_drive(track: Track, t_stop: float, metres_per_unit: float,
     if top < leg.min_speed:
         found += (Reason(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
                          f'{leg.min_speed:g} m/s are asked'),)
-    C = matrix_from_quat(track.q_nb[inside])
-    yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))
-    turning = np.abs(rate_over_second(t, yaw)) > leg.max_yaw_rate
-    share = float(step[turning[:-1]].sum() / distance) if distance else 0.0
-    if share > 0.1:     # judgement: a manoeuvre at either end is less
-        found += (Reason(Code.LEG_NOT_STRAIGHT, f'{100 * share:.0f} % of the distance was driven '
-                         f'in turns above {leg.max_yaw_rate:g} rad/s'),)
     return distance, found
 
 
@@ -116,7 +124,7 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
     end = travel.t[np.append(counts, len(travel.t) - 1)]
-    lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])]), begin[k], end[k])
+    lost = [(_gone(fixes[(t >= begin[k]) & (t <= end[k])], least), begin[k], end[k])
             for k in np.flatnonzero(end - begin > least / FASTEST)]
     far, since, until = max(lost, default=(0.0, 0.0, 0.0))
     # of the way: a counter that lacks less is within what tyres differ by, and seen elsewhere
@@ -126,16 +134,19 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
                    f'to {until:.0f} s, the odometer does not count'),)
 
 
-def _gone(fixes) -> float:
+def _gone(fixes, least) -> float:
     """
-    Return how far (k, 2) fixes surely move from begin to end, m.
+    Return how far (k, 2) fixes surely move from begin to end, m, 0 if by less than ``least``.
 
     One jump of them is no motion, nor is noise, nor what strays and comes back.
     """
     stretches = 20      # so many that motion is in more than two of them
     if len(fixes) < stretches:
         return 0.0
-    middle = np.array([np.median(part, axis=0) for part in np.array_split(fixes, stretches)])
+    parts = np.array_split(fixes, stretches)
+    if np.hypot(*(np.median(parts[-1], axis=0) - np.median(parts[0], axis=0))) < least:
+        return 0.0
+    middle = np.array([np.median(part, axis=0) for part in parts])
     steps = np.sort(np.hypot(*np.diff(middle, axis=0).T))
     # a jump is one step, or two where it is within a stretch: they count as the one after them
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
@@ -184,9 +195,14 @@ def white_noise(fixes_n) -> float:
 
 
 def knots_of(fixes_n, least) -> list[int]:
-    """Return fixes at least so far apart, m."""
-    knots = [0] if len(fixes_n) else []
-    for k, point in enumerate(fixes_n[:, :2]):
-        if np.hypot(*(point - fixes_n[knots[-1], :2])) >= least:
-            knots.append(k)
+    """Return fixes at least so far apart, m: indices of (k, 2 or more), from the first on."""
+    knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
+    begin, ahead = 1, 64       # fixes looked at at a time: the next knot is wont to be among them
+    while begin < len(p):
+        far = np.hypot(*(p[begin:begin + ahead] - p[knots[-1]]).T) >= least
+        if far.any():
+            knots.append(begin + int(np.argmax(far)))
+            begin = knots[-1] + 1
+        else:
+            begin += ahead
     return knots

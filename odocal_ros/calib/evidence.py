@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from odocal_ros.calib.drive import rate_over_second
 from odocal_ros.calib.sections import Sections, sections
 from odocal_ros.data.pieces import by_row, chunks
-from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
-from odocal_ros.nav.rotations import matrix_from_quat
+from odocal_ros.nav.rotations import yaw_from_quat
 
 KEPT_ROWS = 5000       # of each kind kept in a result: more than a screen has columns
 
@@ -92,7 +91,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
     before, after = (_pinned(path, pin) for path in paths)
     after_n, off_n = after(t), after(t_fix) - fix_n
-    yaw = np.unwrap(by_row(_yaw, track.q_nb[inside]))
+    yaw = np.unwrap(by_row(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
     forward = _forward_at(t_fix, t, after_n, sign)
@@ -132,11 +131,6 @@ def _pinned(path, pin):
             out[rows] = pin.position_n + path(t[rows]) - here
         return out
     return at
-
-
-def _yaw(q_nb):
-    C_nb = matrix_from_quat(q_nb)
-    return arctan2(C_nb[:, 1, 0], C_nb[:, 0, 0])
 
 
 def _sent(leg, inputs, kept, span, config):

@@ -138,15 +138,14 @@ class SmootherSoFar:
         few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
-        found, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)
+        found, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
         _refuse_unusable(found)
         inputs = turned_over(inputs) if z_down else inputs
         placed = place(inputs, config)
         if not placed.rough:
             raise BadData('how far a count reaches is not known yet')
         _refuse_unusable(axes_reasons(
-            facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel, placed.rough),
-            config.imu.nominal_yaw))
+            facing(inputs, placed.rough), config.imu.nominal_yaw))
         if vars(placed.origin) != (self._origin and vars(self._origin)):
             self._origin, self._last = placed.origin, None
         spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,

@@ -23,7 +23,12 @@ from odocal_ros.nav.angles import arctan2
 
 def skew(a: ArrayLike) -> Floats:
     """Return the matrix of the cross product with a: (..., 3) to (..., 3, 3)."""
-    return np.cross(np.asarray(a, dtype=float)[..., None, :], -np.eye(3))
+    x, y, z = np.moveaxis(np.asarray(a, dtype=float), -1, 0)
+    S = np.zeros((*x.shape, 3, 3))
+    for (i, j), value in zip(((2, 1), (0, 2), (1, 0)), (x, y, z), strict=True):
+        S[..., i, j] = value
+        S[..., j, i] = -value
+    return S
 
 
 def exp_so3(phi: Floats) -> Floats:
@@ -93,6 +98,13 @@ def matrix_from_quat(q: ArrayLike) -> Floats:
     C[..., 2, 1] = s * (y * z + x * w)
     C[..., 2, 2] = 1 - s * (x * x + y * y)
     return C
+
+
+def yaw_from_quat(q: Floats) -> Floats:
+    """Return the yaw of the matrix of a quaternion, rad: (..., 4) to (...), as b's x axis lies."""
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    s = 2 / np.einsum('...i,...i->...', q, q)
+    return arctan2(s * (x * y + z * w), 1 - s * (y * y + z * z))
 
 
 def quat_from_matrix(C: ArrayLike) -> Floats:

@@ -92,7 +92,8 @@ def _driven(inputs, drive) -> float:
 
 def _units(inputs, config, findings):
     """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
-    findings += with_axes(imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
+    findings += with_axes(
+        imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
     w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
     options = []
     if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:

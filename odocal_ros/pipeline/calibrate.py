@@ -105,7 +105,7 @@ def _screened(leg: Leg, config: Config,
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
         return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
-    sanity, z_down = imu_sanity(inputs.f_b, inputs.w_b, inputs.C_bi, config.imu)
+    sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:

@@ -14,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.drive import judge_drive, not_moving, uncovered
+from odocal_ros.calib.drive import judge_drive, judge_way, not_moving, uncovered
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.slips import wheel_faults
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_row, medians
+from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.standstill import standstills
@@ -66,8 +66,7 @@ def prepare(leg: Leg, inputs: Inputs, config: Config, reasons: Sequence[Reason] 
     still = _standing(inputs, placed)
     if still is not None:
         return None, (*reasons, *still)
-    faces = facing(inputs.t_imu, inputs.w_b, inputs.f_b, inputs.travel,
-                   placed.rough) if inputs.felt else None
+    faces = facing(inputs, placed.rough) if inputs.felt else None
     axes = axes_reasons(faces, config.imu.nominal_yaw)
     reasons = (*reasons, *uncovered(inputs.travel, inputs.t_stop), *with_axes(axes, inputs))
     if Code.IMU_AXES in {r.code for r in axes}:
@@ -110,11 +109,10 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
 
 def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
     """Return a leg whose way and speed are judged by a scale known better than the rough one."""
-    distance, judged = judge_drive(prepared.track, prepared.inputs.t_stop, scale,
-                                   prepared.config.leg)
+    distance, judged = judge_way(prepared.track, prepared.inputs.t_stop, scale,
+                                 prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
-        *(r for r in prepared.reasons if r.code not in BY_SCALE),
-        *(r for r in judged if r.code in BY_SCALE)))
+        *(r for r in prepared.reasons if r.code not in BY_SCALE), *judged))
 
 
 def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
@@ -131,8 +129,7 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
 
 def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
     """Return how the gyro turns, where it does not turn with the course of the fixes."""
-    up_b = medians(inputs.f_b)
-    up_b /= np.linalg.norm(up_b)
+    up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma)
     return gyro_reasons(ratio, config.imu.gyro_scale)

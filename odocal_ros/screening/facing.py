@@ -15,17 +15,20 @@ quarter or a half turn off, the odometer parts from the Imu at every start, as i
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import medians
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
+
+if TYPE_CHECKING:
+    from odocal_ros.screening.screen import Inputs
 
 BIN_S = 1.0                        # s, accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins
@@ -108,8 +111,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
                   np.diff(use, prepend=-9) == 1)
 
 
-def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
-           metres_per_unit: float) -> Facing | None:
+def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     """
     Return where the Imu faces, None where the drive does not show it.
 
@@ -118,15 +120,16 @@ def facing(t: Floats, w_b: Floats, f_b: Floats, travel: Travel,
 
     Parameters
     ----------
-    t, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, m/s^2, in the configured body frame.
-    travel, metres_per_unit
+    inputs : Inputs
+        In the configured body frame.
+    metres_per_unit : float
         As for ``pushes``.
 
     """
-    mean = medians(f_b)
+    mean = inputs.usual_f_b
     size = float(np.linalg.norm(mean))
-    found = pushes(t, w_b, f_b, mean / size, travel, metres_per_unit) if size else None
+    found = pushes(inputs.t_imu, inputs.w_b, inputs.f_b, mean / size, inputs.travel,
+                   metres_per_unit) if size else None
     if found is None:
         return None
     force, onward, inward = (np.diff(x)[found.near[1:]]

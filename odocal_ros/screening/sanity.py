@@ -26,15 +26,17 @@ NO_GRAVITY = 0.01               # m/s^2, far below what gravity is in any unit
 MOST_TILT = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
 
 
-def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats,
+def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
                imu: ImuConfig) -> tuple[tuple[Reason, ...], bool]:
     """
     Judge units and axes of an Imu.
 
     Parameters
     ----------
-    f_b, w_b : (n, 3) arrays
-        Specific force, m/s^2, and turn rate, rad/s, in the configured body frame.
+    mean : (3,)
+        Specific force as it usually is (its median), m/s^2, in the configured body frame.
+    w_b : (n, 3) array
+        Turn rate there, rad/s.
     C_bi : (3, 3)
         Nominal rotation configured.
     imu : ImuConfig
@@ -46,8 +48,7 @@ def imu_sanity(f_b: Floats, w_b: Floats, C_bi: Floats,
     UNUSABLE there is nothing to compute with.
 
     """
-    mean, rest = medians(f_b), medians(w_b)
-    size = float(np.linalg.norm(mean))
+    rest, size = medians(w_b), float(np.linalg.norm(mean))
     fast = float(np.percentile(by_row(lambda w: lengths(w - rest), w_b), 99.9,
                                overwrite_input=True))
     reasons = []

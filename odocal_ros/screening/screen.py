@@ -15,6 +15,7 @@ start mark; the mark is an Imu stamp, so the Imu's time offset moves the others 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
-from odocal_ros.data.pieces import by_step
+from odocal_ros.data.pieces import by_step, medians
 from odocal_ros.nav.gaps import gaps_in_rhythm
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -68,6 +69,11 @@ class Inputs:
     fixes_rejected: int
     scale_unit: str
     felt: bool = True                  # False: f_b is made up, no accelerometer is there
+
+    @cached_property
+    def usual_f_b(self) -> Floats:
+        """Return the median of the specific force, which shows what is up: (3,) m/s^2."""
+        return medians(self.f_b)
 
     def mirrored(self, spans: Floats) -> 'Inputs':
         """Return them with what was counted in spans, (m, 2) s, counted the other way."""

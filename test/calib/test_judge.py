@@ -21,6 +21,7 @@ from odocal_ros.calib.check import (
     steady,
     track_check,
 )
+from odocal_ros.calib.drive import knots_of
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.slow_errors import slow_variance
@@ -100,7 +101,8 @@ class TestImu:
             (2000, 3)) * size / 9.81
         w = 0.002 * rng.standard_normal((2000, 3))
         w[500:520, 2] = fast
-        return imu_sanity(f, w, np.eye(3) if C_bi is None else C_bi, imu or ImuConfig())
+        return imu_sanity(np.median(f, axis=0), w, np.eye(3) if C_bi is None else C_bi,
+                          imu or ImuConfig())
 
     def test_a_sound_imu_says_nothing(self):
         assert self.say([0, 0, 1]) == ((), False)
@@ -140,10 +142,23 @@ class TestImu:
         assert not turned
 
     def test_an_imu_that_shows_nothing_is_no_crash(self):
-        reasons, turned = imu_sanity(np.zeros((50, 3)), np.zeros((50, 3)), np.eye(3),
+        reasons, turned = imu_sanity(np.zeros(3), np.zeros((50, 3)), np.eye(3),
                                      ImuConfig())
         assert codes(reasons) == [Code.NO_IMU, Code.NO_IMU]
         assert not turned
+
+
+def test_knots_are_the_fixes_that_one_after_the_other_finds_so_far_apart():
+    rng = np.random.default_rng(2)
+    p = np.cumsum(rng.normal(0.5, 1.0, (2000, 2)) * (rng.random(2000) < 0.3)[:, None], axis=0)
+    p[700:720] = np.nan
+    for least in (1e-3, 3.0, 90.0, 1e6):
+        knots = [0]
+        for k in range(len(p)):
+            if np.hypot(*(p[k] - p[knots[-1]])) >= least:
+                knots.append(k)
+        assert knots_of(p, least) == knots
+    assert knots_of(p[:0], 3.0) == []
 
 
 class TestCheck:

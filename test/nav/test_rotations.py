@@ -14,6 +14,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.rotations import (
     exp_so3,
     matrix_from_quat,
@@ -25,6 +26,7 @@ from odocal_ros.nav.rotations import (
     rpy_from_matrix,
     skew,
     transpose,
+    yaw_from_quat,
 )
 
 ROUND_OFF = 2e-15    # a dozen operations on numbers up to 2, an ulp of 2.2e-16 each
@@ -149,3 +151,10 @@ def test_against_scipy():
     rpy = rpy_from_matrix(theirs.as_matrix())
     assert_allclose(matrix_from_rpy(theirs.as_euler('xyz')), theirs.as_matrix(), atol=1e-14)
     assert_allclose(rpy[:, 1], theirs.as_euler('xyz')[:, 1], atol=1e-7)
+
+
+@given(VECTORS)
+def test_the_yaw_of_a_quaternion_is_that_of_its_matrix_to_the_last_bit(phi):
+    q = 1.7 * quat_from_rotvec(np.array([phi, -2 * phi, [0.1, 0.2, 3.0]]))
+    C = matrix_from_quat(q)
+    np.testing.assert_array_equal(yaw_from_quat(q), arctan2(C[:, 1, 0], C[:, 0, 0]))

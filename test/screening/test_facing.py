@@ -32,8 +32,8 @@ def town(yaw, **options):
 
 def seen(made, leg=None, **scale):
     inputs, _ = screen(leg or made.leg(), settings(made))
-    w_b = inputs.w_b * scale.get('gyro', 1.0)
-    return facing(inputs.t_imu, w_b, inputs.f_b, inputs.travel, made.options.nominal_scale)
+    inputs = replace(inputs, w_b=inputs.w_b * scale.get('gyro', 1.0))
+    return facing(inputs, made.options.nominal_scale)
 
 
 @pytest.mark.parametrize('yaw', [1.0, 40.0, 90.0, -170.0])
