@@ -13,6 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
+from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
@@ -50,7 +51,7 @@ def mismatch(problem, fit, config):
     share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
     if share > odd_share:
         odd.append(f'{100 * share:.0f} % of the fixes lie far off')
-    share = float((fit.spread[:, 0] > 1.5).mean())
+    share = float((fit.spread[:, 0] > SLIP_VARIANCE).mean())
     if share > odd_share:
         odd.append(f'the wheel slips in {100 * share:.0f} % of the time')
     if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels

@@ -49,12 +49,11 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.nav.earth import C_en, earth_rate_n, gravity
 from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
-D = slice(15, 18)       # rows of the odometer
-ROWS = 18
+D = slice(E, E + 3)     # rows of the odometer, after those of the other unknowns
+ROWS = D.stop
 # of Motion, what each interval has
 EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'pushed',
         'from_mean', 'varied', 'travelled', 'residual')
-RESISTANCE, AIR = 0.1, 1e-4     # m/s^2, 1/m: what a car's tyres pull at a steady speed
 
 
 def rotvec(C):
@@ -103,7 +102,8 @@ def speeding_up(state):
 
 def varies_with(speed, t, faster):
     """Return what the scale varies with, as TYRES has it: (..., 4)."""
-    force = faster + RESISTANCE + AIR * speed**2
+    # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
+    force = faster + 0.1 + 1e-4 * speed**2
     return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
                      np.minimum(force, 0.0)], -1)
 

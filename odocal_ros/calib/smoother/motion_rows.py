@@ -13,6 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import blocks, SHORT_LEG
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
+from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
 from odocal_ros.calib.smoother.part import Part, Total
@@ -21,8 +22,6 @@ from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.state import M
 from odocal_ros.data.mapped import room
 
-FIRST_ROAD = 0.01    # m/sqrt(s), what slip and slide are believed to be at first
-LEAST_ROAD = 2e-4    # m/sqrt(s) along
 ALONG = ('along', 'along_hard')
 # sources in the budget
 NAMES = {'gyro': 'gyro_noise', 'accel': 'accelerometer_noise', 'gyro_walk': 'gyro_bias_walk',
@@ -54,10 +53,10 @@ class MotionRows(Part):
         """Return first levels and their least: of the Imu as it rests, of the road."""
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= at_rest(problem.imu, problem.leg, problem.still)
-        slide = least_slide(problem.turned)**2
-        return (imu | dict.fromkeys(ALONG, FIRST_ROAD**2)
-                | dict.fromkeys(SIDEWAYS, max(FIRST_ROAD**2, slide)),
-                imu | dict.fromkeys(ALONG, LEAST_ROAD**2) | dict.fromkeys(SIDEWAYS, slide)
+        slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, where they set out
+        return (imu | dict.fromkeys(ALONG, road)
+                | dict.fromkeys(SIDEWAYS, max(road, slide)),
+                imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
                 | {'up': max(slide, HEAVE**2)})
 
     def weigh(self, levels):

@@ -26,22 +26,17 @@ from odocal_ros.calib.smoother.state import BA, BG, ODO_DELAY, P, PHI, V
 from odocal_ros.nav.rotations import skew
 
 Floats = NDArray[np.float64]
-# level: variance per second of the white noise or walk
-INTERVAL = ('gyro', 'accel', 'gyro_walk', 'accel_walk', 'along', 'along_hard', 'side',
-            'side_turn', 'up')
-IMU = INTERVAL[:4]
-ROAD = (('along', 0), ('along_hard', 0), ('side', 1), ('side_turn', 1), ('up', 2))   # and axis
+# level: variance per second of the white noise or walk; of the road also the axis of the vehicle
+IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
+ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2}
+INTERVAL = (*IMU, *ROAD)
 SLOW_LEVELS = ('slow', 'slow_up')
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
-HARD_FORCE = 0.5                        # m/s^2 along: above it, a wheel may slip
-TURNING_RATE = 0.05                     # rad/s: above it, a vehicle may slide sideways
-REST_NOISE = 5e-4    # m that an odometer at rest may err by in a second, at least
-FEWEST_RESTS = 5                        # seconds to know that by
-CRAWL_SPEED = 0.02                      # m/s: share of the noise of a wheel that hardly turns
-IMU_GAP = 0.06                          # s and 3 medians: a longer step of the Imu hides motion
-HIDDEN_RATE, HIDDEN_FORCE = 0.1, 1.5    # rad/s, m/s^2 that may hide in it
-ABSENT_VARIANCE = 1e4                   # m^2: no odometer
+# rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
+TURNING_RATE = 0.05
+REST_NOISE = 5e-4       # m that an odometer at rest may err by in a second, at least: play
+ABSENT_VARIANCE = 1e4   # m^2: no odometer
 
 
 @dataclass(frozen=True)
@@ -95,7 +90,7 @@ class IntervalNoise:
     given: Floats                      # (K, 18, g) columns of unit noises, the same
     component: ClassVar[NDArray[np.int64]] = np.array(
         len(GAUSS_X) * [INTERVAL.index(name) for name in IMU for _ in range(3)]
-        + [INTERVAL.index(name) for name, _ in ROAD])
+        + [INTERVAL.index(name) for name in ROAD])
 
     def columns(self, rows: slice) -> Floats:
         """Return what unit noises do in the intervals of a slice: (k, 18, c)."""
@@ -117,7 +112,7 @@ class IntervalNoise:
             gyro_walk[:, D], gyro_walk[:, BG] = way @ C * (u**2 / 2) * root, one * root
             accel_walk[:, V], accel_walk[:, P] = -C * u * root, -C * (u**2 / 2) * root
             accel_walk[:, BA] = one * root
-        for column, (_, axis) in enumerate(ROAD, 12 * len(GAUSS_X)):
+        for column, axis in enumerate(ROAD.values(), 12 * len(GAUSS_X)):
             root = self.road[rows, column - 12 * len(GAUSS_X)]
             out[:, D, column] = self.axes[rows, axis] * root[:, None]
         return out
@@ -147,12 +142,12 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
     axes = axes + np.swapaxes(motion.C @ motion.state.C_bv, 1, 2)
     axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
     speed = np.linalg.norm(motion.way, axis=1) / T
-    share = np.sqrt(np.clip(speed, CRAWL_SPEED, 1.0) * T)
+    share = np.sqrt(np.clip(speed, 0.02, 1.0) * T)      # some of it where a wheel hardly turns
     hard, turning = hard_and_turning(motion)
     spread = np.ones((K, 3)) if spread is None else spread
     acting = ~hard, hard, ~turning, turning, np.ones(K, bool)
     road = np.stack([share * (where & ~rest) * np.sqrt(spread[:, axis])
-                     for (_, axis), where in zip(ROAD, acting, strict=True)], -1)
+                     for axis, where in zip(ROAD.values(), acting, strict=True)], -1)
     extra = _extra(motion, leg)
     still = rest_noise(speed, rest)
     extra[rest, D] += still
@@ -189,17 +184,21 @@ def _given(motion, leg, axes, rest):
 
 def rest_noise(speed, rest):
     """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
-    measured = float((speed[rest]**2).mean()) if rest.sum() >= FEWEST_RESTS else 0.0
+    measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s to know it by
     return max(measured, REST_NOISE**2)
 
 
 def hard_and_turning(motion):
-    """Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each."""
+    """
+    Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each.
+
+    By more than 0.5 m/s^2 along, where a wheel may slip, and TURNING_RATE, where it may slide.
+    """
     T = motion.T[:, 0]
     speed = np.einsum('ki,ki->k', motion.way, (motion.f_n + motion.f_n_end) / 2) \
         / motion.state.scale / T
     padded = np.pad(speed, 1, mode='edge')
-    hard = np.abs(padded[2:] - padded[:-2]) > 2 * HARD_FORCE * T
+    hard = np.abs(padded[2:] - padded[:-2]) > 0.5 * 2 * T
     rate = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate))
     return hard, rate > TURNING_RATE
 
@@ -208,11 +207,13 @@ def _extra(motion, leg):
     """Return variances of what gaps hide: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))
-    gap = np.where(sums.longest_step > max(IMU_GAP, 3 * np.median(sums.longest_step)),
+    # s: a longer step of the Imu hides motion
+    gap = np.where(sums.longest_step > max(0.06, 3 * np.median(sums.longest_step)),
                    sums.longest_step, 0.0)
-    extra[:, PHI] = (HIDDEN_RATE * gap[:, None])**2
-    extra[:, V] = (HIDDEN_FORCE * gap[:, None])**2
-    extra[:, P] = (HIDDEN_FORCE * gap * T)[:, None]**2
+    rate, force = 0.1, 1.5      # rad/s, m/s^2, 1 sigma of what may hide in it: of a car in town
+    extra[:, PHI] = (rate * gap[:, None])**2
+    extra[:, V] = (force * gap[:, None])**2
+    extra[:, P] = (force * gap * T)[:, None]**2
     t = motion.state.t
     way = leg.travel
     delay = motion.state.constants[ODO_DELAY]

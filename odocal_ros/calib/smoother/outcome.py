@@ -25,7 +25,7 @@ from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, model_floor, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
-from odocal_ros.calib.smoother.slip import find_slips, slip_reasons
+from odocal_ros.calib.smoother.slip import find_slips, slip_reasons, SLIP_VARIANCE
 from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
     BG,
@@ -256,7 +256,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
                       'fixes': len(t_fix), 'normalised': _normalised(fit.weighted),
-                      'intervals_slipping': int((fit.spread[:, 0] > 1.5).sum())},
+                      'intervals_slipping': int((fit.spread[:, 0] > SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
                        'turned': float(turned), 'in_turns': problem.turned,

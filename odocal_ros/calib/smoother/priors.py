@@ -13,21 +13,15 @@ import numpy as np
 
 from odocal_ros.calib.smoother.part import hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
-    ACCEL,
     BA,
     BG,
-    FIX_LAG2,
+    constants_from,
     GNSS_ARM,
-    GNSS_DELAY,
-    GYRO,
-    HEADING,
     LEAN,
     M,
     ODO_ARM,
-    ODO_DELAY,
     P,
     PHI,
-    SPEED_OFFSET,
     TYRES,
     V,
 )
@@ -37,18 +31,18 @@ START_SIGMAS = {'position': (P, 1e4), 'velocity': (V, 100.0),
                 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
 # believed of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
-          'odometer_delay': slice(ODO_DELAY, ODO_DELAY + 1),
-          'fix_latency': slice(GNSS_DELAY, GNSS_DELAY + 1),
-          'gyro_scale': slice(GYRO.start, GYRO.start + 3),
-          'gyro_axes': slice(GYRO.start + 3, GYRO.start + 7),
-          'gyro_by_force': slice(GYRO.start + 7, GYRO.stop),
-          'accelerometer_scale': slice(ACCEL.start, ACCEL.start + 3),
-          'accelerometer_axes': slice(ACCEL.start + 3, ACCEL.stop),
-          'receiver_smoothing': slice(FIX_LAG2, FIX_LAG2 + 1),
+          'odometer_delay': constants_from('odometer_delay'),
+          'fix_latency': constants_from('gnss_delay'),
+          'gyro_scale': constants_from('gyro_scale_z', 'gyro_scale_y'),
+          'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
+          'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
+          'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
+          'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_zy'),
+          'receiver_smoothing': constants_from('fix_lag_square'),
           'tyre_changes': TYRES,
           'body_lean': LEAN,
-          'speed_truncation': slice(SPEED_OFFSET, SPEED_OFFSET + 1),
-          'heading': slice(HEADING, HEADING + 1)}
+          'speed_truncation': constants_from('speed_offset'),
+          'heading': constants_from('heading_offset')}
 
 
 class PriorRows(Part):

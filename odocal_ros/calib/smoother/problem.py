@@ -36,11 +36,11 @@ from odocal_ros.calib.smoother.state import (
     GYRO_SIGNAL,
     HEADING,
     IMPERFECT,
+    KIND_SIZES,
     M,
     ODO_ARM,
     ODO_DELAY,
     Priors,
-    SIZES,
     SPEED_OFFSET,
     State,
 )
@@ -52,9 +52,10 @@ from odocal_ros.settings.grades import G, Grade, grade_as_seen
 # SAME_DERIVATIVES, to keep those, which cost most: an interval's are the same to half a per cent
 SAME_SUMS = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
 SAME_DERIVATIVES = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
-SPACING = 1.0           # s between keyframes
-NO_ERROR = 1e-12        # of what there is none of
-WARMING_TIME = 600.0    # s
+# s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
+# consumer's Imu 6 % larger (docs/decisions/0005)
+SPACING = 1.0
+NO_ERROR = 1e-12        # prior sigma of what there is none of, in any unit
 
 
 @dataclass(eq=False)
@@ -199,9 +200,17 @@ def imperfect_sigmas(grade, duration):
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
-    return np.repeat([grade.gyro_scale_error, axes, grade.gyro_by_force, grade.accel_scale_error,
-                      axes, 1.0, 1e-4, 2.5e-3 / max(duration, WARMING_TIME), 4e-3, 3e-3, 5e-3,
-                      3e-4, 5e-4], SIZES)
+    usual = {
+        'gyro_scale': grade.gyro_scale_error, 'gyro_axis': axes,
+        'gyro_by_force': grade.gyro_by_force,       # rad/s per m/s^2
+        'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
+        'fix_lag_square': 1.0,                      # s^2
+        'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
+        'scale_by_time': 2.5e-3 / max(duration, 600.0),     # 1 / s
+        'scale_by_force': 4e-3,                     # 1 / (m/s^2)
+        'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
+        'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4}    # rad per m/s^3
+    return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
 
 
 def _priors(config, grade, leg) -> Priors:

@@ -22,15 +22,17 @@ from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.start import rest_bias
 from odocal_ros.data.pieces import chunks
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import SWAY
 
-TURN_SLIDE = 2e-4    # m/sqrt(s), least that is believed where there are turns
-# m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds
+# m/sqrt(s), least slide where turns test it. Tuned: the simulator's vehicles, which do not slide,
+# then have the yaw sigma of their errors (docs/decisions/0005)
+TURN_SLIDE = 2e-4
+# m/sqrt(s), least up and down: what springs, tyres and road do in a second that no unknown holds.
+# Tuned: with a tenth the pitch of yards was 3 sigmas off (docs/decisions/0005)
 HEAVE = 2e-3
-ORDINARY_ROAD = 0.05 / np.sqrt(10.0)    # m/sqrt(s), an ordinary road: 0.05 m/s, white at 10 Hz
-# rad turned in all: less than one crossroads tests nothing, two do; in between in proportion
-NO_TURN, TURN_ENOUGH = np.pi / 2, np.pi
-MOVING_SPEED = 0.2    # m/s
-SLIDE_WORTH = 2e-3    # m/sqrt(s) worth a word
+# m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
+ORDINARY_ROAD = SWAY / np.sqrt(10.0)
+NO_TURN = np.pi / 2    # rad turned in all: less than one crossroads tests nothing, two do
 SIDEWAYS = ('side', 'side_turn', 'up')
 
 
@@ -45,19 +47,20 @@ def turned(leg, imu) -> float:
     up = total.sum / len(imu.t)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
     way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
-    return float(angle[(angle > TURNING_RATE * T) & (way > MOVING_SPEED * T)].sum())
+    return float(angle[(angle > TURNING_RATE * T) & (way > 0.2 * T)].sum())    # m/s: moving
 
 
 def least_slide(angle) -> float:
-    """Return the least sideways and vertical noise to believe in, m/sqrt(s), by angle turned."""
-    tested = np.clip((angle - NO_TURN) / (TURN_ENOUGH - NO_TURN), 0.0, 1.0)
+    """Return the least sideways and vertical noise, m/sqrt(s), by the angle turned in all, rad."""
+    tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
     return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
 
 
 def assumed(problem, levels):
     """Say where a road's noise was assumed and not seen, and decides: reasons."""
     least = problem.least['side']
-    if least < SLIDE_WORTH**2 or all(levels[name] > 1.01 * least for name in SIDEWAYS):
+    if least < 2e-3**2 or all(      # m^2/s, worth a word
+            levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
     return [Reason(Code.PARAMETER_NOT_DETERMINED, 'the turns of this drive add up to '
                    f'{np.rad2deg(problem.turned):.0f} deg, too little to test how much the '

@@ -16,14 +16,8 @@ import numpy as np
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.reasons import Code, Reason
 
-SLIP_VARIANCE = 1.5      # factor on the variance of an interval from which it is a slip
-SLIP_WORTH = 0.05        # m that are worth a word
-SLIP_OVER_NOISE = 4.0    # times the usual noise of as long a time, the same
-RUN_INTERVALS = 2        # intervals between slips of one run
-HARD_NOISE = 0.006       # m/sqrt(s) when speeding up or braking, which no wheel without slip has
-HARDER_TIMES = 3.0       # times that of even driving, the same
-RUNS_TOLD = 3           # runs told in the sentence
-SPELL_TIME = 10.0        # s that a vehicle speeds up or brakes at a time
+# factor on the variance of an interval from which it is a slip: it lies 3.7 sigmas off
+SLIP_VARIANCE = 1.5
 
 
 @dataclass(frozen=True)
@@ -45,32 +39,33 @@ def along(fit, neighbours):
 def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:
     """Return the runs that lie far out along, by more than a count, m; largest first."""
     turned, t = along(fit, neighbours), fit.state.t
-    noise = SLIP_OVER_NOISE * float(np.sqrt(fit.levels['along']))
-    least = max(SLIP_WORTH, noise, count)
+    noise, worth = 4 * float(np.sqrt(fit.levels['along'])), 0.05    # sigmas of a second; m
+    least = max(worth, noise, count)
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
     if not len(far):
         return ()
-    runs = np.split(far, np.flatnonzero(np.diff(far) > RUN_INTERVALS) + 1)
+    runs = np.split(far, np.flatnonzero(np.diff(far) > 2) + 1)    # a second between
     slips = [Slip(float(t[run[0]]), float(t[run[-1] + 1] - t[run[0]]), float(turned[run].sum()))
              for run in runs]
     return tuple(sorted((s for s in slips if abs(s.metres)
-                         >= max(SLIP_WORTH, noise * np.sqrt(s.duration), count)),
+                         >= max(worth, noise * np.sqrt(s.duration), count)),
                         key=lambda s: -abs(s.metres)))
 
 
 def slip_reasons(fit, slips, count=0.0):
     """Say where the wheels slipped and how much, one by one or whenever the speed changes."""
     level = fit.levels.roots()
-    # two readings differ by that whatever the wheel does
-    rounding = count * np.sqrt(2 / 12) / np.sqrt(SPELL_TIME)
-    said = []
+    # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
+    rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
+    said, most = [], 3      # runs said one by one
     if slips:
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
-               for s in slips[:RUNS_TOLD]]
-        more = f' and {len(slips) - RUNS_TOLD} more' if len(slips) > RUNS_TOLD else ''
+               for s in slips[:most]]
+        more = f' and {len(slips) - most} more' if len(slips) > most else ''
         said.append('the wheel turned more (+) or less (-) than the vehicle moved: '
                     + ', '.join(one) + more)
-    if level['along_hard'] > max(HARD_NOISE, HARDER_TIMES * level['along'], rounding):
+    # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
+    if level['along_hard'] > max(0.006, 3 * level['along'], rounding):
         said.append('it slips when the speed changes: about '
                     f'{1e3 * level["along_hard"]:.0f} mm in each second of speeding up or '
                     f'braking, {1e3 * level["along"]:.1f} mm in even driving')

@@ -17,6 +17,7 @@ units. The constants are the border.
 """
 
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,57 +26,79 @@ from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
 
 Floats = NDArray[np.float64]
-P, V, PHI, BG, BA = (slice(3 * i, 3 * i + 3) for i in range(5))
-E = 15                      # travel error
-SLOW = slice(16, 19)        # slow part of the fix error, ENU, where there is one
-BARE, WITH_SLOW = 16, 19    # unknowns of a block
+# the unknowns of a block, one after the other, and how many each has
+BLOCK = {'position': 3, 'velocity': 3, 'attitude error': 3, 'gyro bias': 3,
+         'accelerometer bias': 3, 'travel error': 1, 'slow fix error, ENU, where there is one': 3}
+P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
+    BLOCK.values(), accumulate(BLOCK.values()), strict=True))
+E = TRAVEL.start
+BARE, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
+
+# Errors of the Imu: of what a signal measures, the part that an axis has too much, by the axis it
+# enters and the signal: of (w_x, w_y, w_z, f_x, f_y), and of (f_x, f_y, f_z). The others of the 18
+# are a bias (f_z into x and y), or zero by the definition of the axes (z: about which the gyro
+# feels a turn on level ground; x: the direction of a push that the y accelerometer does not feel).
+GYRO_ERRORS = {
+    'gyro_scale_z': (2, 2), 'gyro_scale_x': (0, 0), 'gyro_scale_y': (1, 1),
+    'gyro_axis_xy': (0, 1), 'gyro_axis_yx': (1, 0), 'gyro_axis_zx': (2, 0), 'gyro_axis_zy': (2, 1),
+    'gyro_x_by_force_x': (0, 3), 'gyro_x_by_force_y': (0, 4), 'gyro_y_by_force_x': (1, 3),
+    'gyro_y_by_force_y': (1, 4), 'gyro_z_by_force_x': (2, 3), 'gyro_z_by_force_y': (2, 4)}
+ACCEL_ERRORS = {
+    'accelerometer_scale_x': (0, 0), 'accelerometer_scale_y': (1, 1),
+    'accelerometer_scale_z': (2, 2), 'accelerometer_axis_xy': (0, 1),
+    'accelerometer_axis_zx': (2, 0), 'accelerometer_axis_zy': (2, 1)}
+GYRO_AXIS, GYRO_SIGNAL = zip(*GYRO_ERRORS.values(), strict=True)
+ACCEL_AXIS, ACCEL_SIGNAL = zip(*ACCEL_ERRORS.values(), strict=True)
 
 # the border
 CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
-             'odometer_delay', 'gnss_delay', 'heading_offset', 'gyro_scale_z',
-             'gyro_scale_x', 'gyro_scale_y',
-             'gyro_axis_xy', 'gyro_axis_yx', 'gyro_axis_zx', 'gyro_axis_zy',
-             'gyro_x_by_force_x', 'gyro_x_by_force_y', 'gyro_y_by_force_x', 'gyro_y_by_force_y',
-             'gyro_z_by_force_x', 'gyro_z_by_force_y',
-             'accelerometer_scale_x', 'accelerometer_scale_y', 'accelerometer_scale_z',
-             'accelerometer_axis_xy', 'accelerometer_axis_zx', 'accelerometer_axis_zy',
+             'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
              'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
              'speed_offset')
-LN_K, YAW, PITCH = 0, 1, 2
-ODO_ARM, GNSS_ARM = slice(3, 6), slice(6, 9)    # from the Imu, base_link axes, m
-ODO_DELAY, GNSS_DELAY = 9, 10
-HEADING = 11    # error of the outside heading, the same through the leg, rad
-# Errors of the Imu: of what a signal measures, the part that an axis has too much. Each column:
-# the axis it enters, and the signal, of (w_x, w_y, w_z, f_x, f_y) and of (f_x, f_y, f_z). The
-# others of the 18 are a bias (f_z into x and y), or zero by the definition of the axes (z: about
-# which the gyro feels a turn on level ground; x: the direction of a push that the y accelerometer
-# does not feel).
-GYRO, GYRO_SCALE = slice(12, 25), 12
-GYRO_AXIS = (2, 0, 1, 0, 1, 2, 2, 0, 0, 1, 1, 2, 2)
-GYRO_SIGNAL = (2, 0, 1, 1, 0, 0, 1, 3, 4, 3, 4, 3, 4)
-ACCEL = slice(25, 31)
-ACCEL_AXIS, ACCEL_SIGNAL = (0, 1, 2, 0, 2, 2), (0, 1, 2, 1, 0, 1)
-FIX_LAG2 = 31    # s^2, square of the time constant by which a receiver smooths
+
+
+def constants_from(first: str, last: str = '') -> slice:
+    """Return where constants stand, from one to another by name, the last with them, or of one."""
+    return slice(CONSTANTS.index(first), CONSTANTS.index(last or first) + 1)
+
+
+LN_K, YAW, PITCH = map(CONSTANTS.index, ('scale_factor', 'yaw_mounting_angle',
+                                         'pitch_mounting_angle'))
+# from the Imu, base_link axes, m
+ODO_ARM = constants_from('odometer_lever_arm_x', 'odometer_lever_arm_z')
+GNSS_ARM = constants_from('antenna_lever_arm_x', 'antenna_lever_arm_z')
+# s; error of the outside heading, the same through the leg, rad
+ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_delay',
+                                                       'heading_offset'))
+GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
+GYRO_SCALE = GYRO.start
+ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_zy')
+# s^2, square of the time constant by which a receiver smooths
+FIX_LAG2 = CONSTANTS.index('fix_lag_square')
 # relative change of the scale with the square of the speed (its slope at FAST_SPEED, s/m), with
 # time, 1 / s, and with what the tyres pull and brake, 1 / (m/s^2), from their means by travel.
 # Pull and braking are two: a wheel that does not drive brakes only
-TYRES = slice(32, 36)
-BY_SPEED, BY_TIME = 32, 33
-FAST_SPEED = 20.0           # m/s
+TYRES = constants_from('scale_by_speed', 'scale_by_braking')
+BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
+FAST_SPEED = 20.0           # m/s: of a road out of town
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: a body answers late, tyres at once
-LEAN = slice(36, 40)
+LEAN = constants_from('squat', 'sideslip_by_jerk')
 # what a good vehicle has not: all to here, but for the gyro's scale, which every turn tells
-IMPERFECT = slice(13, 40)
-# kinds of these, each there or not, as ``imperfect_sigmas`` has them: gyro scales, axes and by
-# force, accelerometer scales and axes, the others one by one
-SIZES = (2, 4, 6, 3, 3, 1, 1, 1, 2, 1, 1, 1, 1)
-KINDS = tuple(slice(sum(SIZES[:i]), sum(SIZES[:i + 1])) for i in range(len(SIZES)))
-# of a speed sent in steps, what a value of it lacks: half a step where the sender truncates
-SPEED_OFFSET = 40    # scale units per s
+IMPERFECT = constants_from('gyro_scale_x', 'sideslip_by_jerk')
+# kinds of these, each there or not, and how many constants each has
+KIND_SIZES = {'gyro_scale': 2, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
+              'accelerometer_axis': 3, 'fix_lag_square': 1, 'scale_by_speed': 1,
+              'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1, 'sideslip': 1,
+              'squat_by_jerk': 1, 'sideslip_by_jerk': 1}
+KINDS = tuple(slice(end - size, end) for size, end in zip(
+    KIND_SIZES.values(), accumulate(KIND_SIZES.values()), strict=True))
+# scale units per s: of a speed sent in steps, what a value of it lacks, half a step where the
+# sender truncates
+SPEED_OFFSET = CONSTANTS.index('speed_offset')
 M = len(CONSTANTS)
 
 
