@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages.raws import Raws
@@ -58,7 +58,7 @@ class Recording:
         self.start_ns, self.end_ns, self.count = 2**63 - 1, 0, 0
         self._channels: dict[int, Channel] = {}
 
-    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type): channel, time and bytes."""
         raise NotImplementedError
 
@@ -76,7 +76,7 @@ class Recording:
 
     def _count(self) -> None:
         """Count what is there, message by message."""
-        counts: Counter = Counter()
+        counts: Counter[int] = Counter()
         start_ns, end_ns = 2**63 - 1, 0
         for key, time_ns in self._scan():
             counts[key] += 1
@@ -98,6 +98,6 @@ class Recording:
         return {k: c for k, c in self._channels.items() if topics.get(c.topic) == c.msgtype}
 
 
-def possible(time_ns: object) -> bool:
+def possible(time_ns: int) -> bool:
     """Tell whether a bag time can be one."""
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 import struct
+from typing import Any
 import zlib
 
 import numpy as np
@@ -78,7 +79,7 @@ def pack(channel: int, times_ns: Sequence[int], raws: Sequence[bytes], sequence:
 
 
 @cache
-def _zstd():
+def _zstd() -> Any:
     try:
         return zstd_module()
     except ModuleNotFoundError:    # comes with rosbags; without it chunks are just larger

@@ -14,20 +14,21 @@ from contextlib import contextmanager
 import re
 import signal
 import threading
+from typing import Any
 
 BAR = '=' * 80 + '\n'
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
 
 
-def parsed(msgtype: str, form: str, text: str) -> dict:
+def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:
     """Return the fields of a type and those it stands on; form is 'msg' or 'idl'."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
     if form == 'msg':
         return get_types_from_msg(text, msgtype)
     parts = [part.split('\n', 1)[1] for part in text.split(BAR)[1:]] if text.startswith(
         f'{BAR}IDL: ') else [text]
-    found: dict = {}
+    found: dict[str, Any] = {}
     for part in parts:
         found.update(get_types_from_idl(bare(part)))
     return found
@@ -65,7 +66,7 @@ def within(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def late(*_) -> None:
+    def late(*_: Any) -> None:
         raise TimeoutError(f'it takes longer than {seconds:g} s')
     before = signal.signal(signal.SIGALRM, late)
     signal.setitimer(signal.ITIMER_REAL, seconds)

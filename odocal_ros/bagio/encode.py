@@ -14,10 +14,15 @@ Messages of one topic all have the same length (one frame_id, one set of joint n
 of them is one structured array; no message object is made.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 
 CDR_HEADER = (0, 1, 0, 0)
 VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)
@@ -42,11 +47,11 @@ class _Layout:
     """Collects the fields of a message with the padding that CDR puts before them."""
 
     def __init__(self) -> None:
-        self._fields: list[tuple] = [('cdr', 'u1', 4)]
+        self._fields: list[tuple[Any, ...]] = [('cdr', 'u1', 4)]
         self._size = 0
         self._texts: dict[str, bytes] = {}
 
-    def add(self, name: str, kind, align: int | None = None) -> '_Layout':
+    def add(self, name: str, kind: str | tuple[str, int], align: int | None = None) -> '_Layout':
         """Add a number, or a (number, count) array."""
         base, count = kind if isinstance(kind, tuple) else (kind, 1)
         item = np.dtype(base).itemsize
@@ -70,11 +75,12 @@ class _Layout:
         """Add a std_msgs/Header."""
         return self.add('sec', '<i4').add('nanosec', '<u4').text('frame', frame)
 
-    def packer(self, fill: Callable[[np.ndarray, slice], None], n: int):
+    def packer(self, fill: Callable[[NDArray[Any], slice], None],
+               n: int) -> Callable[[slice], NDArray[Any]]:
         """Return a function that packs a slice of n rows, ``fill`` setting the fields."""
         dtype, texts = np.dtype(self._fields), self._texts
 
-        def pack(rows: slice) -> np.ndarray:
+        def pack(rows: slice) -> NDArray[Any]:
             out = np.zeros(len(range(*rows.indices(n))), dtype)
             out['cdr'] = CDR_HEADER
             for name, raw in texts.items():
@@ -84,11 +90,12 @@ class _Layout:
         return pack
 
 
-def _stamp(out, stamp_ns):
+def _stamp(out: NDArray[Any], stamp_ns: Ints) -> None:
     out['sec'], out['nanosec'] = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000
 
 
-def imu(name: str, samples, frame: str = 'imu_link', w_variance=None, f_variance=None) -> Topic:
+def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Floats | None = None,
+        f_variance: Floats | None = None) -> Topic:
     """
     Return sensor_msgs/Imu of ImuSamples; no orientation where the yaw variance is NaN.
 
@@ -99,7 +106,7 @@ def imu(name: str, samples, frame: str = 'imu_link', w_variance=None, f_variance
                         ('f', VECTOR), ('f_cov', SQUARE)):
         layout.add(field, kind)
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])
         out['w'], out['f'] = samples.w_i[rows], samples.f_i[rows]
         for field, variance in (('w_cov', w_variance), ('f_cov', f_variance)):
@@ -110,14 +117,14 @@ def imu(name: str, samples, frame: str = 'imu_link', w_variance=None, f_variance
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def heading(name: str, samples, frame: str = 'imu_link') -> Topic:
+def heading(name: str, samples: HeadingSamples, frame: str = 'imu_link') -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
     layout = _Layout().header(frame)
     for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
                         ('f', VECTOR), ('f_cov', SQUARE)):
         layout.add(field, kind)
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])
         out['w_cov'][:, 0] = out['f_cov'][:, 0] = -1.0
         _orientation(out, samples.q_ni[rows], samples.yaw_variance[rows])
@@ -125,32 +132,33 @@ def heading(name: str, samples, frame: str = 'imu_link') -> Topic:
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def _orientation(out, q_ni, variance):
+def _orientation(out: NDArray[Any], q_ni: Floats, variance: Floats) -> None:
     out['q'] = q_ni
     out['q_cov'][:, ::4] = np.where(np.isnan(variance), 0.0, variance)[:, None]
     out['q_cov'][np.isnan(variance), 0] = -1.0
 
 
-def counter(name: str, samples) -> Topic:
+def counter(name: str, samples: OdometerSamples) -> Topic:
     """Return std_msgs/Int64 of OdometerSamples: no header, so the bag time is the stamp."""
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         out['data'] = samples.value[rows]
     return Topic(name, 'std_msgs/msg/Int64', samples.stamp_ns,
                  _Layout().add('data', '<i8').packer(fill, len(samples.stamp_ns)))
 
 
-def twist(name: str, samples, frame: str = 'base_link') -> Topic:
+def twist(name: str, samples: OdometerSamples, frame: str = 'base_link') -> Topic:
     """Return geometry_msgs/TwistStamped of OdometerSamples: forward speed, the rest zero."""
     layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR)
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])
         out['linear'][:, 0] = samples.value[rows]
     return Topic(name, 'geometry_msgs/msg/TwistStamped', samples.received_ns,
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def joints(name: str, wheels: dict, frame: str = '', rates: bool = False) -> Topic:
+def joints(name: str, wheels: dict[str, OdometerSamples], frame: str = '',
+           rates: bool = False) -> Topic:
     """Return sensor_msgs/JointState of OdometerSamples by joint: positions, or rates, only."""
     first = next(iter(wheels.values()))
     layout = _Layout().header(frame).add('names', '<u4')
@@ -162,7 +170,7 @@ def joints(name: str, wheels: dict, frame: str = '', rates: bool = False) -> Top
         for joint in wheels if field == given else ():
             layout.add(joint, '<f8')
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, first.stamp_ns[rows])
         out['names'] = out[given] = len(wheels)
         for joint, samples in wheels.items():
@@ -171,12 +179,12 @@ def joints(name: str, wheels: dict, frame: str = '', rates: bool = False) -> Top
                  layout.packer(fill, len(first.stamp_ns)))
 
 
-def fix(name: str, samples, frame: str = 'gnss') -> Topic:
+def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
     """Return sensor_msgs/NavSatFix of FixSamples."""
     layout = (_Layout().header(frame).add('status', 'i1').add('service', '<u2')
               .add('place', VECTOR).add('cov', SQUARE).add('cov_type', 'u1'))
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])
         out['status'], out['service'] = samples.status[rows], 1
         out['place'][:, 0] = np.degrees(samples.latitude[rows])
@@ -188,13 +196,13 @@ def fix(name: str, samples, frame: str = 'gnss') -> Topic:
                  layout.packer(fill, len(samples.stamp_ns)))
 
 
-def camera(name: str, time_ns, size: int, rng) -> Topic:
+def camera(name: str, times_ns: Sequence[int], size: int, rng: np.random.Generator) -> Topic:
     """Return sensor_msgs/CompressedImage of ``size`` random bytes each, to make a bag heavy."""
-    time_ns = np.asarray(time_ns, dtype=np.int64)
+    time_ns = np.asarray(times_ns, dtype=np.int64)
     layout = (_Layout().header('camera').text('format', 'jpeg').add('bytes', '<u4')
               .add('data', ('u1', size)))
 
-    def fill(out, rows):
+    def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, time_ns[rows])
         out['bytes'] = size
         out['data'] = np.frombuffer(rng.bytes(out['data'].size), np.uint8).reshape(-1, size)

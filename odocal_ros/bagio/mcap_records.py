@@ -14,6 +14,7 @@ from operator import attrgetter
 import struct
 from typing import NamedTuple
 
+from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.messages.raws import Bytes
 from odocal_ros.outside.limits import Damaged
 
@@ -43,7 +44,7 @@ class Place(NamedTuple):
     index_size: int = 0
 
 
-def records_of(data, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
+def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
     """Yield the records of a section, up to the footer, and whether they are whole."""
     while at + 9 <= len(data):
         op, size = RECORD.unpack(data[at:at + 9])

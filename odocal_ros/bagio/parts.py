@@ -35,7 +35,8 @@ ZSTD = b'\x28\xb5\x2f\xfd'
 class Part:
     """A file of a bag; what is known of it is ``file``'s to tell."""
 
-    def __init__(self, path: Path, file: Path, kind: str, total: int, convert: Callable) -> None:
+    def __init__(self, path: Path, file: Path, kind: str, total: int,
+                 convert: Callable[..., Any]) -> None:
         self.path = path
         self._allowance = Allowance(path, total)
         try:
@@ -43,7 +44,7 @@ class Part:
         except (Damaged, ValueError) as error:
             raise BadBag(f'{path}: nothing in it can be read ({error})') from None
 
-    def _opened(self, file: Path, kind: str, convert: Callable) -> Recording:
+    def _opened(self, file: Path, kind: str, convert: Callable[..., Any]) -> Recording:
         if kind == '.mcap':
             return McapFile(file, self._allowance)
         return SqliteFile(file) if kind == '.db3' else Rosbag1File(file, self._allowance, convert)
@@ -73,15 +74,15 @@ class Part:
             for time_ns, _, channel, raw in heapq.merge(*lists, key=itemgetter(0)):
                 yield channel, time_ns, raw
 
-    def _messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
-        stream: Iterator[tuple] = self._file.messages(topics)
+    def _messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
+        stream: Iterator[tuple[Any, ...]] = self._file.messages(topics)
         first = next(stream, None)
         if first is None:
             return iter(())
         stream = chain([first], stream)
         return self._unpacked(stream) if _packed(first[2]) else stream
 
-    def _unpacked(self, stream: Iterator[tuple]) -> Iterator[tuple]:
+    def _unpacked(self, stream: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
         """Yield messages unpacked; b'' where that fails, for readers to count."""
         for channel, time_ns, raw in stream:
             try:
@@ -103,7 +104,7 @@ def _packed(raw: bytes) -> bool:
     return raw[:4] == ZSTD
 
 
-def group(stream: Iterator[tuple]) -> Batch:
+def group(stream: Iterator[tuple[Any, ...]]) -> Batch:
     """Take messages (rosbags' connection or our Channel, time, raw), by topic; {}: none left."""
     # lists of bytes and numbers only, which the garbage collector does not look at (a list of
     # tuples takes as long as the reading itself)

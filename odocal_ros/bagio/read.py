@@ -25,7 +25,7 @@ from odocal_ros.bagio.sources import find, names, Source, unpack
 from odocal_ros.bagio.types import Types
 from odocal_ros.errors import BadBag, BadData, BadUsage, OdocalError
 from odocal_ros.messages import cdr
-from odocal_ros.messages.decode import Feed, Reader
+from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
 
@@ -105,7 +105,7 @@ class Bag:
                                 'metadata.yaml tells of are missing'))
         return found
 
-    def read(self, readers: dict[str, Reader], feed: Feed,
+    def read(self, readers: Mapping[str, RowReader], feed: Feed,
              progress: Callable[[float], None] | None = None) -> None:
         """
         Read topics in one pass.
@@ -141,7 +141,7 @@ class Bag:
         for topic, reader in readers.items():
             self._tell(topic, reader, used[topic])
 
-    def _tell(self, topic: str, reader: Reader, used: int) -> None:
+    def _tell(self, topic: str, reader: RowReader, used: int) -> None:
         """Note messages that gave no row; raise where none gave one."""
         if not reader.unreadable:
             return
@@ -265,7 +265,7 @@ class open_bag:
                         source.of_file)
         return Bag(source, parts, types)
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: Any) -> None:
         """Close the files."""
         self._stack.close()
 

@@ -30,7 +30,7 @@ class Rosbag1File(Recording):
     the index is counted here, and its decompressors are replaced.
     """
 
-    def __init__(self, path: Path, allowance: Allowance, convert: Callable) -> None:
+    def __init__(self, path: Path, allowance: Allowance, convert: Callable[..., Any]) -> None:
         super().__init__(path)
         self._convert, self._allowance = convert, allowance
         try:
@@ -61,7 +61,7 @@ class Rosbag1File(Recording):
         why = ' '.join(str(error).split()).rstrip('.')[:200] or type(error).__name__
         return BadBag(f"{self.path}: cannot be read ({why}); try 'rosbag reindex' on it")
 
-    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple]:
+    def messages(self, topics: Mapping[str, str]) -> Iterator[tuple[Any, ...]]:
         """Yield the messages of some topics (name -> type) by time, as CDR."""
         connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
         if not connections:      # rosbags would take none as all
@@ -90,7 +90,7 @@ class Rosbag1File(Recording):
         self._reader.close()
 
 
-def _decompressors() -> dict[str, Callable]:
+def _decompressors() -> dict[str, Callable[..., Any]]:
     from rosbags.rosbag1 import reader
     return reader.decompressors
 
@@ -110,7 +110,7 @@ def _reader(path: Path) -> Any:
     class File(type(Path())):     # type: ignore[misc]
         """A path whose file is so bounded."""
 
-        def open(self, *_) -> io.BufferedReader:
+        def open(self, *_: str) -> io.BufferedReader:
             """Open the file for reading."""
             return Bounded(io.FileIO(self))
 
@@ -119,7 +119,7 @@ def _reader(path: Path) -> Any:
 
         left = most
 
-        def read_index_data(self, pos: int, indexes: dict) -> None:
+        def read_index_data(self, pos: int, indexes: Any) -> None:
             """Read the entries of a connection in a chunk."""
             assert self.bio
             begin = self.bio.tell()

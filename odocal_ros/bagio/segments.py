@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
+from typing import Any
 
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
@@ -39,7 +40,7 @@ class Segment:
     size: int
     start_ns: int
     end_ns: int
-    counts: Counter      # messages by channel
+    counts: Counter[int]      # messages by channel
 
 
 class SegmentedBag:
@@ -135,7 +136,7 @@ class _Tally:
 
     def __init__(self) -> None:
         self.start_ns, self.end_ns = 2**63 - 1, 0
-        self.counts: Counter = Counter()
+        self.counts: Counter[int] = Counter()
 
     def over(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
         for chunk in chunks:
@@ -154,8 +155,8 @@ def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
     """Return the text of metadata.yaml, version 9, as rosbag2 of Jazzy writes it."""
     import yaml
     start_ns, end_ns = min(f.start_ns for f in files), max(f.end_ns for f in files)
-    counts: Counter = sum((f.counts for f in files), Counter())
-    return yaml.safe_dump({'rosbag2_bagfile_information': {
+    counts: Counter[int] = sum((f.counts for f in files), Counter())
+    text: str = yaml.safe_dump({'rosbag2_bagfile_information': {
         'version': 9, 'storage_identifier': 'mcap',
         **_span(start_ns, end_ns, counts.total()),
         'topics_with_message_count': [
@@ -167,8 +168,9 @@ def _metadata(files: Sequence[Segment], channels: Mapping[int, Channel]) -> str:
         'files': [{'path': f.path.name, **_span(f.start_ns, f.end_ns, f.counts.total())}
                   for f in files],
         'custom_data': None, 'ros_distro': 'jazzy'}}, sort_keys=False)
+    return text
 
 
-def _span(start_ns: int, end_ns: int, count: int) -> dict:
+def _span(start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
     return {'starting_time': {'nanoseconds_since_epoch': start_ns},
             'duration': {'nanoseconds': end_ns - start_ns}, 'message_count': count}

@@ -15,6 +15,7 @@ from pathlib import Path
 import re
 import shutil
 import sqlite3
+from typing import Any
 
 from odocal_ros.bagio.channels import possible
 from odocal_ros.bagio.numbered import JOURNAL, without_joined
@@ -113,7 +114,7 @@ def _hint(path: Path) -> str:
     return f'; did you mean {" or ".join(map(str, below[:3]))}?' if below else ''
 
 
-def _by_number(path: Path):
+def _by_number(path: Path) -> list[tuple[int, str]]:
     """Sort bag_2 before bag_10."""
     return [(int(part), '') if part.isdigit() else (0, part)
             for part in re.split(r'(\d+)', path.name)]
@@ -153,7 +154,7 @@ def _read_metadata(path: Path) -> Known:
         return Known(trouble=f'{path}: cannot be understood ({why}), so it is not used')
 
 
-def _known(content: dict) -> Known:
+def _known(content: dict[str, dict[str, Any]]) -> Known:
     known = content['rosbag2_bagfile_information']
     files = known.get('files') or ()
     spans = ((Path(file['path']).name, _span(file)) for file in files)
@@ -165,7 +166,7 @@ def _known(content: dict) -> Known:
         '' if 'cdr' in formats else ', '.join(sorted(formats)))
 
 
-def _span(known: dict) -> Span | None:
+def _span(known: dict[str, Any]) -> Span | None:
     """Return the end and the count that metadata tell, of a bag or one file."""
     if not known.get('message_count') or 'starting_time' not in known:
         return None

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 import sqlite3
 import struct
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -68,7 +69,7 @@ class SqliteFile(Recording):
         db.set_authorizer(lambda action, *_: sqlite3.SQLITE_OK if action in READS
                           else sqlite3.SQLITE_DENY)
 
-    def _query(self, sql: str, *values) -> Iterator[tuple]:
+    def _query(self, sql: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query, or raise Damaged."""
         left = int((MOST_STEPS + STEPS_A_BYTE * self._size) * factor()) // STEPS
 
@@ -141,7 +142,7 @@ class SqliteFile(Recording):
         self.damage = 'cut off' if self._leaves.cut else str(error)
 
     def _scan(self) -> Iterator[tuple[int, int]]:
-        rows: Iterator[tuple] = self._leaves.rows(None) if self._leaves else self._query(
+        rows: Iterator[tuple[Any, ...]] = self._leaves.rows(None) if self._leaves else self._query(
             'SELECT topic_id, timestamp, NULL FROM messages')
         before = -1
         for key, time_ns, _ in rows:
@@ -196,7 +197,7 @@ class SqliteFile(Recording):
             if possible(time_ns):
                 yield Message(wanted[key], time_ns, raw)
 
-    def _by_time(self) -> Iterator[tuple]:
+    def _by_time(self) -> Iterator[tuple[Any, ...]]:
         row = 'SELECT rowid, topic_id, timestamp, data FROM messages'
         if self._sorted:
             yield from self._query(f'{row} ORDER BY rowid')

@@ -96,7 +96,7 @@ class Pages:
             yield mine, table if rising else table[np.argsort(order)]
 
 
-def rows_of(file: FileBytes, root: object) -> Rows | None:
+def rows_of(file: FileBytes, root: int) -> Rows | None:
     """Return the rows of a table by the number of its first page; None where anything is odd."""
     if not (isinstance(root, int) and root > 0):
         return None
@@ -207,7 +207,7 @@ def _integer(data: Table, at: Ints, kind: Ints) -> tuple[Ints, Ints]:
     return value, end
 
 
-def plain(sql: object) -> bool:
+def plain(sql: str) -> bool:
     """Tell whether a table is as rosbag2 makes it."""
     return isinstance(sql, str) and re.sub(r'\s|;', '', sql).lower() == SCHEMA
 

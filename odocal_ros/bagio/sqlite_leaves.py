@@ -13,10 +13,11 @@ Rows of the table ``messages`` straight from the pages of a sqlite3 file (sqlite
 Only for files that sqlite itself cannot read to the end.
 """
 
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from functools import partial
 from pathlib import Path
 import struct
+from typing import Any
 
 from odocal_ros.bagio.file_bytes import FileBytes
 
@@ -75,7 +76,7 @@ class Leaves:
                 if keys is None or key in keys:
                     yield key, time_ns, data
 
-    def _rows_of(self, page: int):
+    def _rows_of(self, page: int) -> Iterator[tuple[int, int, int, Callable[..., Any]]]:
         """Yield (row, topic_id, timestamp, what gives the data) of a page."""
         data = self._map[page * self._size:(page + 1) * self._size]
         count = struct.unpack_from('>H', data, 3)[0]

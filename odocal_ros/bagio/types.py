@@ -33,7 +33,7 @@ class Types:
 
     def deserializer(self, msgtype: str) -> Callable[[bytes], Any]:
         """Return the function that turns CDR bytes of a type into an object."""
-        def deserialize(raw: bytes) -> object:
+        def deserialize(raw: bytes) -> Any:
             store = self._with(msgtype)
             try:
                 return store.deserialize_cdr(raw, msgtype)
@@ -45,11 +45,12 @@ class Types:
                 return kind.deserialize_cdr_le(raw[4:], 0, kind.cls, store)[0]
         return deserialize
 
-    def cdr_from_ros1(self, raw: bytes, connection) -> bytes:
+    def cdr_from_ros1(self, raw: bytes, connection: Any) -> bytes:
         """Return a ROS 1 message as CDR."""
-        return self._with(connection.msgtype).ros1_to_cdr(raw, connection.msgtype)
+        cdr: bytes = self._with(connection.msgtype).ros1_to_cdr(raw, connection.msgtype)
+        return cdr
 
-    def _with(self, msgtype: str):
+    def _with(self, msgtype: str) -> Any:
         """Return the store once it knows a type, or raise BadData."""
         if self._store is None:
             from rosbags.typesys import get_typestore, Stores
@@ -80,16 +81,16 @@ class Types:
                           'use another topic') from None
 
 
-def _elements(msgtype: str, fielddefs: dict, depth: int = 0) -> int:
+def _elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
     """Return how many values the fixed arrays of a message make, at least."""
     if depth > DEPTH:
         raise ValueError('it holds itself')
 
-    def of(field) -> int:
+    def of(field: tuple[Any, Any]) -> int:
         kind, what = field
         if kind.name == 'NAME':
             return _elements(what, fielddefs, depth + 1)
-        return of(what[0]) * what[1] if kind.name == 'ARRAY' else 1
+        return of(what[0]) * int(what[1]) if kind.name == 'ARRAY' else 1
     total = 0
     for _, field in fielddefs[msgtype][1]:
         total += of(field)

@@ -9,10 +9,11 @@
 
 """Write bags: topics merged by time, whole or not at all."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 import shutil
 import tempfile
+from typing import Any
 import zlib
 
 import numpy as np
@@ -29,7 +30,7 @@ CRC_AT = 9 + 24        # in a chunk record of mcap
 LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 
-def drive_topics(drive) -> list[Topic]:
+def drive_topics(drive: Any) -> list[Topic]:
     """Return a simulated drive's topics under the names that the node listens to."""
     topics = [encode.imu('/imu/data', drive.imu), encode.fix('/fix', drive.fix)]
     kind, left, right = drive.options.odometer, drive.odometer, drive.odometer_right
@@ -119,7 +120,8 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _write_rosbag2(path, topics, storage, compression, progress):
+def _write_rosbag2(path: Path, topics: Sequence[Topic], storage: str, compression: str,
+                   progress: Callable[[float], None] | None) -> None:
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import get_typestore, Stores
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -133,7 +135,7 @@ def _write_rosbag2(path, topics, storage, compression, progress):
             writer.write(connections[which], time_ns, raw)
 
 
-def _with_checksums(storage) -> None:
+def _with_checksums(storage: Any) -> None:
     """Have rosbags' mcap storage, which writes zeros, give each chunk its checksum."""
     close_chunk = storage.close_chunk
 
@@ -147,7 +149,8 @@ def _with_checksums(storage) -> None:
     storage.close_chunk = close_with_checksum
 
 
-def _write_rosbag1(path, topics, storage, compression, progress):
+def _write_rosbag1(path: Path, topics: Sequence[Topic], storage: str, compression: str,
+                   progress: Callable[[float], None] | None) -> None:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import get_typestore, Stores
     store, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
@@ -158,7 +161,8 @@ def _write_rosbag1(path, topics, storage, compression, progress):
                          ros2.cdr_to_ros1(raw, topics[which].msgtype))
 
 
-def _merged(topics, progress):
+def _merged(topics: Sequence[Topic],
+            progress: Callable[[float], None] | None) -> Iterator[tuple[int, int, bytes]]:
     """Yield (index of the topic, bag time, message) in order of time, packed in blocks."""
     which = np.concatenate([np.full(len(t.time_ns), i) for i, t in enumerate(topics)])
     order = np.argsort(np.concatenate([t.time_ns for t in topics]), kind='stable')
@@ -179,7 +183,7 @@ def _merged(topics, progress):
             progress(min(1.0, (first + block) / len(which)))
 
 
-def _messages(topic, rows):
+def _messages(topic: Topic, rows: slice) -> Iterator[tuple[int, bytes]]:
     """Yield (bag time, message) of a slice of rows of one topic."""
     packed = topic.pack(rows)
     raw, size = packed.tobytes(), packed.itemsize

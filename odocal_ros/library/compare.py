@@ -136,7 +136,7 @@ def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> 
     return f'{difference.change:+.3g} {change.unit}'
 
 
-def hints(found: tuple[Change, ...], stored: tuple[Stored, Stored]) -> Iterator[str]:
+def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
     """Yield what would count if the errors that the legs share were the same each time."""
     for change in found:
         last = change.entries[-1]

@@ -16,7 +16,7 @@ A reader takes messages as they were serialised. Those of one layout are read as
 
 from collections.abc import Callable, Sequence
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,18 @@ class SensorPlan:
         """Return (slot, block) pairs."""
         stamps = stamp_ns(columns[0], columns[1])
         return [(self.slot, self._build(stamps, received_ns, *columns[2:]))]
+
+
+class RowReader(Protocol):
+    """What turns the messages of one topic into rows."""
+
+    unreadable: int
+    trouble: str
+
+    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
+             deserialize: Deserialize) -> Pairs:
+        """Decode messages into (slot, rows)."""
+        raise NotImplementedError
 
 
 class Reader:

@@ -20,6 +20,7 @@ import json
 import math
 from pathlib import Path
 import sys
+from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.say import say, warn
@@ -57,7 +58,7 @@ class Row:
         return self.sigmas_off is not None and abs(self.sigmas_off) <= LIMIT
 
 
-def rows(calibration: dict, truth: dict) -> list[Row]:
+def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[Row]:
     """
     Return each figure whose truth is known.
 
@@ -81,7 +82,8 @@ def rows(calibration: dict, truth: dict) -> list[Row]:
     return found
 
 
-def _row(name, result, truth, factor) -> Row:
+def _row(name: str, result: dict[str, dict[str, Any]], truth: dict[str, Any],
+         factor: float) -> Row:
     entry = result[name]
     value, sigma = (None if entry[k] is None else entry[k] * factor for k in ('value', 'sigma'))
     unit = 'deg' if factor != 1.0 else entry['unit'] or ''
@@ -104,7 +106,7 @@ def table(found: list[Row]) -> str:
     return '\n'.join(lines)
 
 
-def _truth(row):
+def _truth(row: Row) -> str:
     return with_sigma(row.truth, row.truth_sigma) if row.truth_sigma else f'{row.truth:.8g}'
 
 
@@ -124,7 +126,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0 if all(row.agrees for row in found) else 1
 
 
-def _read(path: Path) -> dict:
+def _read(path: Path) -> dict[str, dict[str, Any]]:
     import yaml
     try:
         text = path.read_text(encoding='utf-8')

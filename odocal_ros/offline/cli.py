@@ -14,6 +14,7 @@ import importlib
 import os
 import sys
 import tempfile
+from typing import NoReturn
 
 from odocal_ros import __version__
 from odocal_ros.errors import OdocalError
@@ -38,7 +39,7 @@ OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line instead of a page of usage."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         """Raise what the door turns into one line and exit code 2."""
         raise _Usage(f'{self.prog}: {message} (see {self.prog} --help)')
 
@@ -47,7 +48,7 @@ class _Usage(OdocalError):
     """The command line does not parse."""
 
 
-def _parser(names) -> argparse.ArgumentParser:
+def _parser(names: set[str]) -> argparse.ArgumentParser:
     parser = _Parser(prog='odocal', description="Calibrate a vehicle's odometer against IMU "
                      'and GNSS: scale factor and yaw mounting angle, with honest sigmas.')
     parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
@@ -61,7 +62,7 @@ def _parser(names) -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv=None) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Run a command line; return its exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     if sys.stdout is None:       # closed by whoever started us
@@ -75,7 +76,7 @@ def main(argv=None) -> int:
         if args.command is None:
             parser.print_help()
             return WRONG_USE
-        code = args.run(args)
+        code: int = args.run(args)
         sys.stdout.flush()       # here, where a full disk can still be told
         return code
     except OdocalError as error:
@@ -100,7 +101,7 @@ def main(argv=None) -> int:
         return _internal(error)
 
 
-def _internal(error) -> int:
+def _internal(error: Exception) -> int:
     import traceback
     path = trace_file(''.join(traceback.format_exception(error)))
     first = (str(error).splitlines() or [''])[0][:200]

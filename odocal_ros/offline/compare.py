@@ -9,13 +9,20 @@
 
 """odocal compare: tell whether the vehicle has changed since earlier calibrations."""
 
+import argparse
 import json
 import sys
+from typing import TYPE_CHECKING
 
 from odocal_ros.offline.say import say
 
+if TYPE_CHECKING:
+    from odocal_ros.library.changes import Change, Difference
+    from odocal_ros.library.compare import Comparison
+    from odocal_ros.output.stored import Stored
 
-def add_arguments(parser) -> None:
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.description = (
         'Show each value with its change since the first calibration and since the one before, '
@@ -26,7 +33,7 @@ def add_arguments(parser) -> None:
     parser.add_argument('--json', action='store_true', help='print the changes as JSON')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Compare calibrations; return 0 unchanged, 1 changed or nothing to judge."""
     from odocal_ros.library.compare import compare
     from odocal_ros.offline.cli import OK, REJECTED
@@ -39,7 +46,7 @@ def run(args) -> int:
     return OK if found.changed is False else REJECTED
 
 
-def _screen(found) -> list[str]:
+def _screen(found: 'Comparison') -> list[str]:
     from odocal_ros.library.compare import hints, label
     from odocal_ros.output.worse import said as value_text
     stored = found.stored
@@ -58,7 +65,7 @@ def _screen(found) -> list[str]:
             *hints(found.changes, stored)]
 
 
-def _cell(change, difference, stored) -> str:
+def _cell(change: 'Change', difference: 'Difference | None', stored: 'tuple[Stored, ...]') -> str:
     from odocal_ros.library.compare import amount
     if difference is None:
         return '-'

@@ -9,6 +9,7 @@
 
 """odocal doctor: what is installed and where data would go, as one screen to paste."""
 
+import argparse
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 import os
@@ -31,11 +32,11 @@ PROBE = ('import sys, rclpy\n'
          'sys.stdout.write(f"{rclpy.__file__}\\n{rmw()}\\n")')
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: there are none."""
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Print what is there; return 0, 1 where something that is needed is not."""
     rows = [('odocal_ros', f'{__version__}, {Path(__file__).resolve().parents[1]}'),
             ('Python', f'{platform.python_version()}, {sys.executable}'),

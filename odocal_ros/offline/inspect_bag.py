@@ -9,6 +9,7 @@
 
 """odocal inspect: what a bag holds, what is odd about it, how to replay it, what it lacks."""
 
+import argparse
 from pathlib import Path
 
 from odocal_ros.offline.say import say
@@ -16,7 +17,7 @@ from odocal_ros.offline.say import say
 SLOTS = ('imu', 'odometer', 'odometer_right', 'fix', 'heading', 'fix_velocity')
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add('bag', metavar='BAG', help='bag folder or file')
@@ -29,7 +30,7 @@ def add_arguments(parser) -> None:
             help=f'look at this topic as {slot.replace("_", " ")}')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Inspect a bag and print what was found."""
     import json
 

@@ -9,17 +9,20 @@
 
 """Look through a bag once and gather all that ``odocal inspect`` tells, as plain values."""
 
+from collections.abc import Sequence
 from datetime import datetime, UTC
 import math
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
-from odocal_ros.messages.decode import FIX, IMU, make_reader, Reader
+from odocal_ros.messages.decode import Deserialize, FIX, IMU, make_reader, Pairs, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
 from odocal_ros.offline import survey
 from odocal_ros.offline.inspection_drive import closed, look
@@ -42,7 +45,8 @@ class _Tap:
         self.reader, self.recorder, self.trouble = reader, LegRecorder(), ''
         self.values = Values(reader.msgtype) if reader.msgtype in LISTS else None
 
-    def rows(self, raws, received_ns, deserialize) -> list:
+    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
+             deserialize: Deserialize) -> Pairs:
         """Read and keep a block."""
         if self.values:
             self.values.rows(raws, received_ns)
@@ -54,7 +58,7 @@ class _Tap:
         return []
 
 
-def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> dict:
+def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> dict[str, Any]:
     """
     Return what a bag holds, as for ``odocal inspect --json``.
 
@@ -65,7 +69,7 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
     mapping, config = likely_mapping(bag.topics, config, overrides)
     topics = [_topic(bag, info, taps.get(name), refused.get(name, ''))
               for name, info in bag.topics.items()]
-    found: dict = {
+    found: dict[str, Any] = {
         'bag': bag.name, 'path': path, 'files': [str(f) for f in bag.files],
         'start': bag.start_ns * 1e-9, 'duration': (bag.end_ns - bag.start_ns) * 1e-9,
         'start_utc': datetime.fromtimestamp(bag.start_ns // 10**9, UTC).isoformat(),
@@ -85,10 +89,11 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         for reason in dict.fromkeys(findings)]
     found['open'] = left_open(bag.topics, config, overrides)
     found['command'] = command(path, bag.topics, config, overrides, mapping, extra)
-    return _plain(found)
+    told: dict[str, Any] = _plain(found)
+    return told
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """Return a value as JSON has it: what is no finite number is null."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
@@ -97,7 +102,8 @@ def _plain(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _taps(bag: Bag, config: Config, overrides: dict[str, str]):
+def _taps(bag: Bag, config: Config,
+          overrides: dict[str, str]) -> tuple[dict[str, _Tap], dict[Any, Any]]:
     """Return topic -> tap for every topic that could be an input, and why others could not."""
     asked = {topic: slot for slot, topic in overrides.items()}
     taps: dict[str, _Tap] = {}
@@ -115,10 +121,10 @@ def _taps(bag: Bag, config: Config, overrides: dict[str, str]):
     return taps, refused
 
 
-def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict:
+def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:
     """Return what is known of one topic."""
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
-    facts: dict = {'name': info.name, 'type': info.msgtype, 'count': info.count,
+    facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
                    'rate_hz': info.count / seconds if seconds > 0 else None}
     if tap is None:
         return facts | ({'trouble': trouble} if trouble else {})
@@ -143,7 +149,8 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict:
     return facts
 
 
-def _wheels(taps, mapping, config, topics) -> list[str]:
+def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
+            topics: list[dict[str, Any]]) -> list[str]:
     """Tell how each joint or entry of an odometer moves; return the settings for the wheels."""
     options: list[str] = []
     open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
@@ -162,6 +169,7 @@ def _wheels(taps, mapping, config, topics) -> list[str]:
         if len(facts['values']) > 1:
             facts['moves'] = in_words(facts['values'])
         form = tap.reader.form
+        assert form is not None      # a topic of lists is an odometer's
         if form.chosen:
             facts['chosen'] = form.chosen
         if facts['name'] == mapping.get('odometer') and open_:
@@ -172,7 +180,7 @@ def _wheels(taps, mapping, config, topics) -> list[str]:
     return options
 
 
-def _together(taps, mapping) -> LegRecorder:
+def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
     """Return one recorder with the inputs of a mapping."""
     recorder = LegRecorder()
     for slot, topic in mapping.items():
@@ -180,7 +188,7 @@ def _together(taps, mapping) -> LegRecorder:
             continue
         rows = taps[topic].recorder
         if slot == 'odometer':
-            recorder.form = taps[topic].reader.form
+            recorder.form = taps[topic].reader.form or recorder.form
             recorder.feed('odometer_right', rows.rows('odometer_right'))
         if slot == 'odometer_right':
             recorder.form_right = taps[topic].reader.form
@@ -190,7 +198,7 @@ def _together(taps, mapping) -> LegRecorder:
     return recorder
 
 
-def _lacking(found, mapping, config) -> list[Reason]:
+def _lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
     """Say what a calibration would miss."""
     lacking = [Reason(code, f'no topic for the {word}') for slot, code, word in (
         ('imu', Code.NO_IMU, 'Imu'), ('odometer', Code.NO_ODOMETER, 'odometer'),
@@ -220,7 +228,7 @@ def _lacking(found, mapping, config) -> list[Reason]:
     return lacking + _heading(found, mapping, config)
 
 
-def _heading(found, mapping, config) -> list[Reason]:
+def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
     """Say where a heading could come from, if from nowhere good."""
     if 'heading' in mapping or math.isfinite(config.alignment.heading):
         return []

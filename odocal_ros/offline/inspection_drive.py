@@ -9,6 +9,8 @@
 
 """What a bag's inputs show together: units, axes, standstills, legs."""
 
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.bagio.read import Bag
@@ -16,24 +18,26 @@ from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.judge import far_from_nominal
 from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadData, BadUsage
 from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.stretches import (
+    Drive,
     straight_stretches,
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.sanity import imu_sanity, MAX_RATE, RAD_PER_DEG
-from odocal_ros.screening.screen import screen
+from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
 CLOSED = 0.2            # chord over way: below, a leg ends where it began
 
 
-def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
+def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
          findings: list[Reason]) -> list[str]:
     """
     Look at the inputs together.
@@ -80,7 +84,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict,
     return options
 
 
-def _driven(inputs, drive) -> float:
+def _driven(inputs: Inputs, drive: Drive) -> float:
     """Return the travel, to and fro, between the first and the last fix (else all), in units."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(drive.t_fix) > 1:
@@ -90,7 +94,8 @@ def _driven(inputs, drive) -> float:
     return float(np.abs(np.diff(s)).sum())
 
 
-def _units(inputs, config, findings):
+def _units(inputs: Inputs, config: Config,
+           findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
     """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
         imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
@@ -105,7 +110,8 @@ def _units(inputs, config, findings):
     return options, w_i, f_i
 
 
-def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
+def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config,
+          found: dict[str, Any], findings: list[Reason]) -> list[str]:
     """Tell how the Imu sits and whether its gyro turns with the course."""
     m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
     set_already = bool(np.any(config.imu.mounting_rpy))
@@ -117,7 +123,7 @@ def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
     up_i = np.median(f_i, axis=0)
-    up_i = up_i / max(np.linalg.norm(up_i), 1e-9)
+    up_i = up_i / max(float(np.linalg.norm(up_i)), 1e-9)
     ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma)
     found['drive']['gyro_over_course'] = ratio
     findings += gyro_reasons(ratio, config.imu.gyro_scale)
@@ -126,13 +132,14 @@ def _axes(inputs, w_i, f_i, drive, config, found, findings) -> list[str]:
     return [f'imu.mounting_rpy=[{", ".join(f"{x:.10g}" for x in m.rpy)}]']
 
 
-def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
+def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: int,
+          config: Config, found: dict[str, Any]) -> list[str]:
     """Tell the legs that replay would take, and better ones where the two-point method needs."""
     if not len(drive.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
 
-    def described(start_ns, stop_ns, **more):
+    def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         here = (drive.t_fix >= start) & (drive.t_fix <= stop)
         way, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here])
@@ -158,10 +165,11 @@ def _legs(bag, recorder, inputs, drive, first, config, found) -> list[str]:
     return [f'--leg {leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['straight']]
 
 
-def closed(leg) -> bool:
-    return leg['chord'] < CLOSED * leg['way']
+def closed(leg: dict[str, Any]) -> bool:
+    return bool(leg['chord'] < CLOSED * leg['way'])
 
 
-def _from_rest(stops, start, stop):
+def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:
     """Move ends that lie in a standstill to its end: there the marks of a leg belong."""
-    return tuple(next((b for a, b in stops.tolist() if a <= t <= b), t) for t in (start, stop))
+    begin, end = (next((b for a, b in stops.tolist() if a <= t <= b), t) for t in (start, stop))
+    return begin, end

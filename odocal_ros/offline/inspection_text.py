@@ -9,8 +9,10 @@
 
 """What ``odocal inspect`` found, as a person reads it."""
 
+from collections.abc import Iterator
 import math
 import textwrap
+from typing import Any
 
 from odocal_ros.outside.names import one_line
 
@@ -20,7 +22,7 @@ QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
 
 
-def text(found: dict) -> str:
+def text(found: dict[str, Any]) -> str:
     """Return one screen for people, more where there is more to say."""
     roles = {topic: slot for slot, topic in found['mapping'].items()}
     blocks = [_head(found), _topics(found, roles)]
@@ -30,14 +32,14 @@ def text(found: dict) -> str:
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
 
-def _head(found) -> list[str]:
+def _head(found: dict[str, Any]) -> list[str]:
     files = len(found['files'])
     lines = [found['path'], f'  {found["duration"]:.1f} s from {found["start_utc"]}, '
              f'{found["messages"]} messages in {files} file{"s" * (files > 1)}']
     return lines + [line for note in found['notes'] for line in _wrapped(f'note: {note}', 2)]
 
 
-def _topics(found, roles) -> list[str]:
+def _topics(found: dict[str, Any], roles: dict[str, str]) -> list[str]:
     wide = max((len(topic['name']) for topic in found['topics']), default=0)
     kinds = max((len(_short(topic['type'])) for topic in found['topics']), default=0)
     lines = []
@@ -54,7 +56,7 @@ def _short(msgtype: str) -> str:
     return msgtype.replace('/msg/', '/')
 
 
-def _details(topic, roles) -> list[str]:
+def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
     """Return what one input shows, one thought a line."""
     points = [*_of_imu(topic), *_of_odometer(topic), *_of_fix(topic), *_of_timing(topic)]
     if topic.get('trouble'):
@@ -64,7 +66,7 @@ def _details(topic, roles) -> list[str]:
     return [one_line(topic['name']), *(line for point in points for line in _wrapped(point, 2))]
 
 
-def _of_imu(topic):
+def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
     imu = topic.get('imu')
     if not imu:
         return
@@ -84,7 +86,7 @@ def _of_imu(topic):
     yield from _orientation(imu)
 
 
-def _orientation(imu):
+def _orientation(imu: dict[str, Any]) -> Iterator[str]:
     if not imu['orientation']:
         yield 'no orientation' + (
             ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (never set)')
@@ -94,7 +96,7 @@ def _orientation(imu):
         yield f'orientation filled, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
 
 
-def _of_odometer(topic):
+def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
     if 'chosen' in topic:
         yield topic['chosen']
     yield from topic.get('moves', ())
@@ -113,7 +115,7 @@ def _of_odometer(topic):
         yield f'odd: {odometer["not_finite"]} messages hold NaN or Inf'
 
 
-def _of_fix(topic):
+def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
     fix = topic.get('fix')
     if not fix:
         return
@@ -133,7 +135,7 @@ def _of_fix(topic):
         yield f'positions come in steps of {fix["position_step"]:.2f} m'
 
 
-def _of_timing(topic):
+def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
     timing = topic.get('timing')
     if not timing:
         return
@@ -154,7 +156,7 @@ def _of_timing(topic):
                f'{longest["length"]:.2f} s at {longest["at"]:.2f} s')
 
 
-def _drive(found) -> list[str]:
+def _drive(found: dict[str, Any]) -> list[str]:
     drive = found['drive']
     if not drive:
         return []
@@ -176,7 +178,7 @@ def _drive(found) -> list[str]:
     return lines + _mounting(found['mounting'])
 
 
-def _legs(legs) -> list[str]:
+def _legs(legs: list[dict[str, Any]]) -> list[str]:
     """Return a line for each leg, of many a table."""
     if not legs:
         return []
@@ -189,12 +191,12 @@ def _legs(legs) -> list[str]:
         f'{leg["chord"]:>14.0f}' for i, leg in enumerate(legs, 1)]
 
 
-def _leg(leg) -> str:
+def _leg(leg: dict[str, Any]) -> str:
     return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, way {leg["way"]:.0f} m, '
             f'start to end {leg["chord"]:.0f} m')
 
 
-def _mounting(mounting) -> list[str]:
+def _mounting(mounting: dict[str, Any]) -> list[str]:
     if mounting['rpy'] is None:
         told = 'gravity and driving do not tell how the Imu sits; set imu.mounting_rpy yourself'
         return _wrapped(f'axes: {told}', 2)
@@ -209,7 +211,7 @@ def _mounting(mounting) -> list[str]:
     return _wrapped(f'axes: {told} [{rpy}] deg ({how})', 2)
 
 
-def _findings(found) -> list[str]:
+def _findings(found: dict[str, Any]) -> list[str]:
     if not found['findings']:
         return ['nothing is lacking for a calibration']
     lines = []
@@ -222,7 +224,7 @@ def _findings(found) -> list[str]:
     return lines
 
 
-def _way_on(found) -> list[str]:
+def _way_on(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
         lines += _wrapped(f'replay needs help: {found["open"]}', 0)

@@ -9,20 +9,21 @@
 
 """odocal paper: tables 1 to 4 of Shi et al. 2015, computed beside printed."""
 
+import argparse
 from pathlib import Path
 
 from odocal_ros.offline.say import say
 from odocal_ros.output.pictures import check_picture
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument('--json', action='store_true', help='print one JSON object instead')
     parser.add_argument('--plot', metavar='FILE', help='draw the track and the growth of each '
                         'error over time: .png, .svg or .pdf')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Compute, print, draw; return 0."""
     picture = None if args.plot is None else Path(args.plot)
     if picture is not None:

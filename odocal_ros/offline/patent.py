@@ -9,16 +9,21 @@
 
 """odocal patent: the embodiment of CN104359492A, printed beside computed."""
 
+import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from odocal_ros.offline.say import say
 from odocal_ros.output.pictures import check_picture
 
+if TYPE_CHECKING:
+    from odocal_ros.patent.planar import PlanarLeg
+
 FIXES = ('white', 'correlated', 'rtk')
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument('--fix-noise', default='white', choices=FIXES,
                         help='errors of the simulated fixes (default white, 1.5 m)')
@@ -28,7 +33,7 @@ def add_arguments(parser) -> None:
                         'and of each line: .png, .svg or .pdf')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Simulate, compute, print, draw; return 0."""
     picture = None if args.plot is None else Path(args.plot)
     if picture is not None:
@@ -51,7 +56,7 @@ def run(args) -> int:
     return 0
 
 
-def driven(fix_noise: str, seed: int):
+def driven(fix_noise: str, seed: int) -> 'PlanarLeg':
     """Return the embodiment's drive in the plane: ten minutes of town, off by what it finds."""
     from odocal_ros.patent.embodiment import FOUND, RADIUS
     from odocal_ros.pipeline.patent_run import planar_of

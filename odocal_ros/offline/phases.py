@@ -56,12 +56,12 @@ class Phase:
             self._bar.n = min(max(share, 0.0), 1.0)
             self._bar.refresh()
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._shown:
             self._over.set()
             self._ticker.join()
             self._bar.close()
 
-    def _tick(self):
+    def _tick(self) -> None:
         while not self._over.wait(TICK_S):
             self._bar.refresh()

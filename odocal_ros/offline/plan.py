@@ -9,10 +9,12 @@
 
 """odocal plan: how good a calibration will be, before it is driven, and what would help."""
 
+import argparse
 import json
 import math
 from pathlib import Path
 import sys
+from typing import Any
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
@@ -21,7 +23,7 @@ SLOTS = ('imu', 'odometer', 'fix', 'heading')
 NOISE = {'white': 0.0, 'correlated': 60.0}
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add('--scenario', metavar='NAME', help='drive of a scenario: paper, straight, out_and_back or '
@@ -60,7 +62,7 @@ def add_arguments(parser) -> None:
     add('--json', action='store_true', help='print JSON, nothing else')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Predict and print; return 0."""
     from odocal_ros.library.plan import plan
     from odocal_ros.offline.plan_text import screen
@@ -77,7 +79,7 @@ def run(args) -> int:
     return 0
 
 
-def _config(args) -> dict:
+def _config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < the options named for a plan."""
     from odocal_ros.settings.config_file import parse_set, read_config_file
     from_file = read_config_file(Path(args.config)) if args.config else {}
@@ -97,7 +99,7 @@ def _config(args) -> dict:
     return from_file | asked
 
 
-def _figures(args) -> dict:
+def _figures(args: argparse.Namespace) -> dict[str, Any]:
     """Return the error figures that are asked for."""
     from odocal_ros.library.what_helps import RTK
     if args.rtk and args.fix_sigma is not None:

@@ -14,10 +14,11 @@ import textwrap
 
 from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
-from odocal_ros.library.what_helps import ranked, SCALE, YAW
+from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
-from odocal_ros.planning.methods import NOT_PREDICTED
+from odocal_ros.planning.methods import NOT_PREDICTED, Plan
+from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.smoother import SWAY_RATE
 
 SHOWN = 0.01          # share of the variance from which a source has its row
@@ -31,7 +32,7 @@ def screen(planned: Planned) -> str:
                       *_helps(before, found), *_reasons(before)])
 
 
-def _head(before, sigmas):
+def _head(before: Plan, sigmas: Sigmas) -> list[str]:
     two_point, a = before.two_point, before.two_point.alignment
     stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
     tau = sigmas.correlation_time
@@ -50,7 +51,7 @@ def _head(before, sigmas):
     return lines
 
 
-def _methods(before):
+def _methods(before: Plan) -> list[str]:
     lines = [f'  {"predicted sigma":<20}{"scale":>14}{"yaw":>16}{"pitch":>16}']
     for name, method in before.methods.items():
         shown = [_shown(p, method.estimates[p].sigma) for p in PARAMETERS]
@@ -59,16 +60,16 @@ def _methods(before):
             f'{_result(before)})']
 
 
-def _result(before):
+def _result(before: Plan) -> str:
     """Say which method will give which value."""
-    by = {}
+    by: dict[str | None, list[str]] = {}
     for parameter in PARAMETERS:
         by.setdefault(before.by(parameter), []).append(WORDS[parameter])
     return ', '.join(f'{" and ".join(names) if len(by) > 1 else "all"} '
                      f'{"by " + method if method else "unknown"}' for method, names in by.items())
 
 
-def _shown(parameter, sigma):
+def _shown(parameter: str, sigma: float | None) -> str:
     if sigma is None:
         return 'unknown'
     if parameter == SCALE:
@@ -78,7 +79,7 @@ def _shown(parameter, sigma):
     return f'{math.degrees(sigma):.3g} deg'
 
 
-def _budgets(before):
+def _budgets(before: Plan) -> list[str]:
     """Return the sources that matter of each method that will give something."""
     out = []
     for name in before.giving:
@@ -91,7 +92,7 @@ def _budgets(before):
     return out
 
 
-def _helps(before, found):
+def _helps(before: Plan, found: list[Change]) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
         best, word = ranked(found, before, parameter), WORDS[parameter]
@@ -102,7 +103,7 @@ def _helps(before, found):
     return lines
 
 
-def _reasons(before):
+def _reasons(before: Plan) -> list[str]:
     lines = []
     for reason in before.reasons:
         lines += textwrap.wrap(f'{reason.code.name}: {reason.text}. {reason.remedy}', 96,

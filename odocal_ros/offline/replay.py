@@ -9,22 +9,30 @@
 
 """odocal replay: the node's pipeline over recorded bags."""
 
+import argparse
 import json
 import os
 from pathlib import Path
 from shutil import get_terminal_size
 import sys
 from textwrap import fill
+from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.hearer import Hearer
 from odocal_ros.offline.say import say, warn
 from odocal_ros.outside.names import one_line
 
+if TYPE_CHECKING:
+    from odocal_ros.calib.result import Calibration as Combined
+    from odocal_ros.library.calibration import Calibration
+    from odocal_ros.offline.phases import Phase
+    from odocal_ros.settings.config import Config
+
 SLOTS = ('imu', 'odometer', 'fix', 'heading', 'odometer_right', 'fix_velocity')
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
@@ -39,7 +47,7 @@ def add_arguments(parser) -> None:
     add('--quiet', action='store_true', help='print nothing but errors, and the line of --accept')
 
 
-def add_calibration_arguments(parser) -> None:
+def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
     add = parser.add_argument
     add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')
@@ -60,7 +68,7 @@ def add_calibration_arguments(parser) -> None:
         'and does not pass')
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Replay bags; return 0 accepted or caution (of --accept: pass), else 1."""
     from odocal_ros.library.asked import legs_of
     config = asked_config(args)
@@ -91,7 +99,7 @@ def run(args) -> int:
 class _Screen(Hearer):
     """Shows on the terminal how it goes."""
 
-    def __init__(self, args) -> None:
+    def __init__(self, args: argparse.Namespace) -> None:
         self._quiet, self._silent = args.quiet, args.quiet or args.json
 
     def note(self, text: str) -> None:
@@ -99,13 +107,13 @@ class _Screen(Hearer):
         if not self._quiet:
             warn(f'odocal: {text}')
 
-    def phase(self, title: str):
+    def phase(self, title: str) -> 'Phase':
         """Return a line that is gone when the phase is over."""
         from odocal_ros.offline.phases import Phase
         return Phase(title, self._silent)
 
 
-def asked_config(args) -> dict:
+def asked_config(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings asked for: --config < --set < --accept and --method, each checked."""
     from odocal_ros.settings.accept_option import parse_accept
     from odocal_ros.settings.config import Config, with_settings
@@ -122,17 +130,17 @@ def asked_config(args) -> dict:
     return asked
 
 
-def asked_topics(args) -> dict[str, str]:
+def asked_topics(args: argparse.Namespace) -> dict[str, str]:
     """Return slot -> topic of those asked for."""
     return {slot: topic for slot in SLOTS if (topic := getattr(args, f'{slot}_topic'))}
 
 
-def _styled(stream) -> bool:
+def _styled(stream: Any) -> bool:
     """Tell whether a stream is a terminal that takes colours."""
     return stream.isatty() and 'NO_COLOR' not in os.environ and os.environ.get('TERM') != 'dumb'
 
 
-def _size(stream) -> tuple[int, int | None]:
+def _size(stream: Any) -> tuple[int, int | None]:
     """Return the columns, 98 at most, and the rows of a terminal; no rows for what is none."""
     if not stream.isatty():
         return 98, None
@@ -140,7 +148,7 @@ def _size(stream) -> tuple[int, int | None]:
     return max(40, min(98, columns)), rows
 
 
-def _report(calibration, output, args) -> int:
+def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) -> int:
     from odocal_ros.output.files import Results
     from odocal_ros.output.worse import replacing, stored_in
     screen = _Screen(args)
@@ -167,7 +175,7 @@ def _report(calibration, output, args) -> int:
         return _exit_code(calibration.result, calibration.config, args)
 
 
-def _exit_code(calibration, config, args) -> int:
+def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
     """Return 0 for what is good enough, after telling of limits what there is to tell."""
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.output.acceptance import accept_line, accept_words
@@ -184,7 +192,7 @@ def _exit_code(calibration, config, args) -> int:
     return OK if acceptance.decision is Decision.PASS else REJECTED
 
 
-def _show(calibration, args) -> OSError | None:
+def _show(calibration: 'Combined', args: Any) -> OSError | None:
     """Print the result, for which a report need not be drawn; return what a stream raises."""
     from odocal_ros.output.summary import screen
     columns, rows = _size(sys.stdout)
@@ -198,7 +206,8 @@ def _show(calibration, args) -> OSError | None:
     return None
 
 
-def _show_files(calibration, output, written, report) -> None:
+def _show_files(calibration: 'Combined', output: Path, written: list[Path],
+                report: list[Path]) -> None:
     """Print where the result is."""
     from odocal_ros.output.summary import sentence
     columns, rows = _size(sys.stdout)

@@ -10,13 +10,18 @@
 """odocal simulate: a bag of a drive whose truth is known."""
 
 import argparse
+from collections.abc import Callable
 import math
 from pathlib import Path
 import sys
+from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
 from odocal_ros.outside.names import for_shell
+
+if TYPE_CHECKING:
+    from odocal_ros.sim.options import SimOptions
 
 # option: (what follows it, help); its name is SimOptions' field
 NUMBERS = {
@@ -61,7 +66,7 @@ DAYS = 3650          # then the days of the seeds begin anew
 LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; the simulator checks their values."""
     add = parser.add_argument
     add('--scenario', required=True, metavar='NAME',
@@ -120,9 +125,9 @@ def _span(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(f'{text}: want A:B, two numbers of seconds') from None
 
 
-def options_of(args):
+def options_of(args: argparse.Namespace) -> 'SimOptions':
     """Return the SimOptions that parsed arguments ask for."""
-    from odocal_ros.sim.scenarios import SimOptions
+    from odocal_ros.sim.options import SimOptions
     plain = ['scenario', 'seed', 'imu_grade', 'odometer', 'two_wheels', 'fix_noise', 'slip_walk',
              *NUMBERS]
     given = {name: getattr(args, name) for name in plain if getattr(args, name) is not None}
@@ -142,12 +147,11 @@ def options_of(args):
     return _with_figures(args, given)
 
 
-def _with_figures(args, given):
+def _with_figures(args: argparse.Namespace, given: dict[str, Any]) -> 'SimOptions':
     """Return SimOptions of what was given, with the vehicle drawn and the figures asked for."""
     from odocal_ros.sim.draw import drawn
-    from odocal_ros.sim.options import DEFAULTS
+    from odocal_ros.sim.options import DEFAULTS, SimOptions
     from odocal_ros.sim.real import parsed, Real
-    from odocal_ros.sim.scenarios import SimOptions
     figures = dict(parsed(text) for text in args.figures)
     if not (args.vehicle or args.effects):
         return SimOptions(**given, real=Real(**figures))
@@ -163,7 +167,7 @@ def _with_figures(args, given):
     return drawn(seed, kind, grade, effects, **given, real=figures)[0]
 
 
-def run(args) -> int:
+def run(args: argparse.Namespace) -> int:
     """Simulate, write the bag and the two files beside it, or those of a fleet; return 0."""
     if args.fleet is not None:
         from odocal_ros.offline.simulate_fleet import simulate_fleet
@@ -189,7 +193,7 @@ def run(args) -> int:
     return 0
 
 
-def _progress(quiet: bool):
+def _progress(quiet: bool) -> Callable[[float], None] | None:
     """Return a function that shows the share done on a terminal, or None."""
     if quiet or not sys.stderr.isatty():
         return None

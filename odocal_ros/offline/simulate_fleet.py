@@ -9,22 +9,29 @@
 
 """odocal simulate --fleet: the bags of many vehicles, their manifest and their truth."""
 
+import argparse
 import csv
 from datetime import datetime, UTC
 import io
 import math
 from pathlib import Path
+from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.phases import Phase
 from odocal_ros.offline.say import say
 from odocal_ros.outside.whole import write_text
 
+if TYPE_CHECKING:
+    from odocal_ros.sim.fleet import FleetVehicle
+    from odocal_ros.sim.options import SimOptions
+    from odocal_ros.sim.scenarios import Drive
+
 MANIFEST = 'manifest.csv'
 MOST = 100_000       # vehicles
 
 
-def simulate_fleet(args, options) -> int:
+def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     """
     Write DIR/<vehicle>/bag_<nn>, DIR/<model>.yaml, DIR/manifest.csv and DIR/truth.yaml; return 0.
 
@@ -53,7 +60,8 @@ def simulate_fleet(args, options) -> int:
     return 0
 
 
-def _bag(args, out, number, vehicle, bag, options):
+def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicle', bag: int,
+         options: 'SimOptions') -> 'tuple[dict[str, str], Drive]':
     """Write a bag; return its row of the manifest and the drive's options and truth."""
     from odocal_ros.bagio.write import drive_topics, write_bag
     from odocal_ros.sim.fleet import as_driven, drive_options, MODELS
@@ -71,7 +79,7 @@ def _bag(args, out, number, vehicle, bag, options):
             'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}, drive
 
 
-def _truth(vehicle, drives):
+def _truth(vehicle: 'FleetVehicle', drives: 'list[Drive]') -> dict[str, Any]:
     last = drives[-1].truth
     return {
         'vehicle': vehicle.name, 'model': vehicle.model.name,
@@ -86,7 +94,7 @@ def _truth(vehicle, drives):
                     for change in vehicle.changes]}
 
 
-def _write(out, rows, truth) -> None:
+def _write(out: Path, rows: list[dict[str, str]], truth: list[dict[str, Any]]) -> None:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator='\n')
     writer.writeheader()
@@ -95,7 +103,7 @@ def _write(out, rows, truth) -> None:
     write_text(out / MANIFEST, text.getvalue())      # last: it says that all is there
 
 
-def _yaml(path: Path, content: dict, title: str) -> None:
+def _yaml(path: Path, content: dict[str, Any], title: str) -> None:
     import yaml
     write_text(path, f'# {title} Made by odocal simulate.\n' + yaml.safe_dump(
         content, sort_keys=False, default_flow_style=None))

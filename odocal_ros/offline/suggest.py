@@ -9,6 +9,7 @@
 
 """Which topics a bag's inputs most likely are, and the replay command that says so."""
 
+
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.topics import candidates, choose_topics, named, OPTION, wanted
@@ -18,7 +19,8 @@ from odocal_ros.settings.config import Config, with_settings
 COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 
 
-def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]):
+def likely_mapping(topics: dict[str, TopicInfo], config: Config,
+                   overrides: dict[str, str]) -> tuple[dict[str, str], Config]:
     """Return slot -> topic, the likeliest where several could be meant; and settings it needs."""
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     free = candidates(topics, 'odometer', config, chosen)
@@ -32,7 +34,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config, overrides: dict
     return chosen, config
 
 
-def _rank(slot: str, info: TopicInfo):
+def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
     """Sort the likelier topic first: the usual name, counters before speeds, more messages."""
     usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
@@ -41,7 +43,7 @@ def _rank(slot: str, info: TopicInfo):
             not worded if 'odometer' in slot else 0, -info.count, info.name)
 
 
-def left_open(topics, config, overrides) -> str:
+def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
     """Return what replay would say without options: which topics it cannot choose; '' if none."""
     try:
         choose_topics(topics, config, overrides)
@@ -50,7 +52,8 @@ def left_open(topics, config, overrides) -> str:
     return ''
 
 
-def command(path, topics, config, overrides, mapping, extra) -> str:
+def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
+            mapping: dict[str, str], extra: list[str]) -> str:
     """Return the replay that the findings suggest; '' where an input is missing."""
     if not {'imu', 'odometer', 'fix'} <= mapping.keys():
         return ''

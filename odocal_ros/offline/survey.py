@@ -9,8 +9,12 @@
 
 """What the samples of a topic tell about themselves: timing, units, quality; plain numbers."""
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
@@ -21,7 +25,8 @@ LEAST_GAP = 0.1       # s, shorter is jitter
 AXES = 'xyz'
 
 
-def timing(samples, start_ns: int, headerless: bool) -> dict:
+def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
+           headerless: bool) -> dict[str, Any]:
     """
     Return rate, gaps and what is odd about the stamps of a topic.
 
@@ -50,7 +55,7 @@ def timing(samples, start_ns: int, headerless: bool) -> dict:
                  for k in np.sort(order)]}
 
 
-def imu(samples: ImuSamples) -> dict:
+def imu(samples: ImuSamples) -> dict[str, Any]:
     """Return what an Imu topic shows of gravity, units and orientation."""
     samples = oriented(samples)
     f_i = samples.f_i[~beyond('f_i', samples.f_i)]
@@ -78,7 +83,7 @@ def imu(samples: ImuSamples) -> dict:
         'yaw_sigma': float(np.sqrt(np.median(known))) if len(known) else None}
 
 
-def odometer(samples: OdometerSamples, form: OdometerForm) -> dict:
+def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
     """Return what an odometer topic counts."""
     finite = samples.value[~beyond('value', samples.value)]
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
@@ -87,11 +92,13 @@ def odometer(samples: OdometerSamples, form: OdometerForm) -> dict:
             'not_finite': len(samples.value) - len(finite)}
 
 
-def _number(array):
-    return array[0].item() if len(array) else None
+def _number(array: NDArray[Any]) -> float | None:
+    """Return the first of some numbers, as Python has it."""
+    number: float | None = array[0].item() if len(array) else None
+    return number
 
 
-def fixes(samples: FixSamples) -> dict:
+def fixes(samples: FixSamples) -> dict[str, Any]:
     """Return status and quality of fixes."""
     covariance = np.diagonal(samples.covariance_n, axis1=1, axis2=2)
     known = (samples.covariance_type > 0) & (covariance[:, :2] > 0).all(axis=1) \
@@ -110,7 +117,7 @@ def fixes(samples: FixSamples) -> dict:
         if len(heights) else None}
 
 
-def _grid_step(latitude) -> float | None:
+def _grid_step(latitude: Floats) -> float | None:
     """Return the step, m, in which latitudes come, where it is coarser than 5 mm."""
     steps = np.abs(np.diff(np.unique(latitude))) * 6.37e6
     steps = steps[steps > 1e-6]        # below that it is the last bit

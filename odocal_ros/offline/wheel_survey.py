@@ -9,8 +9,12 @@
 
 """How each value of a list (joints, an array of counters) moves: what could be wheels."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
 from odocal_ros.messages import cdr
 from odocal_ros.messages.odometer_types import JOINTS
@@ -29,9 +33,9 @@ class Values:
 
     def __init__(self, msgtype: str) -> None:
         self.msgtype = msgtype
-        self._blocks: dict[tuple, list] = {}     # (field, keys) -> (stamps, values)
+        self._blocks: dict[tuple[Any, ...], list[Any]] = {}     # (field, keys) -> (stamps, values)
 
-    def rows(self, raws, received_ns) -> None:
+    def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints) -> None:
         """Take messages; those that are not read as columns are passed over."""
         received = np.array(received_ns, np.int64)
         for layout, rows, table in cdr.tables(self.msgtype, raws):
@@ -48,7 +52,7 @@ class Values:
                 stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1])
             self._blocks.setdefault((field, keys), []).append((stamps, np.array(values, float)))
 
-    def facts(self, imu=None) -> list[dict]:
+    def facts(self, imu: tuple[Ints, Floats] | None = None) -> list[dict[str, Any]]:
         """
         Return what each value of the most frequent list does.
 
@@ -75,7 +79,7 @@ class Values:
                 for key, w, d, r, side in zip(keys, way, span, rolls, sides, strict=True)]
 
 
-def _travelled(t, value, field):
+def _travelled(t: Floats, value: Floats, field: str) -> Floats:
     """Return running travels: (n, k)."""
     if field == 'velocity':
         mean = (value[1:] + value[:-1]) / 2 * np.diff(t)[:, None]
@@ -86,7 +90,8 @@ def _travelled(t, value, field):
     return value
 
 
-def _sides(t, s, rolls, imu) -> list[str]:
+def _sides(t: Floats, s: Floats, rolls: Bools,
+           imu: tuple[Floats, Floats] | None) -> list[str]:
     """Return 'left' or 'right' of each wheel that the gyro tells: the outer one runs farther."""
     k = len(rolls)
     none = [''] * k
@@ -110,7 +115,7 @@ def _sides(t, s, rolls, imu) -> list[str]:
     return none
 
 
-def suggested(facts: list[dict]) -> tuple[str, ...]:
+def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
     """Return the settings for the two wheels that data tell; none where they do not."""
     sides = {side: [f['key'] for f in facts if f['side'] == side] for side in ('left', 'right')}
     if [len(keys) for keys in sides.values()] != [1, 1]:
@@ -118,9 +123,9 @@ def suggested(facts: list[dict]) -> tuple[str, ...]:
     return tuple(f'odometer.{side}={keys[0]}' for side, keys in sides.items())
 
 
-def in_words(facts: list[dict]) -> list[str]:
+def in_words(facts: list[dict[str, Any]]) -> list[str]:
     """Return what each value does, for people, a line each."""
-    def one(f):
+    def one(f: dict[str, Any]) -> str:
         side = f', the {f["side"]} wheel by the gyro' if f['side'] else ''
         kind = f'a wheel by its way{side}' if f['rolls'] else 'no wheel'
         return f'{f["key"]} moves {f["way"]:.6g} {f["unit"]} in a range of {f["span"]:.6g}: {kind}'
