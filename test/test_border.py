@@ -91,6 +91,16 @@ def test_imports_at_the_top_stay_light(module):
     assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
 
 
+def test_a_method_that_does_not_run_is_not_imported():
+    probe = ('import odocal_ros.library.calibrate_bag, odocal_ros.pipeline.calibrate, '
+             'odocal_ros.output.files, odocal_ros.output.stored, odocal_ros.library.legs, sys\n'
+             "rooms = ('odocal_ros.calib.smoother', 'odocal_ros.patent', "
+             "'odocal_ros.calib.wheels.')\n"
+             'print([m for m in sys.modules if m.startswith(rooms)'
+             " and m != 'odocal_ros.calib.wheels.wheel_slips'])")
+    assert subprocess.check_output([sys.executable, '-c', probe], text=True).strip() == '[]'
+
+
 def test_help_and_usage_errors_import_not_even_numpy():
     told = [[], ['--help'], ['--version'], ['nothing'], ['replay'], ['inspect'], ['compare'],
             *([command, option] for command in COMMANDS for option in ('--help', '--nothing'))]

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.calib.smoother.state import C_bv
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.dead_reckoning import Origin
@@ -85,6 +84,7 @@ def _rows(smoothed: dict[str, Any], column: Floats) -> Floats:
 
 def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     """Return the rotations from vehicle axes to n at the rows of the track: (m, 3, 3)."""
+    from odocal_ros.calib.smoother.state import C_bv
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
     C_nv: Floats = _rows(smoothed, smoothed['key_C_nb']) @ C_bv(yaw, pitch)

@@ -20,7 +20,6 @@ import numpy as np
 
 from odocal_ros import __version__
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult, TrackCheck
-from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
 from odocal_ros.errors import BadUsage
 from odocal_ros.output import ros_files
 from odocal_ros.output.folder import ResultFolder
@@ -30,7 +29,6 @@ from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1
-IMU_CONSTANTS = (*CONSTANTS[GYRO], *CONSTANTS[ACCEL])
 IMU_KEEPS = 0.1      # of what is believed of them: by how much warmth and time change them
 MAIN = 'calibration.json'
 # what every result names, determined or not; a scale's unit is known only with its data
@@ -73,7 +71,9 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
     if (acceptance := accept(calibration, config)) is not None:
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
-        left['imu'] = calibration.carried.only(IMU_CONSTANTS, IMU_KEEPS).as_dict()
+        from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
+        left['imu'] = calibration.carried.only(
+            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), IMU_KEEPS).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
     content: dict[str, Any] = _plain({

@@ -20,11 +20,11 @@ from odocal_ros.calib.combine import combine_method
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.one_vehicle import unlike_legs
 from odocal_ros.calib.result import Calibration, Estimate, LegResult, MethodResult
-from odocal_ros.calib.smoother.several import combine_legs, DAY
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy, quat_from_matrix, rpy_from_matrix
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.settings.nominal import nominal_scale
 
 PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
@@ -140,8 +140,10 @@ def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int]
         numbers = [0, *(numbers or range(1, len(results)))]
         times_ns = [min(carried.last_ns, *times_ns), *times_ns]      # the scale is the last leg's
     if len(results) > 1 and all(r.border for r in results):
+        from odocal_ros.calib.smoother.several import combine_legs
         return combine_legs(results, times_ns, config, numbers)
-    walked = config.verdict.scale_drift_per_day**2 * (max(times_ns) - np.asarray(times_ns)) / DAY
+    ago_ns = max(times_ns) - np.asarray(times_ns)
+    walked = config.verdict.scale_drift_per_day**2 * ago_ns / DAY_NS
     return combine_method(name, results, walked)
 
 

@@ -15,11 +15,8 @@ from functools import partial
 
 from odocal_ros.calib.failed import failed, told_if_wild
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.outcome import refused as smoother_refused
 from odocal_ros.calib.two_point import unsolved
-from odocal_ros.calib.wheels.result import refused as wheels_refused
-from odocal_ros.calib.wheels.unseen import with_unseen
-from odocal_ros.calib.wheels.wheel_slips import WheelSlips
+from odocal_ros.calib.wheels.wheel_slips import WheelSlips, with_unseen
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
@@ -28,20 +25,38 @@ from odocal_ros.pipeline.method_run import MethodRun
 from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.slow_slip import held
-from odocal_ros.pipeline.smoother_run import smoother
 from odocal_ros.pipeline.two_point_run import two_point
-from odocal_ros.pipeline.wheels_run import wheels
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.screen import Inputs
 
+
+def _wheels(prepared: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
+    from odocal_ros.pipeline.wheels_run import wheels
+    return wheels(prepared, passed)
+
+
+def _smoother(prepared: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
+    from odocal_ros.pipeline.smoother_run import smoother
+    return smoother(prepared, passed)
+
+
+def _no_wheels(inputs: Inputs, why: Reason) -> MethodResult:
+    from odocal_ros.calib.wheels.result import refused
+    return refused(inputs, why)
+
+
+def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
+    from odocal_ros.calib.smoother.outcome import refused
+    return refused((why,), inputs.scale_unit)
+
+
 # as they are shown; two_point, the operator's own marks, is always computed
 METHODS: dict[str, Callable[[PreparedLeg, Callable[[int], None]], MethodRun]] = {
-    'two_point': two_point, 'wheels': wheels, 'smoother': smoother}
+    'two_point': two_point, 'wheels': _wheels, 'smoother': _smoother}
 # what each gives where it refuses: (inputs, reason) to MethodResult
 UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
            'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
-           'wheels': wheels_refused,
-           'smoother': lambda inputs, why: smoother_refused((why,), inputs.scale_unit)}
+           'wheels': _no_wheels, 'smoother': _no_smoother}
 # methods that begin with the alignment: what it had to say is said of them
 ALIGNED = ('two_point', 'wheels')
 

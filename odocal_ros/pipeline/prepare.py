@@ -17,7 +17,6 @@ import numpy as np
 from odocal_ros.calib.drive import judge_drive, judge_way, not_moving, uncovered
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
-from odocal_ros.calib.wheels.slips import wheel_faults
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
 from odocal_ros.data.leg import Leg
 from odocal_ros.data.mapped import let_go
@@ -141,6 +140,7 @@ def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
     odometer, left, right = config.odometer, inputs.travel_left, inputs.travel_right
     if left is None or right is None or not inputs.felt or BROKEN & {r.code for r in reasons}:
         return (), NO_SLIPS
+    from odocal_ros.calib.wheels.slips import wheel_faults
     return wheel_faults(
         left, right, (inputs.t_imu, inputs.w_b, inputs.f_b),
         (0.0, inputs.t_stop), track, placed.origin.latitude, placed.rough,

@@ -19,8 +19,8 @@ from wheel_legs import wheel_leg
 
 from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.result import fit_wheels
-from odocal_ros.calib.wheels.unseen import drawn_out, unseen_slip, with_unseen
-from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS
+from odocal_ros.calib.wheels.unseen import drawn_out, unseen_slip
+from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, with_unseen
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 

@@ -15,15 +15,12 @@ elsewhere and the gyro hold against it, each by its weight, so that one no large
 noise makes is none. What is found joins the slips of the leg, and the fit is made again.
 """
 
-from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.wheels.estimate import solve
 from odocal_ros.calib.wheels.slips import TURN_DOUBT, TYRE_BLUR
-from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import SIDES
@@ -155,17 +152,6 @@ def _slip(found):
     (begin, end), size, sigma, wheel = found
     return {'t': begin, 'duration': end - begin, 'metres': size, 'sigma': sigma,
             'wheel': (*SIDES, 'one of them')[wheel]}
-
-
-def with_unseen(known: WheelSlips, seen: Iterable[Mapping[str, Any]]) -> WheelSlips:
-    """Return WheelSlips with those of calibration.json after them, in order of time."""
-    begin = np.append(known.begin, [s['t'] for s in seen])
-    order = np.argsort(begin, kind='stable')
-    end = np.append(known.end, [s['t'] + s['duration'] for s in seen])
-    wheel = [{'left': -1, 'right': 1}.get(s['wheel'], 0) for s in seen]
-    return replace(known, begin=begin[order], end=end[order],
-                   size=np.append(known.size, [s['metres'] for s in seen])[order],
-                   wheel=np.append(known.wheel, wheel)[order].astype(np.int64))
 
 
 def _said(span, size, sigma, wheel):

@@ -9,7 +9,8 @@
 
 """Slips of the wheels as they are found and said."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -70,3 +71,14 @@ def slip_reason(slips: WheelSlips) -> tuple[Reason]:
                    f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
                    + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
                       if n > 1 else '')),)
+
+
+def with_unseen(known: WheelSlips, seen: Iterable[Mapping[str, Any]]) -> WheelSlips:
+    """Return WheelSlips with those of calibration.json after them, in order of time."""
+    begin = np.append(known.begin, [s['t'] for s in seen])
+    order = np.argsort(begin, kind='stable')
+    end = np.append(known.end, [s['t'] + s['duration'] for s in seen])
+    wheel = [{'left': -1, 'right': 1}.get(s['wheel'], 0) for s in seen]
+    return replace(known, begin=begin[order], end=end[order],
+                   size=np.append(known.size, [s['metres'] for s in seen])[order],
+                   wheel=np.append(known.wheel, wheel)[order].astype(np.int64))
