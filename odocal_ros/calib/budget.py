@@ -30,7 +30,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_step
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.earth import A
-from odocal_ros.nav.rotations import skew
+from odocal_ros.nav.rotations import matrix_from_quat, skew
 
 # m, 1 sigma of the height of fixes that have none, which are put on the ellipsoid. Physical: roads
 # lie up to 2 km above it, most below 500 m; it makes 80 ppm of the scale
@@ -48,7 +48,7 @@ def parameter_gradient(f: Floats) -> Floats:
                      [-z / level**2, 0.0, x / level**2]])
 
 
-def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
+def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
     """
     Return the gyro sources as chord errors, each (3, k) m for one sigma.
 
@@ -58,8 +58,8 @@ def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> d
         Epochs from the start of the leg to its end, s.
     D : (m, 3) array
         Dead-reckoned displacement from the start, n, m.
-    C_nb : (m, 3, 3) array
-        Attitude.
+    q_nb : (m, 4) array
+        Attitude, x y z w.
     alignment : Alignment
         Sigmas.
 
@@ -72,7 +72,7 @@ def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> d
     r = D[-1] - D
     dt = np.diff(t)
     # e = integral of (C_nb db) x r
-    turn = by_step(_turn, r, C_nb)
+    turn = by_step(_turn, r, q_nb)
     bias = np.einsum('nij,n->ij', turn, dt) * alignment.gyro_bias_sigma
     # R(u): what is left of the integral of r from u on; a step of the bias at u turns all of it
     slices = (r[:-1] + r[1:]) / 2 * dt[:, None]
@@ -82,9 +82,9 @@ def drift_sources(t: Floats, D: Floats, C_nb: Floats, alignment: Alignment) -> d
             'gyro_bias_walk': alignment.gyro_bias_walk * _root(_spread(R, dt))}
 
 
-def _turn(r: Floats, C_nb: Floats) -> Floats:
-    """Return the mean of (C_nb db) x r over each step: (n, 3), (n, 3, 3) to (n - 1, 3, 3)."""
-    turn = -skew(r) @ C_nb
+def _turn(r: Floats, q_nb: Floats) -> Floats:
+    """Return the mean of (C_nb db) x r over each step: (n, 3), (n, 4) to (n - 1, 3, 3)."""
+    turn = -skew(r) @ matrix_from_quat(q_nb)
     mean = turn[:-1] + turn[1:]
     mean /= 2
     return mean
@@ -105,7 +105,7 @@ def _root(covariance: Floats) -> Floats:
     return root
 
 
-def _late_odometer(f: Floats, t: Floats, D: Floats, C_nb: Floats, start: MarkFix,
+def _late_odometer(f: Floats, t: Floats, D: Floats, q_nb: Floats, start: MarkFix,
                    end: MarkFix) -> Floats:
     """
     Return what an odometer that is late by 1 s does to the chord, (3,) m.
@@ -113,9 +113,12 @@ def _late_odometer(f: Floats, t: Floats, D: Floats, C_nb: Floats, start: MarkFix
     Travel is then put on attitudes that come after it: the integral of dC/dt f ds, less what the
     track has at one end and lacks at the other, v(end) - v(start).
     """
-    middle = by_step(lambda C_nb: (C_nb[:-1] + C_nb[1:]) @ f / 2, C_nb)
+    def middle_and_change(q_nb: Floats) -> Floats:
+        C_nb = matrix_from_quat(q_nb)
+        return np.stack([(C_nb[:-1] + C_nb[1:]) @ f / 2, np.diff(C_nb, axis=0) @ f], axis=1)
+
+    middle, change = map(np.ascontiguousarray, by_step(middle_and_change, q_nb).swapaxes(0, 1))
     speed = np.einsum('ni,ni->n', middle, np.diff(D, axis=0)) / (f @ f) / np.diff(t)
-    change = by_step(lambda C_nb: np.diff(C_nb, axis=0) @ f, C_nb)
     turned: Floats = (change * speed[:, None]).sum(axis=0)
     v_start = 0.0 if start.standing else _velocity(t, D, start.t, min(start.t + 1.0, end.t))
     v_end = 0.0 if end.standing else _velocity(t, D, max(end.t - 1.0, start.t), end.t)
@@ -130,7 +133,7 @@ def _velocity(t: Floats, D: Floats, begin: float, end: float) -> Floats:
     return mean
 
 
-def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Floats, C_nb: Floats,
+def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Floats, q_nb: Floats,
            alignment: Alignment, *, quantum: float, fix_scale: Floats, time_sigma: float,
            velocity_change: Floats, lever_arm_sigma: float,
            odometer_time_sigma: float) -> tuple[Source, ...]:
@@ -149,7 +152,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
         Attitude summed over travel.
     start, end : MarkFix
         Reference positions.
-    t, D, C_nb : arrays
+    t, D, q_nb : arrays
         The track, as in drift_sources, from the alignment or the start mark to the end mark.
     alignment : Alignment
         Level, heading and gyro sigmas.
@@ -168,19 +171,20 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
 
     """
     forward = D[-1] / np.linalg.norm(D[-1])
+    at_start = int(np.searchsorted(t, start.t - 1e-9))
+    C_first, C_start, C_end = matrix_from_quat(q_nb[[0, at_start, -1]])
     chord = {
         'fix_start': fix_scale[:, None] * _root(start.covariance_n),
         'fix_end': fix_scale[:, None] * _root(end.covariance_n),
         'initial_heading': np.cross([0.0, 0.0, alignment.heading_sigma], D[-1])[:, None],
         # about b's own axes: an accelerometer bias tilts the level of every leg alike
-        'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_nb[0].T[:2]], -1)
+        'initial_level': np.stack([np.cross(axis, D[-1]) for axis in C_first.T[:2]], -1)
         * alignment.level_sigma,
-        **drift_sources(t, D, C_nb, alignment),
+        **drift_sources(t, D, q_nb, alignment),
         'quantisation': (forward * quantum * np.sqrt(2 / 12))[:, None],
         'fix_latency': (velocity_change * time_sigma)[:, None],
-        'antenna_lever_arm': (C_nb[-1] - C_nb[np.searchsorted(t, start.t - 1e-9)])
-        * lever_arm_sigma,
-        'odometer_delay': (_late_odometer(f, t, D, C_nb, start, end)
+        'antenna_lever_arm': (C_end - C_start) * lever_arm_sigma,
+        'odometer_delay': (_late_odometer(f, t, D, q_nb, start, end)
                            * odometer_time_sigma)[:, None],
         'height': (D[-1] * _height_sigma(start, end) / A)[:, None],
         'projection': np.zeros((3, 1)),

@@ -90,7 +90,7 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
     kept = kept & (inputs.t_fix >= span[0]) & (inputs.t_fix <= span[1])
     t_fix, fix_n, covariance = inputs.t_fix[kept], fixes_n[kept], inputs.covariance_n[kept]
     before, after = (_pinned(path, pin) for path in paths)
-    after_n, off_n = after(t), after(t_fix) - fix_n
+    after_n, fixed_n = after(t), after(t_fix)
     yaw = np.unwrap(by_row(yaw_from_quat, track.q_nb[inside]))
     sign = np.where(rate_over_second(t, track.s[inside]) < 0, -1.0, 1.0)
     distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(after_n[:, :2], axis=0).T)))[:len(t)]
@@ -104,9 +104,9 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
         t=t[m], distance=distance[m], speed=(rate_over_second(t, distance) * sign)[m],
         yaw_rate=rate_over_second(t, yaw)[m], track_n=after_n[m], track_before_n=before(t[m]),
         t_fix=t_fix[k], fix_distance=fix_distance[k], fix_n=fix_n[k], fix_sigma=sigma[k],
-        fix_status=status[k], residual=_split(off_n, forward)[k],
+        fix_status=status[k], residual=_split(fixed_n - fix_n, forward)[k],
         residual_before=_split(before(t_fix) - fix_n, forward)[k],
-        sections=sections(fix_distance, after(t_fix), fix_n, sigma),
+        sections=sections(fix_distance, fixed_n, fix_n, sigma),
         t_excluded=t_out[x], excluded_because=tuple(because[i] for i in x),
         fixes=len(t_fix), excluded=len(because), gaps=_gaps(inputs, span, config),
         t_fit=t_fit)

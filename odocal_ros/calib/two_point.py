@@ -34,11 +34,12 @@ from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import slip_source
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
 from odocal_ros.nav.projection import geodesic_chord, plane_chord
-from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.reasons import Code, Reason
 
 # rad, prior sigma of the pitch where heights say nothing: physical, what holders and loads do
@@ -192,20 +193,30 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
     track = chord.track
     # the gyros err from the alignment on; but a fixed heading holds at the mark itself
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
-    keep = (track.t >= min(first, chord.start.t)) & (track.t <= chord.end.t)
+    keep = epochs_between(track, min(first, chord.start.t), chord.end.t)
     t = track.t[keep]
-    D = (track.P[keep] - track.at(chord.start.t)) @ f * (t >= chord.start.t)[:, None]
+    D = displacement(track, keep, chord.start.t, f) * (t >= chord.start.t)[:, None]
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the prior in the pitch stands in for the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
         start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
-    C_nb = matrix_from_quat(track.q_nb[keep])
     K = float(np.linalg.norm(f))
-    return budget(f, M, start, end, t, D, C_nb, chord.alignment,
+    return budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
                   quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
                   velocity_change=chord.velocity_change @ f,
                   lever_arm_sigma=config.gnss.lever_arm_sigma,
                   odometer_time_sigma=config.odometer.time_sigma)
+
+
+def epochs_between(track: Track, begin: float, end: float) -> slice:
+    """Return which epochs of a track lie between two times, s, those at them too."""
+    return slice(np.searchsorted(track.t, begin), np.searchsorted(track.t, end, side='right'))
+
+
+def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
+    """Return how far f takes a track at some epochs from where it is at t_start: (m, 3) m."""
+    start = track.at(t_start)
+    return by_row(lambda P: (P - start) @ f, track.P[rows])
 
 
 def _doubt(chord, f):

@@ -73,7 +73,11 @@ class Track:
         after = np.minimum(k + 1, last)         # a track of one epoch has but that
         step = np.maximum(self.t[after] - self.t[k], LEAST_EPOCH_STEP)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
-        return self.P[k] * (1 - x) + self.P[after] * x
+        before, beyond = self.P.take(k, axis=0), self.P.take(after, axis=0)
+        before *= 1 - x
+        beyond *= x
+        before += beyond
+        return before
 
     def C_nb_at(self, t: float | Floats) -> Floats:
         """Return attitude at the epoch nearest to t: (...) to (..., 3, 3)."""
@@ -102,7 +106,8 @@ def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     half, P = (np.diff(s) / 2)[:, None, None], room(len(t), 3, 3)
     for rows in chunks(len(t) - 1):
         C_nb = matrix_from_quat(q_nb[rows.start:rows.stop + 1])
-        sums = (C_nb[:-1] + C_nb[1:]) * half[rows]
+        sums = C_nb[:-1] + C_nb[1:]
+        sums *= half[rows]
         sums[0] += P[rows.start]
         np.cumsum(sums, axis=0, out=P[rows.start + 1:rows.stop + 1])
     return Track(t, q_nb, s, P)

@@ -29,9 +29,16 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.slip import find_slips, rounding, slip_reason, SPIN_WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
-from odocal_ros.calib.two_point import Chord, fit, refusal, solve, unsolved
+from odocal_ros.calib.two_point import (
+    Chord,
+    displacement,
+    epochs_between,
+    fit,
+    refusal,
+    solve,
+    unsolved,
+)
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.nav.rotations import matrix_from_quat
 from odocal_ros.pipeline.method_run import MethodRun, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, near
@@ -153,9 +160,9 @@ class TwoPointRun:
 
     def _drift(self, chord: Chord, f: Floats) -> Floats:
         """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
-        keep = (self.track.t >= chord.start.t) & (self.track.t <= chord.end.t)
-        D = (self.track.P[keep] - self.track.at(chord.start.t)) @ f
-        sources = drift_sources(self.track.t[keep], D, matrix_from_quat(self.track.q_nb[keep]),
+        keep = epochs_between(self.track, chord.start.t, chord.end.t)
+        D = displacement(self.track, keep, chord.start.t, f)
+        sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep],
                                 self.ready.alignment)
         # the bow of a pinned track is a quarter of what its free end would stray
         return np.concatenate(list(sources.values()), axis=1) / 4

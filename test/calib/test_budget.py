@@ -79,7 +79,7 @@ def sources(track, *, standing=True, cov=0.0, fix_scale=(1.0, 1.0, 1.0), more=No
                'lever_arm_sigma': 0.0, 'odometer_time_sigma': 0.0} | (more or {})
     marks = [MarkFix(t, np.zeros(3), np.eye(3) * cov, standing, 9, 0)
              for t in (track.t[0], track.t[-1])]
-    found = budget(F, track.P[-1], *marks, track.t, track.P @ F, matrix_from_quat(track.q_nb),
+    found = budget(F, track.P[-1], *marks, track.t, track.P @ F, track.q_nb,
                    alignment(**figures), fix_scale=np.array(fix_scale), **options)
     return {s.name: s for s in found}
 
@@ -229,10 +229,10 @@ def test_gyros_err_from_the_alignment_on(leg, truth):
     track, _, _ = truth
     t = np.concatenate([np.arange(-60.0, 0.0, 0.05), track.t])
     D = np.concatenate([np.zeros((1200, 3)), track.P @ F])
-    C = np.concatenate([np.tile(leg.C0, (1200, 1, 1)), matrix_from_quat(track.q_nb)])
+    q = np.concatenate([np.tile(quat_from_matrix(leg.C0), (1200, 1)), track.q_nb])
     figures = alignment(gyro_bias_sigma=np.full(3, 1e-6))
-    whole = drift_sources(t, D, C, figures)['gyro_bias_z']
-    part = drift_sources(t[1200:], D[1200:], C[1200:], figures)['gyro_bias_z']
+    whole = drift_sources(t, D, q, figures)['gyro_bias_z']
+    part = drift_sources(t[1200:], D[1200:], q[1200:], figures)['gyro_bias_z']
     turned = np.cross(leg.C0[:, 2] * 60.0 * 1e-6, D[-1])
     np.testing.assert_allclose(whole[:, 0] - part[:, 0], turned, rtol=2e-3, atol=1e-6)
 
