@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from odocal_ros.bagio import encode
-from odocal_ros.messages.decode import IMU, make_reader
+from odocal_ros.messages.decode import make_reader
+from odocal_ros.messages.sensor_types import IMU
 from odocal_ros.pipeline.calibrate import calibrate, combine
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import Config

@@ -21,26 +21,44 @@ CHUNK_DAMAGED = 'a damaged chunk'
 
 
 class Chunk(NamedTuple):
-    """Its records, the times it states, and the message index behind it, which nobody checked."""
+    """
+    Where its records lie, the times it states, and the message index behind it, to be proved.
 
-    records: Bytes
+    ``data`` may hold more than ``data[at:stop]``: several chunks that were read in one go.
+    """
+
+    data: Bytes
+    at: int
+    stop: int
     start_ns: int
     end_ns: int
     begins: Bytes = b''
 
+    @property
+    def records(self) -> memoryview:
+        """Return its records."""
+        return memoryview(self.data)[self.at:self.stop]
 
-def unpacked(body: Bytes, allowance: Allowance, cut: bool = False) -> Chunk:
-    """Return the chunk that a record holds; or Damaged. ``cut``: the file ends in it."""
+
+def unpacked(data: Bytes, at: int, stop: int, allowance: Allowance, cut: bool = False) -> Chunk:
+    """
+    Return the chunk that a record holds; or Damaged.
+
+    at, stop : where in the data the record's content lies.   cut : the file ends in it.
+    """
+    body = memoryview(data)[at:stop]
     try:
         start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(body)
-        packing, at = text_at(body, CHUNK_HEAD.size)
-        (packed,) = struct.unpack_from('<Q', body, at)
-        data = body[at + 8:at + 8 + packed]
-        records = allowance.unpack(packing, data, size)
+        packing, place = text_at(body, CHUNK_HEAD.size)
+        (length,) = struct.unpack_from('<Q', body, place)
+        packed = body[place + 8:place + 8 + length]
+        records = allowance.unpack(packing, packed, size)
     except (LimitReached, MemoryError):
         raise
     except Exception:    # each compression has its own error; what is lost is lost
         raise Damaged(CHUNK_DAMAGED) from None
     if not cut and (len(records) != size or crc and zlib.crc32(records) != crc):
         raise Damaged(CHUNK_DAMAGED)
-    return Chunk(records, start_ns, end_ns)
+    if packing:
+        return Chunk(records, 0, len(records), start_ns, end_ns)
+    return Chunk(data, at + place + 8, at + place + 8 + len(records), start_ns, end_ns)

@@ -9,14 +9,14 @@
 
 """An mcap file: by its index, or record by record where that is gone or wrong."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import heapq
 from operator import itemgetter
 from pathlib import Path
 import struct
 import zlib
 
-from odocal_ros.bagio.channels import Batch, Channel, FORMATS, Message, Recording
+from odocal_ros.bagio.channels import Batch, Channel, Message
 from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.bagio.mcap_chunk import Chunk, CHUNK_DAMAGED, unpacked
 from odocal_ros.bagio.mcap_gather import batches
@@ -30,7 +30,6 @@ from odocal_ros.bagio.mcap_records import (
     INDEX_DAMAGED,
     MAGIC,
     MESSAGE,
-    MESSAGE_HEAD,
     Place,
     place_of,
     RECORD,
@@ -38,15 +37,13 @@ from odocal_ros.bagio.mcap_records import (
     SCHEMA,
     STATISTICS,
     statistics_of,
-    text_at,
     TIMES,
 )
+from odocal_ros.bagio.mcap_walk import Entry, RecordWalk
 from odocal_ros.outside.limits import Allowance, Damaged, LATEST_NS
 
-Entry = tuple[int, int, bytes]     # time, channel, message
 
-
-class McapFile(Recording):
+class McapFile(RecordWalk):
     """
     A file of messages in chunks.
 
@@ -58,7 +55,6 @@ class McapFile(Recording):
     def __init__(self, path: Path, allowance: Allowance) -> None:
         super().__init__(path)
         self._allowance = allowance
-        self._schemas: dict[int, tuple[str, tuple[str, str]]] = {}
         self._places: list[Place] = []
         self._counted = ''         # the damage known when messages were counted
         self._file = FileBytes(path)
@@ -134,15 +130,25 @@ class McapFile(Recording):
 
     def _gathered(self, places: list[Place], wanted: Mapping[int, Channel]) -> Iterator[Batch]:
         self._allowance.again()
-        yield from batches(places, wanted, self._channels, self._at, self._walked, self._note)
+        yield from batches(places, wanted, self._channels, self._read, self._walked, self._note)
         self._recount()
 
-    def _at(self, place: Place) -> Chunk:
-        """Return a chunk of the index and the message index behind it, or Damaged."""
-        record = memoryview(self._file[place.at:place.at + place.size + place.index_size])
-        if record[:9] != RECORD.pack(CHUNK, place.size - 9):
-            raise Damaged(CHUNK_DAMAGED)
-        return unpacked(record[9:place.size], self._allowance)._replace(begins=record[place.size:])
+    def _read(self, places: Sequence[Place]) -> list[Chunk | Damaged]:
+        """Return chunks of the index that stand side by side, and the message index of each."""
+        begin, end = places[0].at, places[-1].at + places[-1].size + places[-1].index_size
+        data = self._file[begin:end]
+        found: list[Chunk | Damaged] = []
+        for place in places:
+            at = place.at - begin
+            stop = at + place.size
+            try:
+                if data[at:at + 9] != RECORD.pack(CHUNK, place.size - 9):
+                    raise Damaged(CHUNK_DAMAGED)
+                found.append(unpacked(data, at + 9, stop, self._allowance)._replace(
+                    begins=memoryview(data)[stop:stop + place.index_size]))
+            except Damaged as error:
+                found.append(error)
+        return found
 
     def _note(self, damage: Damaged) -> None:
         self.damage = self.damage or str(damage)
@@ -180,7 +186,10 @@ class McapFile(Recording):
     def _of(self, place: Place, wanted: Mapping[int, Channel]) -> list[Entry]:
         """Return the messages of a chunk of the index, sorted; none of one that is damaged."""
         try:
-            found = self._walked(self._at(place))
+            (chunk,) = self._read([place])
+            if isinstance(chunk, Damaged):
+                raise chunk
+            found = self._walked(chunk)
         except Damaged as error:
             self._note(error)
             return []
@@ -205,67 +214,9 @@ class McapFile(Recording):
             except (Damaged, struct.error, UnicodeDecodeError) as error:
                 self.damage = self.damage or _said(error)
 
-    def _message(self, body: bytes) -> Entry:
-        key, _, time_ns, _ = MESSAGE_HEAD.unpack_from(body)
-        if key not in self._channels or time_ns >= LATEST_NS:
-            raise Damaged('a damaged record')
-        return time_ns, key, body[MESSAGE_HEAD.size:]
-
     def _chunk(self, body: bytes, cut: bool = False) -> list[Entry]:
         """Return the messages of a chunk by time; or Damaged. ``cut``: the file ends in it."""
-        return self._walked(unpacked(body, self._allowance, cut), cut)
-
-    def _walked(self, chunk: Chunk, cut: bool = False) -> list[Entry]:
-        """Return the messages of a chunk by time, as a walk over its records finds them."""
-        found = self._entries(bytes(chunk.records), cut)
-        found.sort(key=itemgetter(0))
-        if found and not chunk.start_ns <= found[0][0] <= found[-1][0] <= max(
-                chunk.end_ns, chunk.start_ns):
-            raise Damaged(CHUNK_DAMAGED)
-        return found
-
-    def _entries(self, records: bytes, cut: bool) -> list[Entry]:
-        """Return the messages among the records of a chunk; all of them are right, or Damaged."""
-        found = []
-        channels, head, at, end = self._channels, RECORD.unpack_from, 0, len(records)
-        while at + 9 <= end:
-            op, size = head(records, at)
-            stop = at + 9 + size
-            if stop > end:
-                break
-            if op == MESSAGE:
-                if size < MESSAGE_HEAD.size:
-                    raise Damaged(CHUNK_DAMAGED)
-                key, _, time_ns, _ = MESSAGE_HEAD.unpack_from(records, at + 9)
-                if key not in channels or time_ns >= LATEST_NS:
-                    raise Damaged(CHUNK_DAMAGED)
-                found.append((time_ns, key, records[at + 31:stop]))
-            elif op in (SCHEMA, CHANNEL):
-                try:
-                    self._learn(op, records[at + 9:stop])
-                except (struct.error, UnicodeDecodeError):
-                    raise Damaged(CHUNK_DAMAGED) from None
-            else:       # nothing else may stand in a chunk
-                raise Damaged(CHUNK_DAMAGED)
-            at = stop
-        if at != end and not cut:
-            raise Damaged(CHUNK_DAMAGED)
-        return found
-
-    def _learn(self, op: int, body: bytes) -> None:
-        """Note a schema or a channel."""
-        (key,) = struct.unpack_from('<H', body)
-        if op == SCHEMA:
-            name, at = text_at(body, 2)
-            form, at = text_at(body, at)
-            text, _ = text_at(body, at)
-            self._schemas[key] = name, (FORMATS.get(form, ''), text)
-        elif key not in self._channels:
-            topic, at = text_at(body, 4)
-            form, _ = text_at(body, at)
-            (schema,) = struct.unpack_from('<H', body, 2)
-            name, definition = self._schemas.get(schema, ('', ('', '')))
-            self._channels[key] = Channel(topic, name, 0, form, definition)
+        return self._walked(unpacked(body, 0, len(body), self._allowance, cut), cut)
 
     def close(self) -> None:
         """Let go of the file."""

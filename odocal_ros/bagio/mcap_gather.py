@@ -17,8 +17,6 @@ them. A chunk that is not so goes through the walk.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 import struct
 from typing import NamedTuple
 
@@ -33,8 +31,8 @@ from odocal_ros.messages.raws import Raws, Rows
 from odocal_ros.outside.limits import Damaged, LATEST_NS
 
 BLOCK = 2**21          # bytes of chunks unpacked at a time
-HEAD = np.dtype([('op', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                 ('time_ns', '<u8'), ('published_ns', '<u8')])
+HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
+                 ('time_ns', '<i8'), ('published_ns', '<i8')])
 BODY = 22              # of those bytes, what a record's size counts
 
 
@@ -50,55 +48,51 @@ class Columns(NamedTuple):
         return Columns(self.time_ns[rows], self.channel[rows], self.raws.take(rows))
 
 
-Unpack = Callable[[Place], Chunk]                             # or Damaged
+Block = list[Chunk | Damaged]
+Read = Callable[[Sequence[Place]], Block]                     # of chunks side by side
 Walk = Callable[[Chunk], Sequence[tuple[int, int, bytes]]]    # time, channel, message; or Damaged
 Note = Callable[[Damaged], None]
-Block = list[Chunk | Damaged]
 
 
 def batches(places: Sequence[Place], wanted: Mapping[int, Channel], known: Collection[int],
-            unpack: Unpack, walk: Walk, note: Note) -> Iterator[Batch]:
+            read: Read, walk: Walk, note: Note) -> Iterator[Batch]:
     """
     Yield the messages of some channels by time, many at a time.
 
     places : chunks by the times they state.   known : all channels of the file.
     walk   : gives the messages of a chunk one by one.   note : is told what damage costs.
     """
-    columns = partial(_columns, known=_table(known), walk=walk, note=note)
-    mine = _table(wanted)
+    mine, all_known = _table(wanted), _table(known)
     late: Columns | None = None          # messages that one of a chunk to come may precede
-    with ThreadPoolExecutor(1) as beside:
-        # the first block is one chunk: often no more is asked for
-        block = beside.submit(_block, places, 0, 1, unpack)
-        while True:
-            chunks, at = block.result()
-            size = BLOCK + int(late.raws.size.sum() if late else 0)
-            block = beside.submit(_block, places, at, size, unpack)
-            found = columns(chunks)
+    at, size = 0, 1                      # the first block is one chunk: often no more is asked for
+    while at < len(places):
+        block, at = _block(places, at, size, read)
+        found = _columns(block, all_known, walk, note)
+        if len(wanted) < len(known):
             found = found.take(mine[found.channel])
-            found = _by_time(_joined(late, found) if late else found)
-            end = int(np.searchsorted(found.time_ns, places[at].start_ns)) if at < len(
-                places) else len(found.time_ns)
-            late = found.take(slice(end, None)) if end < len(found.time_ns) else None
-            if end:
-                yield _batch(found.take(slice(end)), wanted)
-            if at >= len(places):
-                return
+        found = _by_time(_joined(late, found) if late else found)
+        end = int(np.searchsorted(found.time_ns, places[at].start_ns)) if at < len(
+            places) else len(found.time_ns)
+        late = found.take(slice(end, None)) if end < len(found.time_ns) else None
+        if end:
+            yield _batch(found.take(slice(end)), wanted)
+        size = BLOCK + int(late.raws.size.sum() if late else 0)
 
 
-def _block(places: Sequence[Place], at: int, size: int, unpack: Unpack) -> tuple[Block, int]:
-    """Unpack chunks from one on, of so many bytes or more; return them and which comes next."""
+def _block(places: Sequence[Place], at: int, size: int, read: Read) -> tuple[Block, int]:
+    """Read chunks from one on, of so many bytes or more; return them and which comes next."""
     block: Block = []
-    end_ns = 0
+    end_ns, first, beside = 0, at, 0
     while at < len(places) and (size > 0 or places[at].start_ns < end_ns and size > -BLOCK):
-        try:
-            chunk = unpack(places[at])
-            block.append(chunk)
-            size -= len(chunk.records)
-        except Damaged as error:
-            block.append(error)
-        size, end_ns, at = size - 1, max(end_ns, places[at].end_ns), at + 1
-    return block, at
+        place = places[at]
+        if place.at != beside:
+            block += read(places[first:at]) if at > first else []
+            first = at
+        beside = place.at + place.size + place.index_size
+        # those that are packed have to be copied to lie in one piece
+        size -= place.size if place.size >= place.unpacked else 2 * place.unpacked
+        end_ns, at = max(end_ns, place.end_ns), at + 1
+    return block + read(places[first:at]), at
 
 
 def _columns(block: Block, known: Bools, walk: Walk, note: Note) -> Columns:
@@ -125,34 +119,48 @@ def _table(keys: Collection[int]) -> Bools:
 
 def _gathered(chunks: Sequence[Chunk], known: Bools) -> Columns | None:
     """Return the messages of chunks; None where anything of them is odd."""
+    chunks = _in_one(chunks)
     starts = [_starts(chunk) for chunk in chunks]
-    counts = [len(s) for s in starts]
-    if not chunks or not all(counts):
+    counts = np.array([len(s) for s in starts])
+    if not chunks or not counts.all():
         return None
-    data = b''.join([chunk.records for chunk in chunks])
-    first = np.cumsum([0, *counts[:-1]])
-    base = np.cumsum([0, *(len(chunk.records) for chunk in chunks)])
-    start = np.concatenate([s + b for s, b in zip(starts, base[:-1], strict=True)])
-    if len(data) < HEAD.itemsize or start.max() > len(data) - HEAD.itemsize or start.min() < 0:
+    data = chunks[0].data
+    start = np.sort(np.concatenate(starts))
+    if start[0] < 0 or start[-1] > len(data) - HEAD.itemsize:
         return None
-    head = np.ndarray((len(data) - HEAD.itemsize + 1,), HEAD, data, 0, (1,))[start]
-    time_ns, size = head['time_ns'], head['size'].astype(np.int64)
-    stop = start + 9 + size
-    chain = ((start[first] == base[:-1]).all() and (stop[:-1] == start[1:]).all()
-             and stop[-1] == base[-1] and (size >= BODY).all()
-             and (head['op'] == MESSAGE).all())
-    if not chain or not known[head['channel']].all() or (time_ns >= LATEST_NS).any():
+    head = np.ndarray((len(data) - HEAD.itemsize + 1,), f'V{HEAD.itemsize}', data, 0, (1,))[
+        start].view(HEAD)
+    end = counts.cumsum()
+    first = end - counts
+    stop = np.append(start[1:], 0)
+    stop[end - 1] = [chunk.stop for chunk in chunks]
+    size = stop - start - 9
+    chain = ((head['size'] == size).all() and size.min() >= BODY and (head['op'] == MESSAGE).all()
+             and start[first].tolist() == [chunk.at for chunk in chunks])
+    time_ns, channel = head['time_ns'].copy(), head['channel'].copy()
+    if not chain or not known[channel].all():
         return None
     least, most = np.minimum.reduceat(time_ns, first), np.maximum.reduceat(time_ns, first)
     for chunk, a, b in zip(chunks, least.tolist(), most.tolist(), strict=True):
-        if not chunk.start_ns <= a <= b <= max(chunk.end_ns, chunk.start_ns):
+        if not chunk.start_ns <= a <= b <= max(chunk.end_ns, chunk.start_ns) or b >= LATEST_NS:
             return None
-    return Columns(time_ns.astype(np.int64), head['channel'],
-                   Raws(data, start + HEAD.itemsize, size - BODY))
+    return Columns(time_ns, channel, Raws(data, start + HEAD.itemsize, size - BODY))
+
+
+def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
+    """Return chunks whose records lie in one piece of memory."""
+    if len({id(chunk.data) for chunk in chunks}) <= 1:
+        return chunks
+    data, at, found = b''.join([chunk.records for chunk in chunks]), 0, []
+    for chunk in chunks:
+        stop = at + chunk.stop - chunk.at
+        found.append(chunk._replace(data=data, at=at, stop=stop))
+        at = stop
+    return found
 
 
 def _starts(chunk: Chunk) -> Ints:
-    """Return where the records of a chunk begin, by its message index; to be proved."""
+    """Return where the records of a chunk begin, by its message index, in any order."""
     found, at, index = [np.empty(0, np.int64)], 0, chunk.begins
     while at + 15 <= len(index):
         op, size = RECORD.unpack_from(index, at)
@@ -162,7 +170,7 @@ def _starts(chunk: Chunk) -> Ints:
             break
         found.append(np.frombuffer(index, '<i8', length // 8, at + 15)[1::2])
         at += 9 + size
-    return np.sort(np.concatenate(found), kind='stable')
+    return np.concatenate(found) + chunk.at
 
 
 def _walked(entries: Sequence[tuple[int, int, bytes]]) -> Columns:
@@ -188,7 +196,7 @@ def _joined(*parts: Columns) -> Columns:
 
 def _by_time(found: Columns) -> Columns:
     """Return messages in order of time, those of one time as they stand."""
-    if (np.diff(found.time_ns) >= 0).all():
+    if (found.time_ns[1:] >= found.time_ns[:-1]).all():
         return found
     return found.take(np.argsort(found.time_ns, kind='stable'))
 
@@ -197,8 +205,8 @@ def _batch(found: Columns, wanted: Mapping[int, Channel]) -> Batch:
     """Return messages by topic."""
     batch: Batch = {}
     for topic in dict.fromkeys(channel.topic for channel in wanted.values()):
-        mine = _table([key for key, channel in wanted.items() if channel.topic == topic])
-        rows = np.flatnonzero(mine[found.channel])
+        mine = [found.channel == key for key, channel in wanted.items() if channel.topic == topic]
+        rows = np.flatnonzero(np.logical_or.reduce(mine))
         if len(rows):
             batch[topic] = found.time_ns[rows], found.raws.take(rows)
     return batch

@@ -33,7 +33,8 @@ class Place(NamedTuple):
     """
     A chunk by the index: its times, where its record stands, whose messages it holds.
 
-    ``index_size`` is that of the message index behind it, as far as it is to be trusted.
+    ``index_size`` is that of the message index behind it, as far as it is to be trusted;
+    ``unpacked`` is how many bytes the chunk is said to hold.
     """
 
     start_ns: int
@@ -42,6 +43,7 @@ class Place(NamedTuple):
     size: int
     channels: frozenset[int]
     index_size: int = 0
+    unpacked: int = 0
 
 
 def records_of(data: bytes | FileBytes, at: int = 0) -> Iterator[tuple[int, bytes, bool]]:
@@ -65,7 +67,8 @@ def place_of(body: bytes) -> Place:
     pairs = body[INDEX_HEAD.size + 4:stop]
     return Place(start_ns, end_ns, at, size,
                  frozenset(key for key, _ in struct.iter_unpack('<HQ', pairs)),
-                 int.from_bytes(body[stop:stop + 8], 'little'))
+                 int.from_bytes(body[stop:stop + 8], 'little'),
+                 int.from_bytes(body[-8:], 'little'))
 
 
 def apart(places: Sequence[Place], end: int) -> list[Place]:

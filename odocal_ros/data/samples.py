@@ -16,8 +16,8 @@ message has none), ``received_ns`` the arrival (bag time, or the middleware's so
 is used to compare clocks and never enters a result.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -144,8 +144,7 @@ def freeze(owner: Samples, **rows: Any) -> None:
 
 def take(samples: SomeSamples, index: Index) -> SomeSamples:
     """Return the rows that a numpy index picks, as the same type."""
-    return of_columns(type(samples), {f.name: getattr(samples, f.name)[index]
-                                      for f in fields(samples)})
+    return of_columns(type(samples), *(column[index] for column in columns_of(samples)))
 
 
 def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
@@ -153,15 +152,19 @@ def join(blocks: Iterable[SomeSamples]) -> SomeSamples:
     blocks = list(blocks)
     if len(blocks) == 1:
         return blocks[0]
-    names = [f.name for f in fields(blocks[0])]
-    return of_columns(type(blocks[0]), {n: np.concatenate([getattr(b, n) for b in blocks])
-                                        for n in names})
+    return of_columns(type(blocks[0]), *map(np.concatenate, zip(*map(columns_of, blocks),
+                                                                strict=True)))
 
 
-def of_columns(kind: type[SomeSamples], columns: Mapping[str, NDArray[Any]]) -> SomeSamples:
+def columns_of(samples: Samples) -> list[NDArray[Any]]:
+    """Return the columns of samples, in the order of their fields."""
+    return list(vars(samples).values())
+
+
+def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
     """Return samples of arrays that were checked before and that nobody else holds: no copy."""
     samples = object.__new__(kind)
-    for name, array in columns.items():
+    for name, array in zip(kind.__dataclass_fields__, columns, strict=True):
         array.setflags(write=False)
         object.__setattr__(samples, name, array)
     return samples

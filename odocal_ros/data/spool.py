@@ -16,7 +16,7 @@ more, rows stay in memory.
 """
 
 from collections.abc import Callable
-from dataclasses import fields
+import math
 import mmap
 import os
 from typing import Any, BinaryIO
@@ -25,11 +25,12 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools
 from odocal_ros.data.mapped import mapped, nameless
-from odocal_ros.data.samples import join, of_columns, Samples, take
+from odocal_ros.data.samples import columns_of, join, of_columns, Samples, take
 
 MEMORY_BYTES = 2**24    # bytes of a topic's rows from which they go to the file
 TAIL_BYTES = 2**23      # bytes after those of the file, the same
 MERGED_BYTES = 2**20    # bytes: so much of small blocks is made one
+LARGE_BYTES = 2**17     # bytes of a block that is not small
 MOVED_BYTES = 2**20     # bytes moved at a time
 
 
@@ -51,7 +52,7 @@ class Rows:
         self._fresh.append(block)
         self._fresh_size += size
         self._size += size
-        if self._fresh_size >= MERGED_BYTES:
+        if self._fresh_size >= MERGED_BYTES or size >= LARGE_BYTES:
             self._merge()
             if self._size > (MEMORY_BYTES if self._file is None else TAIL_BYTES):
                 self._to_file()
@@ -126,35 +127,32 @@ class _Columns:
 
     def __init__(self, like: Samples) -> None:
         self._kind = type(like)
-        self._files: dict[str, tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = {}
-        for field in fields(like):
-            column = getattr(like, field.name)
-            self._files[field.name] = nameless(), column.dtype, column.shape[1:]
+        self._files: list[tuple[BinaryIO, np.dtype[Any], tuple[int, ...]]] = [
+            (nameless(), column.dtype, column.shape[1:]) for column in columns_of(like)]
 
     def write(self, block: Samples, at: int) -> int:
         """Write a block's rows from row ``at`` on; return the row after the last."""
-        for name, (file, dtype, shape) in self._files.items():
-            data = np.ascontiguousarray(getattr(block, name), dtype).data.cast('B')
-            offset = at * dtype.itemsize * int(np.prod(shape))
-            while data:
-                done = os.pwrite(file.fileno(), data[:MOVED_BYTES], offset)
-                data, offset = data[done:], offset + done
+        for (file, dtype, shape), column in zip(self._files, columns_of(block), strict=True):
+            data = np.ascontiguousarray(column, dtype).reshape(-1).view(np.uint8).data
+            offset, done = at * dtype.itemsize * math.prod(shape), 0
+            while done < len(data):
+                done += os.pwrite(file.fileno(), data[done:done + MOVED_BYTES], offset + done)
         return at + len(block.stamp_ns)
 
     def rows(self, stop: int) -> Samples:
         """Return the rows before one, mapped."""
-        return of_columns(self._kind, {
-            name: np.frombuffer(mapped(file, 0, mmap.ACCESS_READ), dtype,
-                                stop * int(np.prod(shape))).reshape(stop, *shape)
-            for name, (file, dtype, shape) in self._files.items()})
+        return of_columns(self._kind, *(
+            np.frombuffer(mapped(file, 0, mmap.ACCESS_READ), dtype,
+                          stop * math.prod(shape)).reshape(stop, *shape)
+            for file, dtype, shape in self._files))
 
     def row(self, at: int) -> Samples:
         """Return one row, in memory."""
-        return of_columns(self._kind, {
-            name: np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
-            for name, (file, dtype, shape) in self._files.items()
-            for size in [dtype.itemsize * int(np.prod(shape))]})
+        return of_columns(self._kind, *(
+            np.frombuffer(os.pread(file.fileno(), size, at * size), dtype).reshape(1, *shape)
+            for file, dtype, shape in self._files
+            for size in [dtype.itemsize * math.prod(shape)]))
 
 
 def _size(block: Samples) -> int:
-    return sum(getattr(block, field.name).nbytes for field in fields(block))
+    return sum(column.nbytes for column in columns_of(block))

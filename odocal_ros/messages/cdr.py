@@ -8,26 +8,20 @@
 # the License.
 
 """
-Decode many serialised messages at once with numpy, without a ROS or rosbags import.
+Where the fields of a serialised message lie, without a ROS or rosbags import.
 
 Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same bytes: one message tells the layout, the others are read as columns. What has no such layout
-(big endian, unknown type, damaged) is left to the caller.
+same bytes: one message tells the layout of all of them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 import re
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Bools, Ints
-from odocal_ros.messages.raws import Raws, Rows
-
-MAX_LAYOUTS = 16   # per call; a stream with more is odd enough to be read message by message
 KINDS = {'int8': '<i1', 'uint8': '<u1', 'int16': '<i2', 'uint16': '<u2', 'int32': '<i4',
          'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': '<f4', 'float64': '<f8'}
 INDEXED = re.compile(r'(.+)\[(\d+)\]')
@@ -75,6 +69,15 @@ SCHEMAS: dict[str, tuple[str, ...]] = {
     'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Float32', 'Float64')}
 
 
+class Run(NamedTuple):
+    """Values of one kind side by side: where, of what kind, and all of them as one thing."""
+
+    place: slice
+    dtype: np.dtype[Any]
+    together: np.dtype[Any]
+    width: int
+
+
 @dataclass
 class Layout:
     """Where the fields of one message lie, and which bytes all messages like it share."""
@@ -84,6 +87,8 @@ class Layout:
     texts: dict[str, list[str]] = field(default_factory=dict)              # lists of strings
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     size: int = 4
+    told: list[bytes] = field(default_factory=list)      # what stands in the fixed places
+    _runs: dict[tuple[str, ...], list[Run] | None] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -104,19 +109,56 @@ class Layout:
             return offset + int(match[2]) * np.dtype(dtype).itemsize, dtype
         return None
 
+    def runs(self, paths: tuple[str, ...]) -> list[Run] | None:
+        """Return where values lie, those side by side as one; None where one is not there."""
+        if paths not in self._runs:
+            self._runs[paths] = _side_by_side([self.find(path) for path in paths])
+        return self._runs[paths]
+
+    def fits(self, raw: bytes) -> bool:
+        """Tell whether a message has this layout."""
+        return self.size <= len(raw) and all(
+            raw[a:b] == told for (a, b), told in zip(self.fixed, self.told, strict=True))
+
+
+_before: dict[str, Layout] = {}      # by type, the last one found: most topics have no other
+
+
+def _side_by_side(places: Sequence[tuple[int, str] | None]) -> list[Run] | None:
+    """Return places of values as runs; None where one of them is none."""
+    found: list[tuple[int, str, int]] = []
+    for place in places:
+        if place is None:
+            return None
+        offset, dtype = place
+        first, kind, count = found[-1] if found else (0, '', 0)
+        if kind == dtype and offset == first + count * np.dtype(dtype).itemsize:
+            found[-1] = first, kind, count + 1
+        else:
+            found.append((offset, dtype, 1))
+    return [Run(slice(first, first + count * np.dtype(kind).itemsize), np.dtype(kind),
+                np.dtype((np.void, count * np.dtype(kind).itemsize)), count)
+            for first, kind, count in found]
+
 
 def layout_of(msgtype: str, raw: bytes) -> Layout | None:
     """Return the layout of one message; None where it cannot be read as columns."""
     if msgtype not in SCHEMAS or raw[:2] != b'\x00\x01':    # XCDR1, little endian
         return None
+    before = _before.get(msgtype)
+    if before and before.fits(raw):
+        return before
     walk = _Walk(raw)
     layout = walk.layout
     try:
         walk.fields(SCHEMAS[msgtype], '')
     except (struct.error, ValueError):
         return None
-    # longer is common: rclpy's serialize_message leaves whatever lay behind the message
-    return layout if layout.size <= len(raw) else None
+    if layout.size > len(raw):
+        return None     # longer is common: serialize_message leaves what lay behind the message
+    layout.told = [raw[a:b] for a, b in layout.fixed]
+    _before[msgtype] = layout
+    return layout
 
 
 def frame_of(msgtype: str, raw: bytes) -> str | None:
@@ -189,65 +231,3 @@ class _Walk:
         if keep:
             self.layout.fixed.append((at, at + length))
         return self.raw[at:at + length - 1].decode() if keep and length else ''
-
-
-def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None, Rows, Raws]]:
-    """
-    Sort messages by layout.
-
-    Yields
-    ------
-    Layout, where its rows stand (numbers, or a slice: all of them) and the messages. Rows that
-    have no layout come last, with None and no messages.
-
-    """
-    raws = Raws.of(raws)
-    odd: list[Ints] = []
-    for same in raws.by_size():
-        rows, table = same, raws.take(same)
-        for _ in range(MAX_LAYOUTS):
-            layout = layout_of(msgtype, table[0])
-            alike = _alike(table, layout.fixed if layout else [(0, len(table[0]))])
-            whole = bool(alike.all())
-            if layout is None:
-                odd.append(rows[alike])
-            elif whole and len(rows) == len(raws):
-                yield layout, slice(None), raws
-            else:
-                yield layout, rows[alike], table.take(alike)
-            if whole:
-                break
-            rows, table = rows[~alike], table.take(~alike)
-        else:
-            odd.append(rows)
-    if odd:
-        yield None, np.sort(np.concatenate(odd)), Raws.of([])
-
-
-def _alike(table: Raws, fixed: Sequence[tuple[int, int]]) -> Bools:
-    """Tell which messages of one length equal the first one in the bytes that make a layout."""
-    alike = np.ones(len(table), bool)
-    for start, stop in fixed:
-        size = stop - start
-        part = table.column(start, *((f'u{size}', 1) if size in (2, 4, 8) else ('u1', size)))
-        alike &= (part == part[0]).all(axis=1)
-    return alike
-
-
-def columns(layout: Layout, table: Raws, paths: Sequence[str]) -> NDArray[Any] | None:
-    """
-    Return the values at some paths.
-
-    Returns
-    -------
-    (n, len(paths)) array of the first path's dtype; None where a path is not in the layout.
-
-    """
-    places = [place for place in map(layout.find, paths) if place]
-    if len(places) < len(paths):
-        return None
-    offset, dtype = places[0]
-    item = np.dtype(dtype).itemsize
-    if places == [(offset + i * item, dtype) for i in range(len(paths))]:
-        return table.column(offset, dtype, len(paths))
-    return np.concatenate([table.column(offset, dtype, 1) for offset, dtype in places], axis=1)

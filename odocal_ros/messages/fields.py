@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.messages import cdr
-from odocal_ros.messages.raws import Raws
+from odocal_ros.messages.raws import Table
+from odocal_ros.messages.tables import columns
 
 PART = re.compile(r'\.?([^.\[\]]+)|\[([^\]]+)\]')
 
@@ -110,10 +111,10 @@ class Column:
     width: int
     pick: Callable[[View], Sequence[str] | None]
 
-    def of_table(self, layout: cdr.Layout, table: Raws) -> NDArray[Any] | None:
+    def of_table(self, layout: cdr.Layout, table: Table) -> NDArray[Any] | None:
         """Return (n, width) values of messages of one layout, None if they are not there."""
         paths = self.pick(layout)
-        return cdr.columns(layout, table, paths) if paths else None
+        return columns(layout, table, paths) if paths else None
 
     def of_message(self, view: MessageView) -> list[Any] | None:
         """Return the same values of one message."""

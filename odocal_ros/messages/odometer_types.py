@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Ints
-from odocal_ros.data.samples import OdometerForm, OdometerSamples, Samples
+from odocal_ros.data.samples import OdometerForm, OdometerSamples, of_columns, Samples
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import Column, MessageView, parts, STAMP, stamp_ns, View
@@ -215,7 +215,7 @@ class OdometerPlan:
         stamps = stamp_ns(columns[0], columns[1]) if self.stamped else received_ns
         slots = ('odometer', 'odometer_right') if self.two else (self.slot,)
         values = columns[2:] if self.stamped else columns
-        return [(slot, OdometerSamples(stamps, received_ns, value[:, 0]))
+        return [(slot, of_columns(OdometerSamples, stamps, received_ns, value[:, 0]))
                 for slot, value in zip(slots, values, strict=True)]
 
 

@@ -7,10 +7,10 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Serialised messages side by side in one buffer: values at one place of all of them at once."""
+"""Serialised messages side by side in one buffer."""
 
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from odocal_ros.data.arrays import Bools, Ints
 
 Bytes = bytes | bytearray | memoryview
 Rows = Ints | Bools | slice
+Table = NDArray[np.uint8]
 
 
 class Raws(Sequence[bytes]):
@@ -56,23 +57,22 @@ class Raws(Sequence[bytes]):
         """Return the messages of some rows; nothing is copied."""
         return Raws(self.data, self.start[rows], self.size[rows])
 
-    def column(self, offset: int, dtype: str, count: int) -> NDArray[Any]:
-        """Return (n, count) values that lie at one place of messages that are as long."""
-        if not len(self) or not count:
-            return np.empty((len(self), count), dtype)
-        width = np.dtype(dtype).itemsize * count
-        # every place of the buffer as such a value; the rows picked are all that is touched
-        there = np.ndarray((len(self.data) - offset - width + 1,), f'V{width}', self.data, offset,
-                           (1,))
-        return there[self.start].view(dtype).reshape(-1, count)
+    def table(self, rows: Ints) -> Table:
+        """Return (n, size) bytes of messages that are as long; nobody else holds them."""
+        start = self.start if len(rows) == len(self) else self.start[rows]
+        size = int(self.size[rows[0]]) if len(rows) else 0
+        if not size:
+            return np.empty((len(rows), 0), np.uint8)
+        # every place of the buffer as such a message; the rows picked are all that is touched
+        there = np.ndarray((len(self.data) - size + 1,), f'V{size}', self.data, 0, (1,))
+        return there[start].view(np.uint8).reshape(-1, size)
 
     def packed(self) -> 'Raws':
         """Return the same messages in a buffer of their own."""
         data, start, at = [], np.empty(len(self), np.int64), 0
         for rows in self.by_size():
-            size = int(self.size[rows[0]])
-            data.append(self.take(rows).column(0, 'u1', size).tobytes())
-            start[rows] = at + np.arange(len(rows)) * size
+            data.append(self.table(rows).tobytes())
+            start[rows] = at + np.arange(len(rows)) * int(self.size[rows[0]])
             at += len(data[-1])
         return Raws(b''.join(data), start, self.size)
 

@@ -22,8 +22,9 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
-from odocal_ros.messages.decode import Deserialize, FIX, IMU, make_reader, Pairs, Reader
+from odocal_ros.messages.decode import Deserialize, make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES as ODOMETERS
+from odocal_ros.messages.sensor_types import FIX, IMU, Pairs
 from odocal_ros.offline import survey
 from odocal_ros.offline.inspection_drive import closed, look
 from odocal_ros.offline.suggest import command, left_open, likely_mapping

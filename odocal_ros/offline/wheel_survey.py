@@ -16,8 +16,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import MOST_DAYS
-from odocal_ros.messages import cdr
 from odocal_ros.messages.odometer_types import JOINTS
+from odocal_ros.messages.tables import columns, tables
 from odocal_ros.screening.glitches import beyond
 
 TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
@@ -38,7 +38,7 @@ class Values:
     def rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints) -> None:
         """Take messages; those that are not read as columns are passed over."""
         received = np.array(received_ns, np.int64)
-        for layout, rows, table in cdr.tables(self.msgtype, raws):
+        for layout, rows, table in tables(self.msgtype, raws):
             if layout is None:
                 continue
             field = next((f for f in FIELDS[self.msgtype] if layout.count(f)), '')
@@ -46,8 +46,8 @@ class Values:
                 continue
             n = layout.count(field)
             keys = tuple(layout.names[:n]) or tuple(str(k) for k in range(n))
-            values = cdr.columns(layout, table, [f'{field}[{k}]' for k in range(len(keys))])
-            stamp = cdr.columns(layout, table, ['header.stamp.sec', 'header.stamp.nanosec'])
+            values = columns(layout, table, [f'{field}[{k}]' for k in range(len(keys))])
+            stamp = columns(layout, table, ['header.stamp.sec', 'header.stamp.nanosec'])
             stamps = received[rows] if stamp is None else (
                 stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1])
             self._blocks.setdefault((field, keys), []).append((stamps, np.array(values, float)))

@@ -21,7 +21,8 @@ import ros_messages as make
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.errors import BadConfig, BadData
 from odocal_ros.messages import cdr
-from odocal_ros.messages.decode import _fix, make_reader
+from odocal_ros.messages.decode import make_reader
+from odocal_ros.messages.sensor_types import _fix
 from odocal_ros.settings.config import Config, with_settings
 
 STD = ('Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64')
@@ -379,6 +380,19 @@ def test_any_chopping_gives_the_rows_of_single_messages(which, monkeypatch, data
     with monkeypatch.context() as patch:
         patch.setattr(cdr, 'layout_of', lambda msgtype, raw: None)
         assert rows(range(len(raws) + 1)) == blocks
+
+
+def test_a_layout_is_remembered_for_messages_that_have_it():
+    """Not for one that is cut off, nor for one of other lengths; and found again after those."""
+    raws = [make.cdr(make.imu(1, frame=frame)) for frame in ('imu', 'other', 'six')]
+    first, other, again = (cdr.layout_of(make.imu(1).__msgtype__, raw) for raw in raws)
+    assert first.size == len(raws[0])
+    assert other.size == len(raws[1]) > first.size
+    assert again == first
+    for raw in raws:
+        layout = cdr.layout_of(make.imu(1).__msgtype__, raw)
+        assert cdr.layout_of(make.imu(1).__msgtype__, raw + b'more') is layout
+        assert cdr.layout_of(make.imu(1).__msgtype__, raw[:-1]) is None
 
 
 def test_layouts_do_read_columns():

@@ -1,0 +1,124 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Messages of the Imu, GNSS and heading: where the values lie in each type, and what they mean."""
+
+from collections.abc import Callable, Sequence
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    OdometerForm,
+    of_columns,
+    Samples,
+    VelocitySamples,
+)
+from odocal_ros.errors import BadData
+from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
+
+RAD_PER_DEG = math.pi / 180
+IMU = 'sensor_msgs/msg/Imu'
+FIX = 'sensor_msgs/msg/NavSatFix'
+VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
+Pairs = list[tuple[str, Samples]]
+Build = Callable[..., Samples]        # of stamps, arrivals and a slot's columns
+
+
+class SensorPlan:
+    """What to take from a stamped sensor message, and the samples it makes."""
+
+    form: OdometerForm | None = None
+    known = True         # its layout is all there is to learn of its type
+
+    def __init__(self, slot: str, columns: Sequence[Column], build: Build) -> None:
+        self.slot = slot
+        self.columns = (*STAMP, *columns)
+        self._build = build
+
+    def ready(self, view: View) -> bool:
+        """Return True: nothing is left to learn from the first message."""
+        return True
+
+    def missing(self, view: View) -> str:
+        """Say why a message holds no value, for people."""
+        return 'the fields of a message are not all there'
+
+    def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:
+        """Return (slot, block) pairs."""
+        stamps = stamp_ns(columns[0], columns[1])
+        return [(self.slot, self._build(stamps, received_ns, *columns[2:]))]
+
+
+def _imu(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats, w_i: Floats,
+         f_i: Floats, of_force: Floats) -> ImuSamples:
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        none = of_force[:, 0] == -1          # REP-145: none is sent
+    if none.any():
+        f_i[none] = np.nan
+    return of_columns(ImuSamples, stamps, received, w_i, f_i, q_ni,
+                      _yaw_variance(q_ni, of_roll, of_yaw))
+
+
+def _heading(stamps: Ints, received: Ints, q_ni: Floats, of_roll: Floats, of_yaw: Floats
+             ) -> HeadingSamples:
+    return HeadingSamples(stamps, received, q_ni, _yaw_variance(q_ni, of_roll, of_yaw))
+
+
+def _yaw_variance(q_ni: Floats, of_roll: Floats, of_yaw: Floats) -> Floats:
+    """Return covariance[8], NaN where REP-145's -1 or an all-zero quaternion say 'none'."""
+    x, y, z, w = q_ni.T
+    zero = (x == 0) & (y == 0) & (z == 0) & (w == 0)
+    return np.where(zero | (of_roll[:, 0] == -1), np.nan, of_yaw[:, 0])
+
+
+def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, known: Ints,
+         status: Ints) -> FixSamples:
+    with np.errstate(invalid='ignore'):      # a NaN that signals
+        latitude, longitude = position[:, 0] * RAD_PER_DEG, position[:, 1] * RAD_PER_DEG
+    return of_columns(FixSamples, stamps, received, latitude, longitude, position[:, 2].copy(),
+                      covariance.reshape(-1, 3, 3), known[:, 0], status[:, 0])
+
+
+def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
+              *covariance: Floats) -> VelocitySamples:
+    variance = covariance[0] if covariance else np.zeros_like(velocity_n)
+    told = (variance > 0) & (variance < 1e12)       # else unknown
+    return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
+
+
+_ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0),
+                array('orientation_covariance', 8))
+SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
+    ('imu', IMU): ((*_ORIENTATION, xyz('angular_velocity'), xyz('linear_acceleration'),
+                    array('linear_acceleration_covariance', 0)), _imu),
+    ('heading', IMU): (_ORIENTATION, _heading),
+    ('fix', FIX): ((fixed(np.float64, 'latitude', 'longitude', 'altitude'),
+                    array('position_covariance', *range(9)),
+                    fixed(np.int64, 'position_covariance_type'),
+                    fixed(np.int64, 'status.status')), _fix),
+    ('fix_velocity', VELOCITY[0]): ((xyz('twist.linear'),), _velocity),
+    ('fix_velocity', VELOCITY[1]): (
+        (xyz('twist.twist.linear'), array('twist.covariance', 0, 7, 14)), _velocity),
+}
+
+
+def sensor_plan(slot: str, msgtype: str) -> SensorPlan:
+    """Return what to take from messages of a type for a slot; BadData: it cannot serve."""
+    if (slot, msgtype) not in SENSORS:
+        types = [other for own, other in SENSORS if own == slot]
+        raise BadData(f'{slot}: messages of type {msgtype} cannot serve; give a topic of '
+                      f'{" or ".join(types)}')
+    return SensorPlan(slot, *SENSORS[slot, msgtype])
