@@ -12,11 +12,18 @@
 import os
 from pathlib import Path
 
+import numpy as np
+
+LET_GO = 2**23      # bytes
+
 
 class FileBytes:
     """The bytes of a file by place, as far as they are there when it is opened."""
 
     def __init__(self, path: Path) -> None:
+        # glibc gives a block of memory back to the system, and has all its pages made again for
+        # the next, unless it has seen a larger one let go before
+        np.empty(LET_GO, np.uint8)
         self._path = path
         self._file = path.open('rb')
         self._size = os.fstat(self._file.fileno()).st_size

@@ -89,8 +89,7 @@ def _block(places: Sequence[Place], at: int, size: int, read: Read) -> tuple[Blo
             block += read(places[first:at]) if at > first else []
             first = at
         beside = place.at + place.size + place.index_size
-        # those that are packed have to be copied to lie in one piece
-        size -= place.size if place.size >= place.unpacked else 2 * place.unpacked
+        size -= max(place.size, place.unpacked)
         end_ns, at = max(end_ns, place.end_ns), at + 1
     return block + read(places[first:at]), at
 
