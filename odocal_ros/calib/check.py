@@ -9,12 +9,12 @@
 
 """The check: dead reckoning against every fix, before and after the correction; and sanity."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from odocal_ros.calib.drive import knots_of
-from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.result import TrackCheck
 from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats
@@ -30,7 +30,7 @@ ONE_MOTION_RATIO = 0.6, 1.6
 NOISIER_WORTH = 1.25
 
 
-def stray(path: Callable[[Floats], Floats], pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
+def stray(path: Path, pin: MarkFix, fixes: tuple[Floats, Floats]) -> Floats:
     """
     Return dead-reckoned minus fixed positions, (n, 3) m.
 

@@ -9,20 +9,24 @@
 
 """Several legs of one vehicle to one result: own errors average down, shared ones do not."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, total_covariance
 from odocal_ros.calib.joint import deviate, Z95
 from odocal_ros.calib.result import Estimate, MethodResult, Source
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 
 DRAWN_ANEW = {'initial_level'}    # an accelerometer bias: one a power-up, not one a vehicle
 
 
-def combine_method(name, results, walked=None) -> MethodResult:
+def combine_method(name: str, results: Sequence[MethodResult],
+                   walked: Floats | None = None) -> MethodResult:
     """
     Combine what one method says of several legs.
 
@@ -47,7 +51,7 @@ def combine_method(name, results, walked=None) -> MethodResult:
     walked = np.zeros(len(results)) if walked is None else walked
     reasons: tuple[Reason, ...] = ()
     estimates: dict[str, Estimate] = {}
-    sources: dict[str, list] = {}
+    sources: dict[str, list[tuple[int, Floats]]] = {}
     for i, parameter in enumerate(parameters):
         told = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
         unit = results[0].estimates[parameter].unit
@@ -67,7 +71,8 @@ def combine_method(name, results, walked=None) -> MethodResult:
                         {'legs_used': len(results)} | _details(stacked, parameters, estimates))
 
 
-def newest(results, estimates):
+def newest(results: Sequence[MethodResult],
+           estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """
     Return what belongs to a leg alone (gyro bias) from the last leg that knows it.
 
@@ -81,19 +86,21 @@ def newest(results, estimates):
             for n in names if n not in none}
 
 
-def _details(sources, parameters, estimates):
+def _details(sources: Sequence[Source], parameters: Sequence[str],
+             estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     """Return budget and correlation of a combination, as a leg's result has them."""
     known = [i for i, p in enumerate(parameters) if estimates[p].value is not None]
     if not known:
         return {}
     names = [parameters[i] for i in known]
     rows = [replace(s, effects=s.effects[known]) for s in sources]
-    scale = [estimates[p].value if p.startswith('scale_factor') else 1.0 for p in names]
+    scale = [estimates[p].value or 0.0 if p.startswith('scale_factor') else 1.0 for p in names]
     return {'budget': budget_table(rows, names, scale),
             'correlation': correlations(total_covariance(rows), names)}
 
 
-def _combine(parameter, i, have, walked):
+def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Floats,
+             ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
     """Return value, own variance, shared effects by source, reasons of one parameter."""
     relative = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in have])
@@ -127,7 +134,7 @@ def _combine(parameter, i, have, walked):
     return float(mean), float(variance), shared, reasons
 
 
-def _weights(covariance):
+def _weights(covariance: Floats) -> Floats:
     """
     Return the weights, none below zero, of the mean with the least variance.
 
@@ -137,26 +144,29 @@ def _weights(covariance):
     from scipy.optimize import nnls
     root = np.linalg.cholesky(covariance / np.trace(covariance))
     weight, _ = nnls(root.T, np.linalg.solve(root, np.ones(len(root))))
-    return weight / weight.sum()
+    out: Floats = weight / weight.sum()
+    return out
 
 
-def _effect(result, name, i):
+def _effect(result: MethodResult, name: str, i: int) -> Floats:
     source = next((s for s in result.sources if s.shared and s.name == name), None)
     width = max((s.effects.shape[1] for s in result.sources if s.name == name), default=1)
     return np.zeros(width) if source is None else source.effects[i]
 
 
-def _ratio(results, estimates):
+def _ratio(results: Sequence[MethodResult],
+           estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Return the combined scale_ratio, from the first leg's K0."""
     first, scale = results[0].estimates, estimates['scale_factor']
     ratio = first['scale_ratio'].value
-    if ratio is None or scale.value is None:
+    one = first['scale_factor'].value
+    if ratio is None or one is None or scale.value is None or scale.sigma is None:
         return {'scale_ratio': Estimate(None, None, '1')}
-    nominal = first['scale_factor'].value / ratio
+    nominal = one / ratio
     return {'scale_ratio': Estimate(scale.value / nominal, scale.sigma / nominal, '1')}
 
 
-def _stacked(sources, p):
+def _stacked(sources: Mapping[str, list[tuple[int, Floats]]], p: int) -> tuple[Source, ...]:
     out = []
     for name, rows in sources.items():
         width = max(len(e) for _, e in rows)

@@ -11,8 +11,9 @@
 
 import numpy as np
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import LegConfig
@@ -78,10 +79,11 @@ def rate_over_second(t: Floats, x: Floats) -> Floats:
     if len(t) < 2:
         return np.zeros(len(t))
     low, high = np.maximum(t - 0.5, t[0]), np.minimum(t + 0.5, t[-1])
-    return (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
+    out: Floats = (np.interp(high, t, x) - np.interp(low, t, x)) / np.maximum(high - low, 1e-9)
+    return out
 
 
-def uncovered(travel, t_stop) -> tuple[Reason, ...]:
+def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     """Say where the odometer begins after the start mark or ends before the stop mark."""
     late, early = float(travel.t[0]), float(t_stop - travel.t[-1])
     # s worth saying, of a topic that comes seldom half as much again as it takes anyway
@@ -94,7 +96,8 @@ def uncovered(travel, t_stop) -> tuple[Reason, ...]:
                    'as it reaches'),)
 
 
-def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
+def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
+               t_stop: float) -> tuple[Reason, ...]:
     """Return why there is no leg where wheels or fixes show no motion, empty where both do."""
     rows = slice(max(0, np.searchsorted(t_fix, -0.5) - 3), np.searchsorted(t_fix, t_stop + 0.5))
     t_here, here = t_fix[rows], fixes_n[rows, :2]
@@ -119,7 +122,7 @@ def not_moving(travel, t_fix, fixes_n, fix_sigma, t_stop) -> tuple[Reason, ...]:
                    if wheels_move else 'the vehicle did not move'),)
 
 
-def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
+def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Reason, ...]:
     """Say where a counter stood while (k, 2) fixes at (k,) s spread by ``least`` m and more."""
     counts = np.flatnonzero(np.diff(travel.s))
     begin = travel.t[np.append(0, counts + 1)]
@@ -134,7 +137,7 @@ def _stopped(travel, t, fixes, least) -> tuple[Reason, ...]:
                    f'to {until:.0f} s, the odometer does not count'),)
 
 
-def _gone(fixes, least) -> float:
+def _gone(fixes: Floats, least: float) -> float:
     """
     Return how far (k, 2) fixes surely move from begin to end, m, 0 if by less than ``least``.
 
@@ -152,7 +155,7 @@ def _gone(fixes, least) -> float:
     return float(min(np.minimum(steps, steps[-3]).sum(), np.hypot(*(middle[-1] - middle[0]))))
 
 
-def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
+def way_and_chord(t_fix: Floats, fixes_n: Floats) -> tuple[float, float]:
     """
     Return the way driven and the distance between the ends, m, by (k, 2 or more) fixes at (k,) s.
 
@@ -167,7 +170,7 @@ def way_and_chord(t_fix, fixes_n) -> tuple[float, float]:
     return way, float(np.hypot(*(p[-1] - p[0])))
 
 
-def within_reach(t_fix, fixes_n):
+def within_reach(t_fix: Floats, fixes_n: Floats) -> Bools:
     """Tell which fixes a vehicle gets to from the one amid them, fix by fix: (k,) bool."""
     p = fixes_n[:, :2]
     steps = np.hypot(*np.diff(p, axis=0).T)
@@ -186,7 +189,7 @@ def within_reach(t_fix, fixes_n):
     return keep
 
 
-def white_noise(fixes_n) -> float:
+def white_noise(fixes_n: Floats) -> float:
     """Return the white noise of fixes, m, by the median of their second differences."""
     if len(fixes_n) < 5:
         return 2.5
@@ -194,7 +197,7 @@ def white_noise(fixes_n) -> float:
     return float(np.median(np.abs(bend)) / (NORMAL_MEDIAN * np.sqrt(6)))
 
 
-def knots_of(fixes_n, least) -> list[int]:
+def knots_of(fixes_n: Floats, least: float) -> list[int]:
     """Return fixes at least so far apart, m: indices of (k, 2 or more), from the first on."""
     knots, p = [0] if len(fixes_n) else [], fixes_n[:, :2]
     begin, ahead = 1, 64       # fixes looked at at a time: the next knot is wont to be among them

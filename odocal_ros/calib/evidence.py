@@ -10,15 +10,22 @@
 """What a person looks at to believe a leg: tracks, residuals, speed, scale by section, fixes."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.drive import rate_over_second
+from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.sections import Sections, sections
+from odocal_ros.data.arrays import Bools, Complexes, Floats, Ints
+from odocal_ros.data.leg import Leg
 from odocal_ros.data.pieces import by_row, chunks
+from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.gaps import gaps_in_rhythm, gaps_longer
 from odocal_ros.nav.rotations import yaw_from_quat
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
 
 KEPT_ROWS = 5000       # of each kind kept in a result: more than a screen has columns
 
@@ -53,7 +60,8 @@ class Evidence:
     t_fit: float = np.inf                # s: what comes after it was kept back from the fit
 
 
-def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf) -> Evidence:
+def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bools, pin: MarkFix,
+             paths: tuple[Path, Path], config: Config, t_fit: float = np.inf) -> Evidence:
     """
     Collect what the report draws of a leg.
 
@@ -112,7 +120,8 @@ def evidence(leg, inputs, track, fixes_n, kept, pin, paths, config, t_fit=np.inf
         t_fit=t_fit)
 
 
-def _gaps(inputs, span, config):
+def _gaps(inputs: Inputs, span: tuple[float, float],
+          config: Config) -> tuple[tuple[str, float, float], ...]:
     """Return where Imu or odometer pause while the vehicle moves: (which, begin, end)."""
     travel = inputs.travel
     found = [('Imu', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
@@ -122,10 +131,10 @@ def _gaps(inputs, span, config):
                  if a < span[1] and b > span[0])
 
 
-def _pinned(path, pin):
+def _pinned(path: Path, pin: MarkFix) -> Path:
     here = path(np.array(pin.t))
 
-    def at(t):
+    def at(t: Floats) -> Floats:
         out = np.empty((len(t), 3))
         for rows in chunks(len(t)):       # the sums that a path goes by are 3 x 3 a row
             out[rows] = pin.position_n + path(t[rows]) - here
@@ -133,10 +142,12 @@ def _pinned(path, pin):
     return at
 
 
-def _sent(leg, inputs, kept, span, config):
+def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
+          config: Config) -> tuple[Ints, NDArray[Any], list[str]]:
     """Return the status of the fixes kept, the times of the others, and why they are not."""
     fix, gnss = leg.fix, config.gnss
-    t = (fix.stamp_ns - leg.start_ns) * 1e-9 + (gnss.time_offset - config.imu.time_offset)
+    later = gnss.time_offset - config.imu.time_offset
+    t = np.asarray(fix.stamp_ns - leg.start_ns) * 1e-9 + later
     near = (t >= span[0]) & (t <= span[1])
     row = {when: i for i, when in enumerate(t.tolist())}
     rows = np.array([row[when] for when in inputs.t_fix[kept].tolist()], int)
@@ -149,10 +160,11 @@ def _sent(leg, inputs, kept, span, config):
         f'sigma above {gnss.max_sigma:g} m' if 0 < gnss.max_sigma < sigma[i] else
         'far off the track' if usable[i] and row[t[i]] == i else
         'stamp or position not believable' for i in out]
-    return fix.status[rows], t[out], because
+    status: Ints = fix.status[rows]
+    return status, t[out], because
 
 
-def _forward_at(t_new, t, track_n, sign):
+def _forward_at(t_new: Floats, t: Floats, track_n: Floats, sign: Floats) -> Complexes:
     """Return the forward direction as complex numbers; at rest that of before: (k,)."""
     if not len(t):
         return np.ones(len(t_new), complex)
@@ -163,16 +175,17 @@ def _forward_at(t_new, t, track_n, sign):
         return np.ones(len(t_new), complex)
     before = np.searchsorted(moving, np.arange(len(t)), side='right') - 1
     angle = np.unwrap(np.angle(z[moving[np.maximum(before, 0)]]))
-    return np.exp(1j * np.interp(t_new, t, angle))
+    out: Complexes = np.exp(1j * np.interp(t_new, t, angle))
+    return out
 
 
-def _split(off_n, forward):
+def _split(off_n: Floats, forward: Complexes) -> Floats:
     """Return horizontal offsets, (k, 3) in n, along and to the left of forward: (k, 2)."""
     z = (off_n[:, 0] + 1j * off_n[:, 1]) * np.conj(forward)
     return np.stack([z.real, z.imag], -1)
 
 
-def _few(n):
+def _few(n: int) -> Ints:
     """Return at most KEPT_ROWS row numbers, first and last included."""
     return np.unique(np.linspace(0, n - 1, min(n, KEPT_ROWS)).round().astype(int)) if n else \
         np.empty(0, int)

@@ -15,6 +15,7 @@ ln K walks at random from leg to leg; what is believed beforehand counts once. E
 docs/method.md, several legs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,7 +50,7 @@ class Joint:
     sigma: Floats
     used: Floats
     chi2: float
-    freedom: int
+    freedom: float
     deviation: Floats
     carried: Border
     spread: dict[str, float] = field(default_factory=dict)
@@ -57,7 +58,9 @@ class Joint:
     bent: Floats = field(default_factory=lambda: np.zeros(0))
 
 
-def joint(borders, steps, drifting='scale_factor', angles=(), curved=()) -> Joint:
+def joint(borders: Sequence[Border], steps: Sequence[float] | Floats,
+          drifting: str = 'scale_factor', angles: Sequence[str] = (),
+          curved: Sequence[str] = ()) -> Joint:
     """
     Combine legs of one vehicle.
 
@@ -94,13 +97,14 @@ def joint(borders, steps, drifting='scale_factor', angles=(), curved=()) -> Join
                  factor, bent)
 
 
-def deviate(chi2, freedom):
+def deviate(chi2: float, freedom: float) -> float:
     """Return the normal deviate of a chi-square (Wilson and Hilferty 1931)."""
     a = 2 / (9 * freedom)
-    return ((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - a)) / np.sqrt(a)
+    out: float = ((max(chi2, 0.0) / freedom)**(1 / 3) - (1 - a)) / np.sqrt(a)
+    return out
 
 
-def _disputed(legs) -> dict[str, float]:
+def _disputed(legs: LinkedLegs) -> dict[str, float]:
     """Return the constants in which legs differ for certain, and by what sigma."""
     spread: dict[str, float] = {}
     while len(spread) < 3:      # where legs differ in more, all their sigmas are in doubt
@@ -117,7 +121,7 @@ def _disputed(legs) -> dict[str, float]:
     return spread
 
 
-def _spread(legs, spread, name, target) -> float:
+def _spread(legs: LinkedLegs, spread: dict[str, float], name: str, target: float) -> float:
     """
     Return the sigma of a constant between legs at which they differ in it as much as they may.
 
@@ -133,10 +137,11 @@ def _spread(legs, spread, name, target) -> float:
         middle = float(np.sqrt(low * high))
         chi2, _ = legs.disagreement(spread | {name: middle})
         low, high = (middle, high) if chi2 > target else (low, middle)
-    return high
+    out: float = high
+    return out
 
 
-def _bend(legs, curved):
+def _bend(legs: LinkedLegs, curved: Sequence[str]) -> Floats:
     """Give each leg an error of its own for the way from where it was linearised; (J,) of it."""
     first, at = legs.borders, [legs.names.index(n) for n in curved]
     bent = np.zeros(len(first))

@@ -9,11 +9,13 @@
 
 """The rows of several legs as one least squares: constants they share, one that walks, priors."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.calib.border import Border
+from odocal_ros.data.arrays import Floats, Ints
 
 # relative, rad: unit of a constant without a prior, ln K and angles. Judgement: a leg's equations
 # are linear as far, the square of it being 0.1 %
@@ -23,7 +25,8 @@ STEP_UNIT = 0.05
 class LinkedLegs:
     """Borders on common names, the constants' prior, and the walk of one of them."""
 
-    def __init__(self, borders, drifting: str, steps, angles=()):
+    def __init__(self, borders: Sequence[Border], drifting: str,
+                 steps: Sequence[float] | Floats, angles: Sequence[str] = ()) -> None:
         """Take legs by time; ``steps`` (J - 1,): sigmas of ``drifting`` between them."""
         self.names = tuple(dict.fromkeys(n for b in borders for n in b.names))
         self.take([_on(b, self.names) for b in borders])
@@ -40,24 +43,26 @@ class LinkedLegs:
         # 0.1 ppm of ln K: no vehicle keeps it, and rows of less would swamp all others by rounding
         self.steps = np.maximum(steps, 1e-7)
 
-    def take(self, borders):
+    def take(self, borders: list[Border]) -> None:
         """Take legs in place of those there, on the names of all."""
-        self.borders, self._told = borders, None
+        self.borders = borders
+        self._told: list[Border] | None = None
 
-    def told(self):
+    def told(self) -> list[Border]:
         """Return of each leg what it tells at least as well as it was believed."""
         if self._told is None:      # asked for each constant anew
             self._told = [b.told(self.unit) for b in self.borders]
         return self._told
 
-    def columns(self, j):
+    def columns(self, j: int) -> Ints:
         """Return where the constants of leg j stand among the unknowns: z, then k by leg."""
         m = len(self.names)
         where = np.arange(m)
         where[self.drifting] = m + j
         return where
 
-    def system(self, spread=None, borders=None):
+    def system(self, spread: dict[str, float] | None = None,
+               borders: Sequence[Border] | None = None) -> tuple[Floats, Floats]:
         """Return the rows of all legs and of the walk, and what they should be."""
         m, J = len(self.names), len(self.borders)
         A, b = [], []
@@ -67,18 +72,18 @@ class LinkedLegs:
             A[-1][:, self.columns(j)] = R
             b.append(y)
         walk = np.zeros((J - 1, m + J))
-        j = np.arange(J - 1)
-        walk[j, m + j], walk[j, m + j + 1] = -1 / self.steps, 1 / self.steps
+        k = np.arange(J - 1)
+        walk[k, m + k], walk[k, m + k + 1] = -1 / self.steps, 1 / self.steps
         used = [i for i in range(m + J) if i != self.drifting]
         scale = np.concatenate([self.unit, np.full(J, self.unit[self.drifting])])[used]
         return np.concatenate([*A, walk])[:, used] * scale, np.concatenate([*b, np.zeros(J - 1)])
 
-    def place(self, j):
+    def place(self, j: int) -> Ints:
         """Return where the constants of leg j stand among the columns of ``system``."""
         where = self.columns(j)
         return where - (where > self.drifting)
 
-    def solve(self, spread=None):
+    def solve(self, spread: dict[str, float] | None = None) -> tuple[Floats, Floats]:
         """Return the unknowns and their covariance, of leg j at ``place``."""
         A, b = self.system(spread)
         prior, centre = self._beliefs(A.shape[1])
@@ -90,14 +95,14 @@ class LinkedLegs:
             scale[self.place(j)] = self.unit
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
-    def _beliefs(self, columns, but=()):
+    def _beliefs(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
         """Return what is believed of constants, but for some, as rows and what they should be."""
         held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
         prior = np.zeros((len(held), columns))
         prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
         return prior, self.centre[held] / self.used[held]
 
-    def carried(self, value, spread=None) -> Border:
+    def carried(self, value: Floats, spread: dict[str, float] | None = None) -> Border:
         """Return what all legs tell, of the last leg's constants, where those are ``value``."""
         A, b = self.system(spread)
         rows, b = _left(A, b, self.place(len(self.borders) - 1))
@@ -106,7 +111,7 @@ class LinkedLegs:
         return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
                       self.centre, self.sigma, self.used, self.usual * every)
 
-    def evidence(self, at):
+    def evidence(self, at: Ints) -> tuple[Floats, Floats]:
         """
         Return what legs tell of some constants, what is believed of the others taken in.
 
@@ -122,13 +127,13 @@ class LinkedLegs:
         rows = rows / self.unit[at]
         return rows.T @ rows, rows.T @ b
 
-    def believing(self, at, sigmas) -> list[Border]:
+    def believing(self, at: Ints, sigmas: Floats) -> list[Border]:
         """Return the borders with what is to be believed of some constants."""
         first, used = self.sigma.copy(), self.used.copy()
         first[at] = used[at] = sigmas
         return [replace(b, sigma=first, used=used) for b in self.borders]
 
-    def disagreement(self, spread=None):
+    def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """
         Return the legs' cost when they are one vehicle's, and what it should be.
 
@@ -144,7 +149,7 @@ class LinkedLegs:
         rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
         return float(rest @ rest), len(A) - float((U[of_legs]**2).sum())
 
-    def deviations(self, spread=None):
+    def deviations(self, spread: dict[str, float] | None = None) -> Floats:
         """
         Return by how much each leg's constants differ from those by the others, in sigmas: (J, m).
 
@@ -164,15 +169,15 @@ class LinkedLegs:
         return out
 
 
-def _left(A, b, keep):
+def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
     """Return rows of some unknowns, the others taken out, and what they should be."""
     gone = np.setdiff1d(np.arange(A.shape[1]), keep)
     # orthogonal rows of which only the first hold what is eliminated
-    R = np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r')[len(gone):]
-    return R[:, len(gone):-1], R[:, -1]
+    R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r'))
+    return R[len(gone):, len(gone):-1], R[len(gone):, -1]
 
 
-def _on(border: Border, names) -> Border:
+def _on(border: Border, names: tuple[str, ...]) -> Border:
     """Return a border on more names, of which it says and believes nothing."""
     if border.names == names:
         return border
@@ -181,7 +186,7 @@ def _on(border: Border, names) -> Border:
     D = np.zeros((m, m))
     D[np.ix_(at, at)] = border.information
 
-    def on(values, rest):
+    def on(values: Floats, rest: float) -> Floats:
         out = np.full(m, rest)
         out[at] = values
         return out

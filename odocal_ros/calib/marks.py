@@ -21,9 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS, RAYLEIGH_MEDIAN
 
+Path = Callable[[Floats], Floats]     # t (n,) s to an antenna's path, (n, 3) m, or t () to (3,)
 # s, least half-window of fixes about a mark in motion. Judgement: two seconds of fixes, over which
 # dead reckoning errs by less than any of them
 MARK_WINDOW = 1.0
@@ -51,7 +52,7 @@ class MarkFix:
     height_known: bool = True
     surveyed: bool = False
 
-    def at_least(self, variance, up_ratio) -> 'MarkFix':
+    def at_least(self, variance: float, up_ratio: float) -> 'MarkFix':
         """Return the mark with no less than a level variance, m^2, and so many times it up."""
         if self.surveyed:
             return self
@@ -60,7 +61,8 @@ class MarkFix:
         return replace(self, covariance_n=self.covariance_n + more)
 
 
-def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
+def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
+             correlation_time: float = np.nan) -> tuple[Floats, Floats, int, int]:
     """
     Average fixes of one place.
 
@@ -90,17 +92,19 @@ def mean_fix(t, position_n, covariance_n, correlation_time=np.nan):
     return mean, whole * share, int(keep.sum()), int((~keep).sum())
 
 
-def _near_middle(position_n, covariance_n):
+def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
     """Tell which fixes are within five robust sigmas of the median, in the level and in height."""
     off = np.abs(position_n - np.median(position_n, axis=0))
     level, up = np.hypot(off[:, 0], off[:, 1]), off[:, 2]
     stated = np.median(np.diagonal(covariance_n, axis1=1, axis2=2), axis=0)
     spread = max(np.median(level) / RAYLEIGH_MEDIAN, 0.2 * np.sqrt((stated[0] + stated[1]) / 2))
     spread_up = max(np.median(up) / NORMAL_MEDIAN, 0.2 * np.sqrt(stated[2]))
-    return (level <= OUTLIER_SIGMAS * spread) & (up <= OUTLIER_SIGMAS * spread_up)
+    out: Bools = (level <= OUTLIER_SIGMAS * spread) & (up <= OUTLIER_SIGMAS * spread_up)
+    return out
 
 
-def _share(t, residual, whole, weight, correlation_time):
+def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
+           correlation_time: float) -> float:
     """Return which part of a single fix's variance is left in the mean."""
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
@@ -120,10 +124,11 @@ def _share(t, residual, whole, weight, correlation_time):
         return white * (scatter if scatter > 1 + slack else 1.0)
     fast = min(step, 1.0)
     slow = max(1.0, scatter) - fast
-    return fast * white + slow * _left(t, weight, _correlation_time(t, z, fast, slow))
+    out: float = fast * white + slow * _left(t, weight, _correlation_time(t, z, fast, slow))
+    return out
 
 
-def _left(t, weight, tau):
+def _left(t: Floats, weight: Floats, tau: float) -> float:
     """Return the variance share of a mean of first-order Gauss-Markov errors of time tau, s."""
     if tau == np.inf:
         return 1.0
@@ -133,7 +138,7 @@ def _left(t, weight, tau):
     return float(max(w @ alike @ w, weight @ weight))
 
 
-def _correlation_time(t, z, fast, slow):
+def _correlation_time(t: Floats, z: Floats, fast: float, slow: float) -> float:
     """Return how fast the slow part moves, from the structure function at a quarter window."""
     lag = max(1, len(t) // 4)
     grown = ((z[lag:] - z[:-lag])**2).mean() / 2 - fast

@@ -15,7 +15,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 
-def lag_reasons(square, sigma) -> tuple[Reason, ...]:
+def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     """Return FIXES_SMOOTHED, where so; of the square of its time constant and sigma, s^2."""
     worth = 0.1     # s: a fix at 10 Hz is as old anyway
     if square <= max(REMARK_SIGMAS * sigma, worth**2):

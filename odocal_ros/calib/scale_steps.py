@@ -9,11 +9,14 @@
 
 """Where, between legs of a vehicle, the scale changed by more than a walk: new tyres, a load."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
+from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 FREE_STEP = 1.0     # 1 sigma of ln K where it changes for good: any tyre, gear or counter
@@ -28,7 +31,8 @@ class ScaleStep:
     sigmas: float
 
 
-def scale_steps(borders, steps, drifting: str, angles=()) -> list[ScaleStep]:
+def scale_steps(borders: Sequence[Border], steps: Sequence[float] | Floats, drifting: str,
+                angles: Sequence[str] = ()) -> list[ScaleStep]:
     """
     Hold each leg's scale against what those before foretell.
 

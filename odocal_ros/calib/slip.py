@@ -25,6 +25,7 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.integral import integral_at
+from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import NORMAL_MEDIAN
 
@@ -37,7 +38,7 @@ SPIN_TURN = 0.1      # rad in a window: in more of a turn the level's error is a
 PIN_COUNTS = 8.0
 
 
-def rounding(travel) -> float:
+def rounding(travel: Travel) -> float:
     """Return the size of a count, scale units, or that of one as coarse as steps of a speed."""
     coarse = travel.coarse
     # speeds at both ends of a window, and within it, err by up to that
@@ -85,15 +86,17 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     return _events(grid[PIN_STEPS:-span - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 
-def acceleration(grid, t_imu, f_b, track, forward, latitude):
+def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
+                 latitude: float) -> Floats:
     """Return the mean acceleration along the forward axis from each grid time to the next."""
     along = by_row(lambda f_b: f_b @ forward, f_b)
     force = np.diff(integral_at(grid, t_imu, along)) / SPIN_GRID
     rise = np.einsum('ni,i->n', track.C_nb_at((grid[:-1] + grid[1:]) / 2)[:, 2], forward)
-    return force - gravity(latitude, 0.0) * rise
+    out: Floats = force - gravity(latitude, 0.0) * rise
+    return out
 
 
-def excess_way(span, a, way):
+def excess_way(span: int, a: Floats, way: Floats) -> Floats:
     """
     Return the odometer's way over each window less that by acceleration: (m,) m.
 
@@ -105,10 +108,12 @@ def excess_way(span, a, way):
     ahead = way - x                 # its slope is what the speed by acceleration lacks
     lacks = (ahead[2 * PIN_STEPS:] - ahead[:-2 * PIN_STEPS]) / (2 * PIN_STEPS * SPIN_GRID)
     ahead = ahead[PIN_STEPS:-PIN_STEPS]
-    return ahead[span:] - ahead[:-span] - (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID
+    lacked = (lacks[:-span] + lacks[span:]) / 2 * span * SPIN_GRID
+    excess: Floats = ahead[span:] - ahead[:-span] - lacked
+    return excess
 
 
-def _events(middle, excess, limit):
+def _events(middle: Floats, excess: Floats, limit: float) -> tuple[Floats, Floats]:
     """
     Return time and size of each event.
 
@@ -122,13 +127,13 @@ def _events(middle, excess, limit):
     return middle[k], excess[k]
 
 
-def slip_source(track, f, gradient, t, size) -> Source:
+def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floats) -> Source:
     """Return slips as a source of error: one for all of them, since wheels spin one way."""
     along_n = track.C_nb_at(t) @ f / np.linalg.norm(f) * np.abs(size)[:, None]
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 
 
-def slip_reason(t, size) -> tuple[Reason, ...]:
+def slip_reason(t: Floats, size: Floats) -> tuple[Reason, ...]:
     """Return WHEEL_SLIP with what was seen, empty where nothing was."""
     if not len(t):
         return ()

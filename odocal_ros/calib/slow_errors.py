@@ -32,7 +32,8 @@ def window_means(t: Floats, *columns: Floats) -> tuple[Ints, Ints, list[Floats]]
     return count[full], full, [np.bincount(window, x)[full] / count[full] for x in columns]
 
 
-def slow_variance(t, along, way, variance, drift):
+def slow_variance(t: Floats, along: Floats, way: Floats, variance: Floats,
+                  drift: float) -> tuple[float, float]:
     """
     Return the variance of fix errors averaged over SLOW_WINDOW, m^2, and how long they last, s.
 
@@ -68,7 +69,7 @@ def slow_variance(t, along, way, variance, drift):
     return float(seen - white), _lasting(alike)
 
 
-def _lasting(alike):
+def _lasting(alike: float) -> float:
     """Return the time constant, s, that makes neighbouring means of SLOW_WINDOW so alike."""
     times = np.geomspace(2.0, 2000.0, 100)      # s, that such a window can tell
     x = SLOW_WINDOW / times
@@ -76,14 +77,15 @@ def _lasting(alike):
     return float(np.interp(alike, correlation, times))
 
 
-def slow_share(seconds, tau):
+def slow_share(seconds: float, tau: float) -> float:
     """Return the variance of a mean of slow errors over a time, against that over SLOW_WINDOW."""
     share = [2 * (x - 1 + np.exp(-x)) / x**2 if x > 1e-4 else 1.0
              for x in (seconds / tau, SLOW_WINDOW / tau)]       # of a Gauss-Markov process
     return float(share[0] / share[1])
 
 
-def no_better(mark: MarkFix, slow, tau, span, stated, up_ratio) -> MarkFix:
+def no_better(mark: MarkFix, slow: float, tau: float, span: tuple[float, float] | None,
+              stated: float, up_ratio: float) -> MarkFix:
     """
     Return a mark no better than the slow part of the fix errors allows.
 
@@ -137,7 +139,7 @@ def marks_no_better(marks: tuple[MarkFix, MarkFix], spans: Floats, t: Floats, wa
     along = chord_n[:2] / np.hypot(*chord_n[:2])
     stated = np.einsum('nij,i,j->n', covariance_n[:, :2, :2], along, along)
     slow, tau = slow_variance(t, residual[:, :2] @ along, way_n[:, :2] @ along, stated,
-                              np.linalg.norm(along @ drift_n[:2]))
+                              float(np.linalg.norm(along @ drift_n[:2])))
     up_ratio = np.median(covariance_n[:, 2, 2] / stated)
     start, end = (no_better(mark, slow, tau, standing_at(mark.t, spans), np.median(stated),
                             up_ratio) for mark in marks)

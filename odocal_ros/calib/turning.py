@@ -13,6 +13,7 @@ import numpy as np
 
 from odocal_ros.calib.check import ONE_MOTION_RATIO
 from odocal_ros.calib.drive import knots_of
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.integral import twice_integral_at
 from odocal_ros.reasons import Code, Reason
@@ -22,7 +23,8 @@ from odocal_ros.reasons import Code, Reason
 SAME_TURNS, SLOPE_SIGMAS = 0.9, 8.0
 
 
-def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
+def turn_ratio(t_imu: Floats, w_up: Floats, t_fix: Floats, fixes_n: Floats,
+               sigma: float) -> float | None:
     """
     Return turns by the gyro over turns of the course by fixes: 1 if units and sign are right.
 
@@ -58,7 +60,7 @@ def turn_ratio(t_imu, w_up, t_fix, fixes_n, sigma) -> float | None:
     return 1 / slope if alike > SAME_TURNS**2 and certain else None
 
 
-def gyro_reasons(ratio, gyro_scale) -> tuple[Reason, ...]:
+def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     """Return GYRO_SIGN or IMU_UNITS where such a ratio, with such an imu.gyro_scale, tells it."""
     if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()

@@ -17,6 +17,7 @@ between the reference positions, M f = c gives f = K forward_b, and so scale, ya
 once. The plane and the geodesic of the source are the cross-check.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +42,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
 from odocal_ros.nav.projection import geodesic_chord, plane_chord
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 # rad, prior sigma of the pitch where heights say nothing: physical, what holders and loads do
 PITCH_PRIOR = 0.05
@@ -69,7 +71,7 @@ class Chord:
         return self.track.at(self.end.t) - self.track.at(self.start.t)
 
 
-def solve(chord: Chord, up_scale=1.0):
+def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
     """
     Solve M f = c for f = K forward_b.
 
@@ -90,7 +92,7 @@ def solve(chord: Chord, up_scale=1.0):
                           and up_scale * sigma < PITCH_PRIOR * np.hypot(*antenna[:2]))
     f = np.array([1.0, 0.0, 0.0])
     for _ in range(4):      # the lever arm turns with the mounting angles: converges at once
-        yaw, pitch = mounting_from_forward(f / np.linalg.norm(f))
+        yaw, pitch = map(float, mounting_from_forward(f / np.linalg.norm(f)))
         c = antenna - turn @ _C_bv(yaw, pitch) @ chord.lever_b
         if vertical_known:
             f = np.linalg.solve(M, c)
@@ -101,14 +103,14 @@ def solve(chord: Chord, up_scale=1.0):
     return f, vertical_known
 
 
-def _C_bv(yaw, pitch):
+def _C_bv(yaw: float, pitch: float) -> Floats:
     """Return the rotation that takes v to b for mounting angles, roll 0."""
     x = forward_b(yaw, pitch)
     y = np.array([np.cos(pitch) * np.sin(yaw), np.cos(yaw), np.sin(pitch) * np.sin(yaw)])
     return np.stack([x, y, np.cross(x, y)], -1)
 
 
-def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
+def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     """Return why the leg's chord cannot carry the method, empty if it can."""
     between = (chord.track.t >= chord.start.t) & (chord.track.t <= chord.end.t)
     path = np.abs(np.diff(chord.track.s[between])).sum() * scale_guess
@@ -123,7 +125,7 @@ def refusal(chord: Chord, scale_guess) -> tuple[Reason, ...]:
     return ()
 
 
-def unsolved(reasons, scale_unit) -> MethodResult:
+def unsolved(reasons: Iterable[Reason], scale_unit: str) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
@@ -132,7 +134,8 @@ def unsolved(reasons, scale_unit) -> MethodResult:
                         PARAMETERS)
 
 
-def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> MethodResult:
+def fit(chord: Chord, nominal_scale: float, scale_unit: str, quantum: float, fix_scale: Floats,
+        config: Config) -> MethodResult:
     """
     Return scale, yaw and pitch of one leg with their sigmas and the error budget.
 
@@ -170,17 +173,15 @@ def fit(chord: Chord, nominal_scale, scale_unit, quantum, fix_scale, config) -> 
         'pitch_mounting_angle': Estimate(pitch, float(sigma[2]), 'rad') if vertical_known
         else Estimate(None, None, 'rad'),
         **_gyro_bias(chord.alignment)}
-    details = {'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
-               'correlation': correlations(covariance, PARAMETERS),
-               'cross_check': _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0
-                                          else K, config),
-               'heading_source': chord.alignment.heading_source}
-    reasons += _planes_agree(details['cross_check'], K, sigma[0])
-    return MethodResult('two_point', reasons, estimates, PARAMETERS, sources,
-                        details | {'f': f})
+    check = _cross_check(chord, f, nominal_scale if 0.5 < nominal_scale / K < 2.0 else K, config)
+    reasons += _planes_agree(check, K, sigma[0])
+    return MethodResult('two_point', reasons, estimates, PARAMETERS, sources, {
+        'budget': budget_table(sources, PARAMETERS, (K, 1.0, 1.0)),
+        'correlation': correlations(covariance, PARAMETERS), 'cross_check': check,
+        'heading_source': chord.alignment.heading_source, 'f': f})
 
 
-def _gyro_bias(alignment):
+def _gyro_bias(alignment: Alignment) -> dict[str, Estimate]:
     """Return the gyro bias in b as estimates, not determined without a standstill."""
     known = alignment.standstill is not None
     return {f'gyro_bias_{axis}': Estimate(float(bias), float(sigma), 'rad/s') if known
@@ -189,7 +190,8 @@ def _gyro_bias(alignment):
                                          strict=True)}
 
 
-def _sources(chord, f, vertical_known, quantum, fix_scale, config):
+def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_scale: Floats,
+             config: Config) -> tuple[Source, ...]:
     track = chord.track
     # the gyros err from the alignment on; but a fixed heading holds at the mark itself
     first = chord.start.t if chord.alignment.heading_source == 'fixed' else chord.alignment.t
@@ -199,7 +201,8 @@ def _sources(chord, f, vertical_known, quantum, fix_scale, config):
     start, end, M = chord.start, chord.end, chord.M
     if not vertical_known:       # the prior in the pitch stands in for the heights
         fix_scale = fix_scale * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
-        start, end = _blind_height(start), _blind_height(end, PITCH_PRIOR * np.linalg.norm(M @ f))
+        rise = PITCH_PRIOR * float(np.linalg.norm(M @ f))
+        start, end = _blind_height(start), _blind_height(end, rise)
     K = float(np.linalg.norm(f))
     return budget(f, M, start, end, t, D, track.q_nb[keep], chord.alignment,
                   quantum=quantum * K, fix_scale=fix_scale, time_sigma=config.gnss.time_sigma,
@@ -219,7 +222,7 @@ def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats
     return by_row(lambda P: (P - start) @ f, track.P[rows])
 
 
-def _doubt(chord, f):
+def _doubt(chord: Chord, f: Floats) -> tuple[Source, ...]:
     """Return the sources of travel lost in gaps and resets, and of slip; empty where none."""
     gradient = parameter_gradient(f) @ np.linalg.inv(chord.M)
     sources: tuple[Source, ...] = ()
@@ -233,7 +236,7 @@ def _doubt(chord, f):
     return sources
 
 
-def _blind_height(mark, sigma=0.0):
+def _blind_height(mark: MarkFix, sigma: float = 0.0) -> MarkFix:
     """Return the mark with its height replaced by a prior of sigma, m."""
     covariance = mark.covariance_n.copy()
     covariance[2, :] = covariance[:, 2] = 0.0
@@ -241,7 +244,8 @@ def _blind_height(mark, sigma=0.0):
     return replace(mark, covariance_n=covariance)
 
 
-def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
+def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple[Source, ...],
+                  vertical_known: bool, config: Config) -> tuple[Reason, ...]:
     asked = config.verdict.max_yaw_sigma
     by_heading = next(s for s in sources if s.name == 'initial_heading')
     share = float(np.linalg.norm(by_heading.effects[1]))
@@ -269,7 +273,8 @@ def _judge_angles(alignment, yaw, pitch, sources, vertical_known, config):
     return reasons
 
 
-def _cross_check(chord, f, nominal_scale, config):
+def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
+                 config: Config) -> dict[str, dict[str, float]]:
     """
     Return K and yaw by eq. (6)-(10) in the plane and by the geodesic, S1 / S2 and bearings.
 
@@ -277,7 +282,7 @@ def _cross_check(chord, f, nominal_scale, config):
     """
     from odocal_ros.nav.projection import plane_for
     K = np.linalg.norm(f)
-    yaw, pitch = mounting_from_forward(f / K)
+    yaw, pitch = map(float, mounting_from_forward(f / K))
     turn = chord.track.C_nb_at(chord.end.t) - chord.track.C_nb_at(chord.start.t)
     start_n = chord.start.position_n
     end_n = chord.end.position_n - turn @ _C_bv(yaw, pitch) @ chord.lever_b
@@ -293,7 +298,8 @@ def _cross_check(chord, f, nominal_scale, config):
     return results
 
 
-def _planes_agree(check, K, sigma_relative):
+def _planes_agree(check: dict[str, dict[str, float]], K: float,
+                  sigma_relative: float) -> tuple[Reason, ...]:
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
     # relative: a plane about the leg keeps ratios of chords far better
     if worst > 3e-5 + 0.2 * sigma_relative:

@@ -12,12 +12,15 @@
 import numpy as np
 
 from odocal_ros.calib.border import Border
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.priors import PriorRows
 from odocal_ros.calib.smoother.problem import imperfect_sigmas
 from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT
+from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.grades import Grade
 
 
-def border_of(fit, configured, grade) -> Border:
+def border_of(fit: Fit, configured: Floats, grade: Grade) -> Border:
     """
     Return the border of a fit, at its last linearisation.
 

@@ -18,7 +18,7 @@ An hour has thousands of blocks: the equations, their elimination and the covari
 after the other in the same memory, which lies in files for hours.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -26,6 +26,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.mapped import let_go, room
 from odocal_ros.errors import OdocalError
 
@@ -46,7 +47,7 @@ class Normal:
     corner : (m, m).   g, g_border : (N, n), (m,).
     """
 
-    def __init__(self, N, n, m):
+    def __init__(self, N: int, n: int, m: int) -> None:
         self.diagonal = room(N, n, n)
         self.wide = room(N, n, n + m + 1)           # what elimination carries, side by side
         self.beside = self.wide[:-1, :, :n]
@@ -93,7 +94,7 @@ class Solved:
             z[n:, :n] = across[:, n:].T
         return Neighbours(own, wide[:, :, :n + m], corner, self._scale, self._scale_border)
 
-    def forget(self):
+    def forget(self) -> None:
         """Let go of what the covariances are made from."""
         self._chain = None
 
@@ -117,17 +118,18 @@ class Neighbours:
 
     def __getitem__(self, k: int) -> Floats:
         """Return the covariance of one interval: (2n + m, 2n + m)."""
-        return self.of(np.array([k % len(self)]))[0]
+        out: Floats = self.of(np.array([k % len(self)]))[0]
+        return out
 
-    def of(self, rows) -> Floats:
+    def of(self, rows: Ints) -> Floats:
         """Return the covariances of the intervals of an index array: (r, 2n + m, 2n + m)."""
         return self._made(rows) if len(self) > SHORT_LEG else self._whole[rows]
 
     @cached_property
-    def _whole(self):
+    def _whole(self) -> Floats:
         return self._made(np.arange(len(self)))
 
-    def _made(self, rows):
+    def _made(self, rows: Ints) -> Floats:
         n, size = self._own.shape[1], self._across.shape[2] + self._own.shape[1]
         out = np.empty((len(rows), size, size))
         across, after = self._across[rows], self._across[rows + 1][:, :, n:]
@@ -150,10 +152,10 @@ class Neighbours:
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
         """Yield all of them, some intervals at a time."""
         for rows in blocks(len(self)):
-            at = np.arange(rows.start, rows.stop) if len(self) > SHORT_LEG else rows
-            yield rows, self.of(at)
+            at = np.arange(rows.start, rows.stop)
+            yield rows, self._made(at) if len(self) > SHORT_LEG else self._whole[rows]
 
-    def entries(self, i, j) -> Floats:
+    def entries(self, i: Sequence[int] | Ints, j: Sequence[int] | Ints) -> Floats:
         """Return the entries of index arrays i, j of each interval: (N - 1, len(i))."""
         out = np.empty((len(i), len(self)))
         for rows, block in self.blocks():

@@ -13,9 +13,9 @@ The least squares of a leg at one state: the parts, their normal equations, cost
 A sensor, or a prior, that is to be heard is one more class here (``part.Part``).
 """
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from odocal_ros.calib.smoother.chain import Normal
+from odocal_ros.calib.smoother.chain import Neighbours, Normal, Solved
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.heading import HeadingRows
 from odocal_ros.calib.smoother.motion_rows import MotionRows
@@ -25,9 +25,13 @@ from odocal_ros.calib.smoother.priors import PriorRows
 from odocal_ros.calib.smoother.rests import Rests
 from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.state import BARE, M, WITH_SLOW
+from odocal_ros.calib.smoother.state import BARE, M, Priors, State, WITH_SLOW
 from odocal_ros.calib.smoother.travel_error import TravelError
 from odocal_ros.calib.smoother.velocity import VelocityRows
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem, Sums
 
 SomePart = TypeVar('SomePart', bound=Part)
 PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
@@ -37,7 +41,9 @@ PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, S
 class Equations:
     """The parts at one linearisation, for any levels."""
 
-    def __init__(self, problem, state, sums, priors=None, spread=None, fitted=False):
+    def __init__(self, problem: 'Problem', state: State, sums: 'Sums',
+                 priors: Priors | None = None, spread: Floats | None = None,
+                 fitted: bool = False) -> None:
         self.state = state
         here = Here(state, *sums.near(state), priors or problem.priors, spread, fitted)
         self.parts = {kind.name: kind(problem, here) for kind in PARTS if kind.there(problem)}
@@ -55,7 +61,7 @@ class Weighted:
     are those of ``Solved``.
     """
 
-    def __init__(self, equations: Equations, levels: Levels):
+    def __init__(self, equations: Equations, levels: Levels) -> None:
         self.state, self.levels = equations.state, levels
         self.n = WITH_SLOW if levels.correlation_time else BARE
         self.parts = {name: part.weighed(levels) for name, part in equations.parts.items()
@@ -71,7 +77,7 @@ class Weighted:
             part.add(out)
         return out
 
-    def after(self, solved) -> 'Weighted':
+    def after(self, solved: Solved) -> 'Weighted':
         """Bring the residuals to where the step leads, were all linear; returns itself."""
         step, constants = solved.step, solved.step_border
         reached = self.state.moved(step, constants)
@@ -79,7 +85,7 @@ class Weighted:
             part.after(step, constants, reached)
         return self
 
-    def forget(self):
+    def forget(self) -> None:
         """Let go of what can be made again."""
         for part in self.parts.values():
             part.forget()
@@ -92,7 +98,7 @@ class Weighted:
         """Return the log determinant of the covariance of all rows that the levels change."""
         return float(sum(part.log_R for part in self.parts.values()))
 
-    def components(self, neighbours) -> dict[str, tuple[float, float]]:
+    def components(self, neighbours: Neighbours) -> dict[str, tuple[float, float]]:
         """
         Return for each variance component its quadratic sum and what is expected of it.
 

@@ -16,6 +16,7 @@ heavy tail: fixes, slips of an interval, and priors (a lever arm, a delay, a tur
 the data gainsay.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +39,9 @@ from odocal_ros.calib.smoother.state import (
     State,
     YAW,
 )
+from odocal_ros.data.arrays import Floats
+
+Trace = Callable[[int, State, Levels, Weighted, Solved], None]     # called with each pass
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ class WarmStart:
     levels: Levels
     priors: Priors           # as the data left them
     first: Priors            # as they were before any gave way
-    spread: np.ndarray       # (K, SPREAD) factors on variances: slips, jumps of slow fix errors
+    spread: Floats           # (K, SPREAD) factors on variances: slips, jumps of slow fix errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +131,8 @@ class Fit(Outline):
         return solve(self.weighted.normal()).neighbours()
 
 
-def fit(problem: Problem, state: State, levels: Levels, most=40, *, frozen=False,
-        about: WarmStart | None = None, trace=None) -> Fit:
+def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, frozen: bool = False,
+        about: WarmStart | None = None, trace: Trace | None = None) -> Fit:
     """
     Iterate from a state to the restricted maximum of the likelihood.
 
@@ -198,7 +202,8 @@ def fit(problem: Problem, state: State, levels: Levels, most=40, *, frozen=False
                likelihood, weighted, solved)
 
 
-def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Levels:
+def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
+           pace: dict[str, tuple[float, float]], slipping: bool = False) -> Levels:
     """
     Return levels moved towards the maximum of the restricted likelihood.
 
@@ -224,7 +229,7 @@ def update(weighted, neighbours, levels, problem, pace, slipping=False) -> Level
     return levels.but(**new)
 
 
-def slips(weighted, neighbours, spread):
+def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats) -> Floats:
     """Return factors on variances where an interval lies far out: (K, SPREAD)."""
     noise, found = weighted[MotionRows].road_noise(neighbours)
     jumps = np.zeros((2, len(noise), 1))
@@ -236,10 +241,12 @@ def slips(weighted, neighbours, spread):
     wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
-    return wanted
+    out: Floats = wanted
+    return out
 
 
-def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Priors:
+def widened(first: Priors, now: Priors, state: State, solved: Solved, neighbours: Neighbours,
+            fitted: bool) -> Priors:
     """
     Return priors widened where the data are far from their centre.
 
@@ -262,7 +269,7 @@ def widened(first: Priors, now: Priors, state, solved, neighbours, fitted) -> Pr
         constants=constants)
 
 
-def _wider(first, now, off, variance):
+def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
     """
     Return sigmas at which ``off`` is no more than PRIOR_GIVES_WAY, none below the first.
 

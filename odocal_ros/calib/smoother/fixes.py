@@ -9,10 +9,13 @@
 
 """Fixes as rows, (S8): the antenna's place at the time of a fix, from the keyframe before it."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -29,12 +32,17 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     PITCH,
     SLOW,
+    State,
     V,
     YAW,
 )
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import skew
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 class Fixes(PointRows):
@@ -42,8 +50,9 @@ class Fixes(PointRows):
 
     name, source = 'fixes', 'fixes'
     levels_of = {'fix': slice(0, 2), 'fix_up': slice(2, 3)}
+    share: Floats
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         leg, state, points = problem.leg, here.state, here.points['fixes']
         self.state, self.points, self.root = state, points, problem.root
         k, tau = points.interval, points.tau[:, None]
@@ -72,7 +81,7 @@ class Fixes(PointRows):
             state.t[k] + points.tau, state.constants[FIX_LAG2])
         self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - smoothed
 
-    def jacobians(self, n):
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """
         Return derivatives of the residual: (m, 3, n) by the keyframe before, (m, 3, M).
 
@@ -99,35 +108,36 @@ class Fixes(PointRows):
         return J, c
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return first levels, factors on the stated variance, and their least."""
         least = (LEAST.fix / problem.fix_sigma)**2
         return dict.fromkeys(cls.levels_of, 1.0), dict.fromkeys(cls.levels_of, least)
 
     @classmethod
-    def times(cls, problem, constants):
+    def times(cls, problem: 'Problem', constants: Floats) -> Floats:
         """Return when the fixes that are used were true, s."""
-        return problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
+        out: Floats = problem.leg.t_fix[problem.use] - constants[GNSS_DELAY]
+        return out
 
-    def stated(self, rows):
+    def stated(self, rows: Floats) -> Floats:
         """Return rows in the sigmas that the receiver states."""
         return self.root @ rows
 
-    def known(self):
+    def known(self) -> Bools:
         """Tell which components there are: (m, 3), fixes without height are level ones."""
         known = np.ones((len(self.k), 3), bool)
         known[:, 2] = self.root[:, 2, 2] > 1e-5
         return known
 
 
-def _antenna(state, mean_rate, arm_b):
+def _antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
     """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,
             state.v_n + turn(state.C_nb, np.cross(rate, arm_b)))
 
 
-def whitener(covariance_n, no_height):
+def whitener(covariance_n: Floats, no_height: Bools) -> Floats:
     """Return inverse roots of covariances, lower triangular: level rows know no height."""
     C = covariance_n.copy()
     C[no_height, 2, :] = C[no_height, :, 2] = 0.0

@@ -9,12 +9,20 @@
 
 """A heading from outside: the yaw of the Imu's x axis, with an error that stays for a leg."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from odocal_ros.calib.smoother.least import LEAST
+from odocal_ros.calib.smoother.outside import Heading
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
-from odocal_ros.calib.smoother.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI
+from odocal_ros.calib.smoother.part import Here
+from odocal_ros.calib.smoother.preintegrate import Points
+from odocal_ros.calib.smoother.state import BARE, BG, GYRO_SCALE, HEADING, M, PHI, State
 from odocal_ros.nav.angles import arctan2, wrap
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 class HeadingRows(OutsideRows):
@@ -23,17 +31,19 @@ class HeadingRows(OutsideRows):
     name, source = 'heading', 'heading_noise'
     levels_of = {'heading': slice(0, 1)}
 
-    def rows(self, problem, here):
+    def rows(self, problem: 'Problem', here: Here) -> Rows:
         """Return the rows."""
-        return _heading(problem.outside['heading'], here.state, here.points['heading'])
+        sent = problem.outside['heading']
+        assert isinstance(sent, Heading)
+        return _heading(sent, here.state, here.points['heading'])
 
     @staticmethod
-    def least(sent):
+    def least(sent: Heading) -> dict[str, float]:
         """Return the least level."""
         return {'heading': (LEAST.heading / float(np.median(sent.noise)))**2}
 
 
-def _heading(sent, state, points):
+def _heading(sent: Heading, state: State, points: Points) -> Rows:
     k = points.interval
     C = state.C_nb[k]
     x = (C @ points.R)[:, :, 0]

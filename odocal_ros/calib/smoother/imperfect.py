@@ -20,20 +20,23 @@ Where fixes err slowly, metres come from the accelerometer, and its scale error 
 There no drive tells an error of a third of the grade from none: all are believed as usual.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.linked_legs import LinkedLegs
-from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit
-from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR
-from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K
+from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace
+from odocal_ros.calib.smoother.problem import imperfect_sigmas, NO_ERROR, Problem
+from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K, Priors
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.settings.grades import Grade
 
 SAME_SIGMAS = 1e-3      # relative change of prior sigmas that is none
 
 
-def mixture_prior(data, pull, odds=0.5):
+def mixture_prior(data: Floats, pull: Floats, odds: float = 0.5) -> tuple[Floats, float]:
     """
     Return how large errors of one kind are to be taken for.
 
@@ -63,7 +66,8 @@ def mixture_prior(data, pull, odds=0.5):
     return np.clip(taken, 1e-3**2, 1.0), float(weight)
 
 
-def weigh_kinds(data, gradient, kinds):
+def weigh_kinds(data: Floats, gradient: Floats | None,
+                kinds: Sequence[Bools | slice]) -> Floats:
     """
     Return prior variances of all errors, each kind weighed with the others as last believed.
 
@@ -90,7 +94,7 @@ def weigh_kinds(data, gradient, kinds):
     return prior
 
 
-def judged_priors(now: Fit, grade, found=True):
+def judged_priors(now: Fit, grade: Grade, found: bool = True) -> Priors:
     """
     Return a fit's priors with what is to be believed of imperfections.
 
@@ -118,7 +122,7 @@ def judged_priors(now: Fit, grade, found=True):
     return with_imperfect(now.priors, sigmas)
 
 
-def _taken(prior, last, sigma):
+def _taken(prior: Floats, last: Floats, sigma: Floats) -> Floats:
     """
     Return prior sigmas of variances in units of the usual ones: (k,) each.
 
@@ -127,7 +131,7 @@ def _taken(prior, last, sigma):
     return np.where(prior > 0.98, np.maximum(last, sigma), np.sqrt(prior) * sigma)
 
 
-def weighed_together(borders, steps) -> list[Border]:
+def weighed_together(borders: list[Border], steps: Floats) -> list[Border]:
     """
     Return borders of one vehicle with what all of them tell of imperfections believed.
 
@@ -154,7 +158,7 @@ def weighed_together(borders, steps) -> list[Border]:
     return legs.believing(at, taken)
 
 
-def judge_running(now: Fit, grade) -> Fit:
+def judge_running(now: Fit, grade: Grade) -> Fit:
     """Return a fit with what it tells of imperfections believed: where the next sets out."""
     priors = judged_priors(now, grade)
     if priors is now.priors:
@@ -163,14 +167,14 @@ def judge_running(now: Fit, grade) -> Fit:
                    first=with_imperfect(now.first, priors.constants[IMPERFECT]))
 
 
-def with_imperfect(priors, sigmas):
+def with_imperfect(priors: Priors, sigmas: Floats) -> Priors:
     """Return priors with these sigmas of what is imperfect, (k,)."""
     constants = priors.constants.copy()
     constants[IMPERFECT] = sigmas
     return replace(priors, constants=constants)
 
 
-def judge_imperfect(problem, now: Fit, trace=None) -> Fit:
+def judge_imperfect(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     """
     Return a fit whose sigmas hold the imperfections that there may be, and no more.
 

@@ -11,18 +11,22 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.least import LEAST
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_step, chunks
+from odocal_ros.settings.grades import Grade
 
 
-def sensor_noise(grade) -> dict[str, float]:
+def sensor_noise(grade: Grade) -> dict[str, float]:
     """Return the roots of the Imu's noise levels by its grade, SI: white ones and walks."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
     return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
 
 
-def at_rest(imu, leg, still) -> dict:
+def at_rest(imu: ImuRows, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     """Return white noise levels of gyro and accelerometer as standstills show them."""
     turn = imu.turned()
     force = imu.over_intervals(lambda rows: np.add.reduceat(
@@ -46,17 +50,18 @@ def at_rest(imu, leg, still) -> dict:
             for name, total in zip(('gyro', 'accel'), sums, strict=True)}
 
 
-def shaken(imu) -> dict:
+def shaken(imu: ImuRows) -> dict[str, float]:
     """
     Return white noise levels of gyro and accelerometer as neighbouring samples show them.
 
     What a vehicle shakes is in them, and much of it does not add up over a second: levels to come
     down from.
     """
-    def jumps(x):
-        return (np.diff(x, axis=0)**2).sum(axis=1)
+    def jumps(x: Floats) -> Floats:
+        out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
+        return out
 
-    def of_gyro():
+    def of_gyro() -> Floats:
         steps = chunks(len(imu.t) - 2)
         return np.concatenate([jumps(
             imu.turns(some.start, some.stop + 1)

@@ -9,11 +9,13 @@
 
 """Imu samples of a leg as rows between keyframes, and the Imu's own errors in them."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     ACCEL_AXIS,
@@ -22,13 +24,14 @@ from odocal_ros.calib.smoother.state import (
     GYRO_AXIS,
     GYRO_SIGNAL,
 )
+from odocal_ros.data.arrays import Ints
 from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.strapdown import rotation_increments
 
 Floats = NDArray[np.float64]
 
 
-def keyframes(t, t_begin, t_end, spacing):
+def keyframes(t: Floats, t_begin: float, t_end: float, spacing: float) -> Ints:
     """Return indices of the samples nearest to an even grid of times: (K + 1,), rising."""
     first, last = np.searchsorted(t, t_begin), np.searchsorted(t, t_end, side='right') - 1
     count = max(1, round((t[last] - t[first]) / spacing))
@@ -63,14 +66,14 @@ class ImuRows:
     key: NDArray[np.int64]   # (K + 1,) samples that are keyframes
 
     @classmethod
-    def of(cls, leg, spacing):
+    def of(cls, leg: SmootherLeg, spacing: float) -> 'ImuRows':
         """Return the rows of a leg between its begin and stop."""
         key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
         rows = slice(key[0], key[-1] + 1)
         t = leg.t_imu[rows]
         return cls(t, leg.f_b[rows], leg.w_b[rows], key - key[0])
 
-    def parts(self):
+    def parts(self) -> Iterator[tuple[int, int, SomeRows]]:
         """Yield first and last of the keyframes of some intervals, and their rows."""
         K, at_a_time = len(self.key) - 1, 8192      # rows, whose arrays stay in the cache
         per = max(1, int(at_a_time * K / (self.key[-1] - self.key[0] + 1)))
@@ -79,36 +82,40 @@ class ImuRows:
             yield first, last, self.between(first, last)
             let_go()
 
-    def between(self, first, last) -> SomeRows:
+    def between(self, first: int, last: int) -> SomeRows:
         """Return the rows from one keyframe to another."""
         a, b = self.key[first], self.key[last]
         return SomeRows(self.t[a:b + 1], self.f_b[a:b + 1], self.turns(a, b),
                         self.key[first:last + 1] - a)
 
-    def turns(self, begin=0, end=None):
+    def turns(self, begin: int = 0, end: int | None = None) -> Floats:
         """Return the rotation vectors of some steps, bias and all: (m, 3)."""
         return rotation_increments(self.t, self.w_b, begin, end).T
 
-    def over_intervals(self, function):
+    def over_intervals(self, function: Callable[[SomeRows], Floats]) -> Floats:
         """Return what a function of SomeRows gives for each interval: (K, ...)."""
         return np.concatenate([function(rows) for _, _, rows in self.parts()])
 
-    def turned(self):
+    def turned(self) -> Floats:
         """Return the sum of the rotation vectors over each interval: (K, 3)."""
         return self.over_intervals(lambda rows: np.add.reduceat(rows.turn, rows.key[:-1]))
 
 
-def mended(imu, constants):
+def mended(imu: SomeRows, constants: Floats | None) -> tuple[Floats, Floats]:
     """Return rotation vectors (n - 1, 3) and forces (n, 3) without the Imu's own errors."""
     if constants is None or not (constants[GYRO].any() or constants[ACCEL].any()):
         return imu.turn, imu.f_b
     gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))
     gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
     accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
-    return imu.turn - signals(imu) @ gyro.T, imu.f_b - imu.f_b @ accel.T
+    by = signals(imu.turn, imu.f_b, np.diff(imu.t))
+    return imu.turn - by @ gyro.T, imu.f_b - imu.f_b @ accel.T
 
 
-def signals(imu):
-    """Return what the gyro's errors go by over each step: turns, rad, and forces times s."""
-    dt = np.diff(imu.t)[:, None]
-    return np.concatenate([imu.turn, (imu.f_b[:-1] + imu.f_b[1:]) / 2 * dt], axis=1)
+def signals(turn: Floats, f_b: Floats, dt: Floats) -> Floats:
+    """
+    Return what the gyro's errors go by over each step: turns, rad, and forces times s: (n - 1, 6).
+
+    turn, f_b, dt : (n - 1, 3) rad, (n, 3) m/s^2, (n - 1,) s.
+    """
+    return np.concatenate([turn, (f_b[:-1] + f_b[1:]) / 2 * dt[:, None]], axis=1)

@@ -9,26 +9,33 @@
 
 """What a fit leaves over of each sensor, and how well it knows the biases, along the leg."""
 
-import numpy as np
+from typing import Any
 
-from odocal_ros.calib.smoother.chain import blocks
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.calib.smoother.chain import blocks, Neighbours
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import ABSENT_VARIANCE
+from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import BA, BG, PHI, V
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import transpose
 
 OF_INTERVALS = ('odometer', 'gyro', 'accelerometer')
 
 
-def bias_sigmas(near, widen):
+def bias_sigmas(near: Neighbours, widen: float) -> Floats:
     """Return the sigmas of the biases at the keyframes: (2, N, 3), gyro first, rad/s, m/s^2."""
     variance = near.variances()
     return np.sqrt(np.stack([variance[:, BG], variance[:, BA]])) * widen
 
 
-def left_over(leg, problem, fit):
+def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray[Any]]:
     """
     Return what the fit has less what each sensor says, and the noise it is believed to have.
 
@@ -46,10 +53,10 @@ def left_over(leg, problem, fit):
             for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
 
 
-def _of_intervals(fit):
+def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:
     """Return of each sensor of the motion values and sigmas, (K, 3) each."""
     motion = fit.weighted[MotionRows]
-    found: dict[str, list] = {name: [] for name in OF_INTERVALS}
+    found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in OF_INTERVALS}
     T, C, C_end = (getattr(motion.motion, name) for name in ('T', 'C', 'C_end'))
     for some in blocks(len(motion.r)):
         raw = np.linalg.solve(motion.whiten[some], motion.r[some, :, None])
@@ -60,13 +67,15 @@ def _of_intervals(fit):
                                 ('accelerometer', V, transpose(C[some]) * per_T)):
             variance = np.einsum('kij,kjl,kil->ki', axes, Q[:, own, own], axes)
             found[name].append(((axes @ raw[:, own])[:, :, 0], np.sqrt(variance)))
-    whole = {name: tuple(map(np.concatenate, zip(*parts, strict=True)))
+    whole = {name: (np.concatenate([value for value, _ in parts]),
+                    np.concatenate([sigma for _, sigma in parts]))
              for name, parts in found.items()}
-    absent = whole['odometer'][1]**2 > ABSENT_VARIANCE / 2
-    return whole | {'odometer': tuple(np.where(absent, np.nan, x) for x in whole['odometer'])}
+    value, sigma = whole['odometer']
+    absent = sigma**2 > ABSENT_VARIANCE / 2
+    return whole | {'odometer': (np.where(absent, np.nan, value), np.where(absent, np.nan, sigma))}
 
 
-def _of_fixes(fit):
+def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     """Return of the fixes values and sigmas, (m, 3) each."""
     fixes = fit.weighted[Fixes]
     covariance_root = np.linalg.inv(fixes.root)

@@ -10,6 +10,7 @@
 """What the smoother works on: one leg as clean arrays, and how the parameters are numbered."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from odocal_ros.calib.smoother.outside import Heading, outside_heading, outside_velocity, Velocity
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.odometer import Travel
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
 Floats = NDArray[np.float64]
@@ -24,7 +27,7 @@ Floats = NDArray[np.float64]
 BEFORE_MARK = 30.0
 
 
-def _none(*shape):
+def _none(*shape: int) -> Any:
     return field(default_factory=lambda: np.empty((0, *shape)))
 
 
@@ -70,7 +73,8 @@ class SmootherLeg:
         return coarse is not None and coarse.step * self.rough_scale > 0.05
 
 
-def smoother_leg(inputs, config, origin, fixes_n, spans, rough_scale, t_stop=None) -> SmootherLeg:
+def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats, spans: Floats,
+                 rough_scale: float, t_stop: float | None = None) -> SmootherLeg:
     """
     Return the smoother's view of screened inputs.
 

@@ -11,11 +11,15 @@
 
 import numpy as np
 
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
+from odocal_ros.calib.smoother.outside import Heading
+from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
@@ -27,7 +31,7 @@ OF_FORCE = ('Mount the Imu firmly, or set imu.grade, or imu.accel_noise and the 
             'is.')
 
 
-def mismatch(problem, fit, config):
+def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
     told, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
@@ -64,7 +68,7 @@ def mismatch(problem, fit, config):
     return 2.0 if odd else 1.0, reasons      # judgement: nothing tells by how much it is off
 
 
-def _heading(heading, error):
+def _heading(heading: Heading, error: float) -> list[Reason]:
     """Say where the outside heading is farther from that of the drive than its sigma allows."""
     if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []

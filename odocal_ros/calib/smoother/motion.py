@@ -20,7 +20,8 @@ from copy import copy
 
 import numpy as np
 
-from odocal_ros.calib.smoother.preintegrate import turn
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.preintegrate import Intervals, turn
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     ACCEL_AXIS,
@@ -42,10 +43,14 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     PITCH,
     SPEED_OFFSET,
+    State,
     TYRES,
     V,
     YAW,
 )
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, earth_rate_n, gravity
 from odocal_ros.nav.rotations import exp_so3, skew, transpose
 
@@ -56,7 +61,7 @@ EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsai
         'from_mean', 'varied', 'travelled', 'residual')
 
 
-def rotvec(C):
+def rotvec(C: Floats) -> Floats:
     """Return the rotation vector of (..., 3, 3), well below pi."""
     axis = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0],
                      C[..., 1, 0] - C[..., 0, 1]], -1) / 2
@@ -65,14 +70,16 @@ def rotvec(C):
     return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[..., None]
 
 
-def gravity_n(position_n, origin):
+def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     """Return gravity at positions in n, as a vector in n: (N, 3) m/s^2."""
     latitude, longitude, height = origin.to_geodetic(position_n).T
     up_e = C_en(latitude, longitude)[..., 2]
-    return -gravity(latitude, height)[:, None] * (up_e @ C_en(origin.latitude, origin.longitude))
+    down: Floats = -gravity(latitude, height)[:, None] * (
+        up_e @ C_en(origin.latitude, origin.longitude))
+    return down
 
 
-def pushes(state):
+def pushes(state: State) -> Floats:
     """
     Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
 
@@ -86,12 +93,13 @@ def pushes(state):
     return np.concatenate([accel, jerk], axis=1)
 
 
-def forward_speed(state):
+def forward_speed(state: State) -> Floats:
     """Return the speed along the vehicle at each keyframe: (N,) m/s."""
-    return np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
+    out: Floats = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
+    return out
 
 
-def speeding_up(state):
+def speeding_up(state: State) -> Floats:
     """
     Return by how much the way is driven faster, what tyres pull for, in each interval: (K,) m/s^2.
 
@@ -100,7 +108,7 @@ def speeding_up(state):
     return np.diff(np.abs(forward_speed(state))) / np.diff(state.t)
 
 
-def varies_with(speed, t, faster):
+def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
     """Return what the scale varies with, as TYRES has it: (..., 4)."""
     # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
     force = faster + 0.1 + 1e-4 * speed**2
@@ -108,11 +116,12 @@ def varies_with(speed, t, faster):
                      np.minimum(force, 0.0)], -1)
 
 
-def means_by_way(sums, state):
+def means_by_way(sums: Intervals, state: State) -> Floats:
     """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""
     way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
     t = (state.t[1:] + state.t[:-1]) / 2
-    return way @ varies_with(way / sums.T, t, speeding_up(state)) / max(way.sum(), 1e-9)
+    out: Floats = way @ varies_with(way / sums.T, t, speeding_up(state)) / max(way.sum(), 1e-9)
+    return out
 
 
 class Motion:
@@ -126,7 +135,8 @@ class Motion:
         the fit then takes for information, and a smaller signal for a better one.
     """
 
-    def __init__(self, leg, state, intervals, change=(0.0, 0.0), fitted=False):
+    def __init__(self, leg: SmootherLeg, state: State, intervals: Intervals,
+                 change: tuple[Floats | float, float] = (0.0, 0.0), fitted: bool = False) -> None:
         self.state, self.sums, self.fitted = state, intervals, fitted
         self.by_steps = leg.by_steps
         T = self.T = intervals.T[:, None]
@@ -142,7 +152,7 @@ class Motion:
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
         if np.any(change[0]):
-            way = way + turn(intervals.S_by, change[0])
+            way = way + turn(intervals.S_by, np.asarray(change[0]))
         self.faster = self._faster()
         self.way = turn(half @ self.C, way) + self.faster * change[1]
         self.unsaid = self._unsaid(leg.travel.coarse)
@@ -167,7 +177,7 @@ class Motion:
             [r_p, r_v, r_phi, np.diff(state.gyro_bias, axis=0),
              np.diff(state.accel_bias, axis=0), r_d], axis=1)
 
-    def take(self, rows) -> 'Motion':
+    def take(self, rows: slice) -> 'Motion':
         """Return the motion of the intervals of a slice, for derivatives and noises of its own."""
         part = copy(self)
         part.sums = self.sums.take(rows)
@@ -176,7 +186,7 @@ class Motion:
             setattr(part, name, whole if whole is None else whole[rows])
         return part
 
-    def _vary(self):
+    def _vary(self) -> None:
         """Work out how scale and forward axis change with speed, time and acceleration."""
         state, T, c = self.state, self.T, self.state.constants
         self.pushed = pushes(state)
@@ -188,20 +198,21 @@ class Motion:
         self.leaned = state.scale * (np.outer(pitch, self.by_pitch[:, 0])
                                      + np.outer(yaw, self.by_yaw[:, 0]))
 
-    def _unsaid(self, coarse):
+    def _unsaid(self, coarse: CoarseSpeed | None) -> Floats | None:
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
         if coarse is None:
             return None
         said = np.einsum('kij,j->ki', self.sums.S, self.state.forward) @ self.state.forward
         moves = np.abs(said) > coarse.step * self.T[:, 0]
-        return (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None] * self.T
+        ahead: Floats = (self.f_n + self.f_n_end) / 2 * (np.sign(said) * moves)[:, None]
+        return np.asarray(ahead * self.T)
 
-    def _faster(self):
+    def _faster(self) -> Floats:
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
         state = self.state
         return (self.f_n + self.f_n_end) / 2 * np.diff(forward_speed(state) / state.scale)[:, None]
 
-    def jacobians(self, n):
+    def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
         s, C, state = self.sums, self.C, self.state
         K, T = len(self.T), self.T[:, :, None]
@@ -221,7 +232,7 @@ class Motion:
         b[:, D, P], b[:, D, PHI], b[:, D, E] = one, -skew(self.C_end @ arm_b), self.f_n_end
         return a, b, self._by_constants(gyro)
 
-    def _by_gyro(self):
+    def _by_gyro(self) -> Floats:
         """Return derivatives by the gyro's bias and constants: (K, 18, 3 + g)."""
         s, C = self.sums, self.C
         out = np.zeros((len(C), ROWS, s.turned.shape[2]))
@@ -229,7 +240,7 @@ class Motion:
         out[:, D] = -C @ s.S_by
         return out
 
-    def _by_constants(self, gyro):
+    def _by_constants(self, gyro: Floats) -> Floats:
         s, C, state = self.sums, self.C, self.state
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
@@ -254,7 +265,7 @@ class Motion:
             self._fit_signals(c, gyro)
         return c
 
-    def _fit_signals(self, c, gyro):
+    def _fit_signals(self, c: Floats, gyro: Floats) -> None:
         """
         Take the noise, which the residuals are, out of the signals in c.
 

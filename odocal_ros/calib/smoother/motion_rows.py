@@ -9,18 +9,25 @@
 
 """The motion of the intervals as a part: Imu and odometer from each keyframe to the next."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks, SHORT_LEG
+from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal, SHORT_LEG
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
-from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise
-from odocal_ros.calib.smoother.part import Part, Total
+from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise, Levels
+from odocal_ros.calib.smoother.part import Here, Part, Total
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.state import M
+from odocal_ros.calib.smoother.state import M, State
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.mapped import room
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 ALONG = ('along', 'along_hard')
 # sources in the budget
@@ -41,7 +48,7 @@ class MotionRows(Part):
 
     name = 'motion'
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         change = here.gyro_change, here.odo_later
         self.motion = Motion(problem.leg, here.state, here.intervals, change, here.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
@@ -49,7 +56,7 @@ class MotionRows(Part):
                                     problem.still[:-1] & problem.still[1:], here.spread)
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return first levels and their least: of the Imu as it rests, of the road."""
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= at_rest(problem.imu, problem.leg, problem.still)
@@ -59,9 +66,9 @@ class MotionRows(Part):
                 imu | dict.fromkeys(ALONG, LEAST.road**2) | dict.fromkeys(SIDEWAYS, slide)
                 | {'up': max(slide, HEAVE**2)})
 
-    def weigh(self, levels):
+    def weigh(self, levels: Levels) -> None:
         """Whiten the rows by the Cholesky root of their covariance."""
-        self._kept: dict = {}
+        self._kept: dict[int, Floats] = {}
         self.whiten = room(len(self.raw), ROWS, ROWS)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
@@ -73,14 +80,14 @@ class MotionRows(Part):
             self.r[rows] = np.einsum('kij,kj->ki', self.whiten[rows], self.raw[rows])
         self.log_R = -2 * logs.sum()
 
-    def after(self, step, constants, reached):
+    def after(self, step: Floats, constants: Floats, reached: State) -> None:
         """Bring the residuals to where the step leads."""
         both = np.concatenate([step[:-1], step[1:],
                                np.broadcast_to(constants, (len(self.r), M))], axis=1)
         self.r = self.r + np.concatenate([
             np.einsum('kij,kj->ki', self._J(rows), both[rows]) for rows in blocks(len(self.r))])
 
-    def _J(self, rows):
+    def _J(self, rows: slice) -> Floats:
         """Return the whitened derivatives of some intervals: (k, 18, 2n + M)."""
         if rows.start in self._kept:
             return self._kept[rows.start]
@@ -89,11 +96,11 @@ class MotionRows(Part):
             self._kept[rows.start] = J
         return J
 
-    def forget(self):
+    def forget(self) -> None:
         """Let go of the derivatives."""
         self._kept = {}
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         n = self.n
         corner, g_border = Total(), Total()
@@ -114,24 +121,25 @@ class MotionRows(Part):
         out.corner += corner.sum
         out.g_border += g_border.sum
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
-        return (self.r**2).sum()
+        out: float = (self.r**2).sum()
+        return out
 
-    def _units(self, rows):
+    def _units(self, rows: slice) -> tuple[Floats, Floats]:
         """Return the whitened unit noises of some intervals, (k, 18, c), and J' of them."""
         A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
         return A, np.swapaxes(self._J(rows), 1, 2) @ A
 
-    def roots(self):
+    def roots(self) -> Floats:
         """Return the standard deviation of each unit noise, (c,), per root second."""
         return np.sqrt([self.levels[INTERVAL[i]] for i in self.noise.component])
 
-    def of(self, *names):
+    def of(self, *names: str) -> Bools:
         """Tell which unit noises are of these levels: (c,) bool."""
         return np.isin(self.noise.component, [INTERVAL.index(name) for name in names])
 
-    def components(self, near):
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return for each level its quadratic sum and what is expected of it."""
         estimates, power, taken = [], Total(), Total()
         for rows, block in near.blocks():
@@ -144,7 +152,7 @@ class MotionRows(Part):
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what the unit noises of each level do."""
         units, given = [], []
         for rows, block in near.blocks():
@@ -158,7 +166,7 @@ class MotionRows(Part):
         if self.noise.given.shape[2]:
             yield SpeedSteps.source, np.concatenate(given)
 
-    def road_noise(self, near):
+    def road_noise(self, near: Neighbours) -> tuple[Floats, Floats]:
         """
         Return the odometer's noise of each interval, along, side, up: (K, 3) each.
 
@@ -175,7 +183,7 @@ class MotionRows(Part):
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
 
-    def along_size(self):
+    def along_size(self) -> Floats:
         """Return how far a unit of the noise along moves the end of each interval, m: (K,)."""
         pick = self.of(*ALONG)
         return np.concatenate([

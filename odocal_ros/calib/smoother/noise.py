@@ -21,8 +21,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.state import BA, BG, ODO_DELAY, P, PHI, V
+from odocal_ros.data.arrays import Bools
 from odocal_ros.nav.rotations import skew
 
 Floats = NDArray[np.float64]
@@ -49,7 +51,7 @@ class Levels:
 
     values: dict[str, float]
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> float:
         return self.values[name]
 
     @property
@@ -57,7 +59,7 @@ class Levels:
         """Return the correlation time of the slow fix error, s, 0: there is none."""
         return self.values.get('correlation_time', 0.0)
 
-    def but(self, **values) -> 'Levels':
+    def but(self, **values: float) -> 'Levels':
         """Return levels with some replaced."""
         return Levels(self.values | values)
 
@@ -68,7 +70,7 @@ class Levels:
                 for k, v in self.values.items()} | {'correlation_time': time}
 
     @classmethod
-    def of_roots(cls, roots) -> 'Levels':
+    def of_roots(cls, roots: dict[str, float]) -> 'Levels':
         """Return the levels of such standard deviations."""
         time = roots['correlation_time']
         return cls({k: v**2 / (time / 2 if time and k in SLOW_LEVELS else 1.0)
@@ -129,7 +131,8 @@ class IntervalNoise:
         return Q
 
 
-def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
+def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
+                   spread: Floats | None = None) -> IntervalNoise:
     """
     Return the noises of a motion.
 
@@ -156,7 +159,7 @@ def interval_noise(motion, leg, rest, spread=None) -> IntervalNoise:
     return IntervalNoise(motion, axes, road, extra, _given(motion, leg, axes, rest))
 
 
-def _given(motion, leg, axes, rest):
+def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
     """
     Return noises of a way that is told by speeds in steps: (K, 18, g).
 
@@ -182,13 +185,13 @@ def _given(motion, leg, axes, rest):
     return given * ~rest[:, None, None]
 
 
-def rest_noise(speed, rest):
+def rest_noise(speed: Floats, rest: Bools) -> float:
     """Return the variance of a second's way at rest, m^2: what a noisy speed adds up to."""
     measured = float((speed[rest]**2).mean()) if rest.sum() >= 5 else 0.0      # s to know it by
     return max(measured, REST_NOISE**2)
 
 
-def hard_and_turning(motion):
+def hard_and_turning(motion: Motion) -> tuple[Bools, Bools]:
     """
     Tell where the vehicle speeds up or brakes, and where it turns: (K,) bool each.
 
@@ -203,7 +206,7 @@ def hard_and_turning(motion):
     return hard, rate > TURNING_RATE
 
 
-def _extra(motion, leg):
+def _extra(motion: Motion, leg: SmootherLeg) -> Floats:
     """Return variances of what gaps hide: (K, 18)."""
     sums, T = motion.sums, motion.T[:, 0]
     extra = np.zeros((len(T), ROWS))

@@ -9,6 +9,9 @@
 
 """The smoother's fit as a method's result: estimates, reasons, budget, what the drive was like."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
@@ -17,11 +20,15 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
+from odocal_ros.calib.smoother.equations import Weighted
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
+from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, model_floor, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed, NO_TURN
@@ -41,8 +48,10 @@ from odocal_ros.calib.smoother.state import (
     V,
     YAW,
 )
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE
 
 SCALE_LIMIT = 0.05      # relative sigma: a scale no better is not known. Judgement
@@ -55,13 +64,14 @@ SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
-def refused(reasons, scale_unit, details=None) -> MethodResult:
+def refused(reasons: Iterable[Reason], scale_unit: str,
+            details: dict[str, Any] | None = None) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     return MethodResult('smoother', tuple(reasons), _unknown(scale_unit), PARAMETERS, (),
                         details or {})
 
 
-def not_settled(leg, problem, fit, config) -> MethodResult:
+def not_settled(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
     """Return the refusal of a fit that goes to and fro: what moves, and what may be the cause."""
     move = np.abs(fit.solved.step_border[:3]) / np.sqrt(np.diag(fit.solved.covariance))[:3]
     worst = int(np.argmax(move))
@@ -76,7 +86,7 @@ def not_settled(leg, problem, fit, config) -> MethodResult:
     return refused([Reason(Code.NOT_CONVERGED, text), *odd], leg.scale_unit)
 
 
-def no_imu(fit) -> list[Reason]:
+def no_imu(fit: Fit) -> list[Reason]:
     """Return why a fit is not to be believed whose Imu no maker would sell, empty else."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
@@ -87,14 +97,14 @@ def no_imu(fit) -> list[Reason]:
                    'Imu is: a false minimum, or its units, axes or times are not as set')]
 
 
-def _unknown(scale_unit):
+def _unknown(scale_unit: str) -> dict[str, Estimate]:
     units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
              'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
     units |= {CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
     return {name: Estimate(None, None, unit) for name, unit in units.items()}
 
 
-def outcome(leg, problem, fit, config) -> MethodResult:
+def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
     """Return what a settled fit says of the leg."""
     near = fit.neighbours()
     widen, reasons = mismatch(problem, fit, config)
@@ -135,14 +145,15 @@ def outcome(leg, problem, fit, config) -> MethodResult:
                         border_of(fit, configured(leg), problem.grade).widened(widen))
 
 
-def floored(covariance, floor):
+def floored(covariance: Floats, floor: Floats) -> Floats:
     """Return the covariance of the constants with what the model does not hold, (3,) sigmas."""
     covariance = covariance.copy()
     covariance[range(len(floor)), range(len(floor))] += floor**2
     return covariance
 
 
-def told(value, sigma, ratio, scale_unit, nominal, config, doubt=1.0):
+def told(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
+         config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
     """
     Return the estimates of the constants as far as the data tell them, and why not further.
 
@@ -179,14 +190,14 @@ def told(value, sigma, ratio, scale_unit, nominal, config, doubt=1.0):
     return found, _undetermined(sigma, limit / doubt, config, yaw)
 
 
-def configured(leg):
+def configured(leg: SmootherLeg) -> Floats:
     """Return the values of the settings that constants are corrections to: (M,)."""
     value = np.zeros(M)
     value[ODO_ARM], value[GNSS_ARM] = leg.odometer_arm, leg.antenna_arm
     return value
 
 
-def in_words(names):
+def in_words(names: Iterable[str]) -> str:
     """Return names of estimates as people say them, axes of one thing together."""
     words: dict[str, list[str]] = {}
     for name in names:
@@ -200,11 +211,11 @@ def in_words(names):
     return said[0] if len(said) == 1 else f'{", ".join(said[:-1])} and {said[-1]}'
 
 
-def _widened(source, widen):
+def _widened(source: Source, widen: float) -> Source:
     return type(source)(source.name, source.effects * widen, source.shared)
 
 
-def _undetermined(sigma, limit, config, yaw):
+def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> list[Reason]:
     # of a model that does not hold more is wanted: said, or 0.4 deg would seem to be enough
     reasons, wanted = [], f', {np.rad2deg(limit):.2g} deg are wanted'
     if sigma[LN_K] > SCALE_LIMIT:
@@ -232,7 +243,9 @@ def _undetermined(sigma, limit, config, yaw):
     return reasons
 
 
-def _details(leg, problem, fit, sources, ratio, widen, sigma):
+def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source],
+             ratio: dict[str, float], widen: float,
+             sigma: Floats) -> dict[str, Any]:
     state, motion, fixes = fit.state, fit.weighted[MotionRows].motion, fit.weighted[Fixes]
     K = state.scale
     arm = state.C_bv @ motion.arm_v
@@ -267,7 +280,7 @@ def _details(leg, problem, fit, sources, ratio, widen, sigma):
     }
 
 
-def _normalised(weighted):
+def _normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
     """Return how the rows of each sensor lie in their sigmas, before weights take off tails."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]
     white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
@@ -277,11 +290,12 @@ def _normalised(weighted):
                             ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
 
 
-def _outside(leg, problem, fit, sigma):
+def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,
+             sigma: Floats) -> dict[str, dict[str, float | str]]:
     """Return what the drive says of velocity and heading from outside."""
-    out = {}
-    for name in problem.outside:
-        out[name] = {'messages': len(fit.weighted.parts[name].k),
+    out: dict[str, dict[str, float | str]] = {}
+    for name, sent in problem.outside.items():
+        out[name] = {'messages': len(sent.t),
                      'alike': problem.per_effective.get(name, 1.0)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,

@@ -16,15 +16,18 @@ is one such message.
 """
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import arctan2, wrap, yaw_from_heading
+from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
 
 Floats = NDArray[np.float64]
 VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say: physical, Doppler
@@ -32,7 +35,7 @@ HEADING_RATE = 5.0          # Hz: receivers' errors of a heading stay longer tha
 GIVEN_HEADING_NOISE = 1e-4  # rad, of a heading given at the mark, beside its error: next to none
 
 
-def _none(*shape):
+def _none(*shape: int) -> Any:
     return field(default_factory=lambda: np.empty((0, *shape)))
 
 
@@ -45,7 +48,7 @@ class Velocity:
     velocity_n: Floats = _none(3)
     sigma: Floats = _none(3)
 
-    def between(self, first, last) -> 'Velocity':
+    def between(self, first: float, last: float) -> 'Velocity':
         """Return what lies between two times."""
         pick = (self.t >= first) & (self.t <= last)
         return Velocity(self.t[pick], self.velocity_n[pick], self.sigma[pick])
@@ -66,13 +69,13 @@ class Heading:
     sigma: float = 1.0
     source: str = ''
 
-    def between(self, first, last) -> 'Heading':
+    def between(self, first: float, last: float) -> 'Heading':
         """Return what lies between two times."""
         pick = (self.t >= first) & (self.t <= last)
         return Heading(self.t[pick], self.yaw[pick], self.noise[pick], self.sigma, self.source)
 
 
-def outside_velocity(inputs, config, origin) -> Velocity:
+def outside_velocity(inputs: Inputs, config: Config, origin: Origin) -> Velocity:
     """Return the velocity of the antenna, turned from where it is to n; empty: not asked for."""
     if not config.gnss.use_velocity or not len(inputs.t_velocity) or not len(inputs.t_fix):
         return Velocity()
@@ -83,7 +86,7 @@ def outside_velocity(inputs, config, origin) -> Velocity:
     return Velocity(inputs.t_velocity, (C_np @ inputs.velocity_n[:, :, None])[:, :, 0], sigma)
 
 
-def outside_heading(inputs, config, origin) -> Heading:
+def outside_heading(inputs: Inputs, config: Config, origin: Origin) -> Heading:
     """Return the heading that the settings ask for, else the heading topic; empty: none."""
     asked, alignment = config.alignment.heading_source, config.alignment
     given = not np.isnan(alignment.heading)
@@ -100,7 +103,8 @@ def outside_heading(inputs, config, origin) -> Heading:
     return Heading()
 
 
-def _sent(inputs, t, q, variance, offset, config, origin, C_ib, source):
+def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float, config: Config,
+          origin: Origin, C_ib: Floats, source: str) -> Heading:
     good = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):
@@ -116,12 +120,12 @@ def _sent(inputs, t, q, variance, offset, config, origin, C_ib, source):
     return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source)
 
 
-def _from_place(inputs, t, origin):
+def _from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     """Return C_np of the places at times: east and north differ from those at the origin."""
     latitude, longitude = (np.interp(t, inputs.t_fix, inputs.geodetic[:, i]) for i in (0, 1))
     return transpose(C_en(origin.latitude, origin.longitude)) @ C_en(latitude, longitude)
 
 
-def _convergence(inputs, t, origin):
+def _convergence(inputs: Inputs, t: Floats, origin: Origin) -> Floats:
     C_np = _from_place(inputs, t, origin)
     return arctan2(C_np[:, 1, 0], C_np[:, 0, 0])

@@ -10,11 +10,19 @@
 """What velocity and heading from outside have in common: rows with a sigma for each component."""
 
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.outside import Heading, Velocity
+from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.state import BARE, GNSS_DELAY
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,48 +39,51 @@ class Rows:
 class OutsideRows(PointRows):
     """Rows of one of ``problem.outside``."""
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         self._rows = self.rows(problem, here)
         self.k, self.raw = self._rows.k, self._rows.raw
         self.per_effective = problem.per_effective.get(self.name, 1.0)
 
-    def rows(self, problem, here) -> Rows:
+    def rows(self, problem: 'Problem', here: Here) -> Rows:
         """Return the rows at a state."""
         raise NotImplementedError
 
     @classmethod
-    def there(cls, problem):
+    def there(cls, problem: 'Problem') -> bool:
         """Tell whether there are any."""
         return cls.name in problem.outside
 
     @classmethod
-    def times(cls, problem, constants):
+    def times(cls, problem: 'Problem', constants: Floats) -> Floats:
         """Return when they were true, s."""
         sent = problem.outside[cls.name]
-        return sent.t - constants[GNSS_DELAY] * sent.from_fixes
+        out: Floats = sent.t - constants[GNSS_DELAY] * sent.from_fixes
+        return out
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return first levels, factors on stated variances, and their least."""
         return dict.fromkeys(cls.levels_of, 1.0), cls.least(problem.outside[cls.name])
 
     @staticmethod
-    def least(sent) -> dict:
+    def least(sent: Any) -> dict[str, float]:
         """Return the least levels."""
         raise NotImplementedError
 
-    def jacobians(self, n):
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         J = self._rows.J
         return np.pad(J, ((0, 0), (0, 0), (0, n - BARE))), self._rows.c
 
-    def stated(self, rows):
+    def stated(self, rows: Floats) -> Floats:
         """Return rows (m, d, c) in the sigmas that the sensor states."""
-        return rows * self._rows.root[:, :, None]
+        out: Floats = rows * self._rows.root[:, :, None]
+        return out
 
 
-def used(leg, t) -> dict:
+def used(leg: SmootherLeg, t: Floats) -> dict[str, Velocity | Heading]:
     """Return velocity and heading within the keyframes, those that there are."""
-    found = {'velocity': leg.velocity.between(t[0], t[-1]),
+    found: dict[str, Velocity | Heading] = {
+        'velocity': leg.velocity.between(t[0], t[-1]),
              'heading': leg.heading.between(t[0], t[-1])}
     return {name: x for name, x in found.items() if len(x.t)}

@@ -15,17 +15,22 @@ its rows give to normal equations, cost, variance components and the budget of e
 unweighted; ``weighed`` returns a copy of it at given levels, whose ``after`` takes a step in.
 """
 
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.smoother.chain import blocks
+from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.preintegrate import Intervals, Points
 from odocal_ros.calib.smoother.state import BARE, Priors, State, WITH_SLOW
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 # factors on variances of an interval: the odometer's along, to the side and up (slips), and that
 # of what drives the slow fix error (a receiver that jumps)
@@ -72,21 +77,24 @@ class Part:
     n: int                   # of so many unknowns of a keyframe
     log_R: float = 0.0       # log determinant of the rows' covariance, but for a constant
 
+    def __init__(self, problem: 'Problem', here: Here) -> None:
+        self.state = here.state
+
     @classmethod
-    def there(cls, problem) -> bool:
+    def there(cls, problem: 'Problem') -> bool:
         """Tell whether a leg has such rows."""
         return True
 
     @classmethod
-    def first_levels(cls, problem) -> tuple[dict, dict]:
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return the variances to start from, by the names of its levels, and the least."""
         return {}, {}
 
-    def in_use(self, levels) -> bool:
+    def in_use(self, levels: Levels) -> bool:
         """Tell whether the rows are there with these levels."""
         return True
 
-    def weighed(self, levels) -> 'Part':
+    def weighed(self, levels: Levels) -> 'Part':
         """Return the part with its rows weighed."""
         new = copy(self)
         new.levels = levels
@@ -94,36 +102,36 @@ class Part:
         new.weigh(levels)
         return new
 
-    def weigh(self, levels):
+    def weigh(self, levels: Levels) -> None:
         """Set what depends on the levels."""
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
 
-    def after(self, step, constants, reached):
+    def after(self, step: Floats, constants: Floats, reached: State) -> None:
         """Bring the residuals to where a step (N, n), (M,) leads, were all linear."""
         self.state = reached
 
-    def forget(self):
+    def forget(self) -> None:
         """Let go of what can be made again."""
 
     def cost(self) -> float:
         """Return the weighted sum of squares of the residuals."""
         return 0.0
 
-    def components(self, near) -> dict[str, tuple[float, float]]:
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return of each level its quadratic sum and what is expected of it."""
         return {}
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterable[tuple[str, Floats]]:
         """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
         return ()
 
-    def to_told(self, block):
+    def to_told(self, block: Floats) -> Floats:
         """Return the covariance of scale, yaw and pitch with the unknowns: (k, 3, 2n + M)."""
         return block[:, 2 * self.n:2 * self.n + WANTED, :]
 
-    def all_told(self, near):
+    def all_told(self, near: Neighbours) -> Floats:
         """Return that of all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would hold the whole block
         return np.concatenate([self.to_told(block).copy() for _, block in near.blocks()])
@@ -139,26 +147,28 @@ class Total:
         """Return the sum of the rows so far; before the first it has no shape."""
         return np.zeros(()) if self._sum is None else self._sum
 
-    def add(self, rows):
+    def add(self, rows: Floats) -> None:
         """Add rows: numpy adds them one after the other."""
         if self._sum is not None:
             rows = np.concatenate([self._sum[None], rows])
         self._sum = rows.sum(axis=0)
 
 
-def hold(out, k, columns, variance, residual, weight=1.0):
+def hold(out: Normal, k: int | slice, columns: slice, variance: Floats | float,
+         residual: Floats | float, weight: Floats | float = 1.0) -> None:
     """Add rows that are an unknown each: those of columns at keyframes k, a slice or one."""
     i = np.arange(out.g.shape[1])[columns]
-    k = np.atleast_1d(np.arange(len(out.g))[k])
-    weight, pull = (np.broadcast_to(x, (len(k), len(i)))
+    keys = np.atleast_1d(np.arange(len(out.g))[k])
+    weight, pull = (np.broadcast_to(x, (len(keys), len(i)))
                     for x in (weight / variance, weight * residual / variance))
-    for rows in blocks(len(k)):
-        at = k[rows, None]
+    for rows in blocks(len(keys)):
+        at = keys[rows, None]
         out.diagonal[at, i, i] += weight[rows]
         out.g[at, i] -= pull[rows]
 
 
-def link(out, columns, decay, weight, residual):
+def link(out: Normal, columns: slice, decay: Floats | float, weight: Floats,
+         residual: Floats) -> None:
     """Add rows of all intervals, (K, c): an unknown at the end less its decayed one before."""
     i = np.arange(out.g.shape[1])[columns]
     all_of = np.broadcast_shapes(np.shape(residual), (len(out.beside), len(i)))

@@ -14,21 +14,30 @@ Each hangs on the keyframe before it, on the constants, and, where slow fix erro
 on those of the keyframe after it. What lies far out loses weight as a heavy tail has it.
 """
 
+from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks
+from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
+from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Part, Total
-from odocal_ros.calib.smoother.state import M, SLOW, WITH_SLOW
+from odocal_ros.calib.smoother.state import M, SLOW, State, WITH_SLOW
+from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.mapped import room
 from odocal_ros.settings.levels import NORMAL_MEDIAN
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 # sigmas beyond which a row, or a slip of an interval, has a heavy tail. Statistical: one sound row
 # in 370 loses some of its weight
 TAIL_SIGMAS = 3.0
 FEWEST_JUDGED = 5    # rows, of which one may be an outlier
+
+
+Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
 
 
 class PointRows(Part):
@@ -44,27 +53,29 @@ class PointRows(Part):
 
     levels_of: ClassVar[dict[str, slice]]     # columns that a level, factor on variances, is of
     source: ClassVar[str]                     # name in the budget
+    k: Ints
+    raw: Floats
     per_effective = 1.0
-    share: np.ndarray | None = None
+    share: Floats | None = None
 
     @classmethod
-    def times(cls, problem, constants):
+    def times(cls, problem: 'Problem', constants: Floats) -> Floats:
         """Return when what was sent was true, s: (m,); sums to these times are in ``here``."""
         raise NotImplementedError
 
-    def jacobians(self, n):
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, d, n), (m, d, M)."""
         raise NotImplementedError
 
-    def stated(self, rows):
+    def stated(self, rows: Floats) -> Floats:
         """Return rows (m, d, c) in the sigmas that the sensor states."""
         raise NotImplementedError
 
-    def known(self):
+    def known(self) -> Bools | bool:
         """Tell which components are there at all: (m, d) bool or one for all."""
         return True
 
-    def weigh(self, levels):
+    def weigh(self, levels: Levels) -> None:
         """Set r, J and J_end, weighed for heavy tails as well."""
         white = self.stated(self.raw[:, :, None])[:, :, 0]
         factor = np.ones(white.shape[1])
@@ -82,7 +93,7 @@ class PointRows(Part):
         self.log_R = -2 * np.log(np.tile(factor, (len(white), 1))).sum() / self.per_effective
 
     @cached_property
-    def J(self):
+    def J(self) -> Floats:
         """Return the whitened derivatives: (m, d, n + M)."""
         rows, constants = self.jacobians(self.n)
         out = room(*self.raw.shape, self.n + M)
@@ -92,15 +103,15 @@ class PointRows(Part):
         out *= self._root
         return out
 
-    def forget(self):
+    def forget(self) -> None:
         """Let go of the derivatives: they are made again if they are wanted again."""
         self.__dict__.pop('J', None)
 
-    def _sizes(self, white):
+    def _sizes(self, white: Floats) -> Iterator[tuple[slice, Floats]]:
         for columns in self.levels_of.values():
             yield columns, np.abs(np.hypot.reduce(white[:, columns], axis=1))
 
-    def _weights(self, white):
+    def _weights(self, white: Floats) -> Floats:
         """Return weights of whitened residuals, (m, d), those of one level together."""
         w = np.ones_like(white)
         if len(white) >= FEWEST_JUDGED:
@@ -108,7 +119,7 @@ class PointRows(Part):
                 w[:, columns] = np.minimum(1.0, TAIL_SIGMAS / np.maximum(size, 1e-12))[:, None]**2
         return w
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the losses that the weights belong to: squares, logarithms beyond TAIL_SIGMAS."""
         total = 0.0
         for _, size in self._sizes(self.r / np.sqrt(self.weight / self.per_effective)):
@@ -117,14 +128,14 @@ class PointRows(Part):
                             + 2 * TAIL_SIGMAS**2 * np.log(far)).sum())
         return total / self.per_effective
 
-    def after(self, step, constants, reached):
+    def after(self, step: Floats, constants: Floats, reached: State) -> None:
         """Bring the residuals to where the step leads."""
         own = np.concatenate([step[self.k], np.broadcast_to(constants, (len(self.k), M))], axis=1)
         self.r = self.r + np.einsum('kij,kj->ki', self.J, own)
         if self.J_end is not None:
             self.r = self.r + np.einsum('kij,kj->ki', self.J_end, step[self.k + 1, SLOW])
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         n, corner, g_border = self.n, Total(), Total()
         for present, gather in self._intervals():
@@ -147,7 +158,7 @@ class PointRows(Part):
         out.corner += corner.sum
         out.g_border += g_border.sum
 
-    def _intervals(self):
+    def _intervals(self) -> Iterator[tuple[Ints, Gather]]:
         """
         Yield the intervals that have rows, some at a time, and what gathers rows by them.
 
@@ -160,19 +171,20 @@ class PointRows(Part):
             own = np.repeat(np.arange(len(counts)), counts)
             place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
-            def gather(x, rows=rows, own=own, place=place, counts=counts, most=most):
+            def gather(x: Floats, rows: slice = rows, own: Ints = own, place: Ints = place,
+                       counts: Ints = counts, most: int = most) -> Floats:
                 out = np.zeros((len(counts), most, *x.shape[1:]))
                 out[own, place] = x[rows]
                 return out.reshape(len(counts), -1, x.shape[2])
 
             yield present[some], gather
 
-    def _columns(self):
+    def _columns(self) -> tuple[Ints, Ints]:
         """Return the columns of J and of J_end among those of neighbours."""
         n = self.n
         return np.r_[0:n, 2 * n:2 * n + M], np.arange(n + SLOW.start, n + SLOW.stop)
 
-    def components(self, near):
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return for each level its quadratic sum and what is expected of it."""
         if len(self.k) < FEWEST_JUDGED:
             return {}
@@ -184,7 +196,7 @@ class PointRows(Part):
                         float(known[:, columns].sum() - taken[:, :, columns].sum()))
                 for level, columns in self.levels_of.items()}
 
-    def _taken(self, block, gather):
+    def _taken(self, block: Floats, gather: Gather) -> Floats:
         """Return what the unknowns take up of the rows of some intervals: (k, most, d)."""
         (own, end), J = self._columns(), gather(self.J)
         taken = ((J @ block[:, own[:, None], own]) * J).sum(axis=2)
@@ -192,9 +204,10 @@ class PointRows(Part):
             B = gather(self.J_end)
             taken = taken + 2 * ((J @ block[:, own[:, None], end]) * B).sum(axis=2)
             taken = taken + ((B @ block[:, end[:, None], end]) * B).sum(axis=2)
-        return taken.reshape(len(block), -1, self.r.shape[1])
+        out: Floats = taken.reshape(len(block), -1, self.r.shape[1])
+        return out
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what a unit error of each row does."""
         own, end = self._columns()
         parts = []

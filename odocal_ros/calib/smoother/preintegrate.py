@@ -17,13 +17,16 @@ follow from the same sums: a bias db turns R by -A db, A the integral of R. No l
 rotations by a prefix product, the rest by cumulative sums, a chunk of intervals at a time.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.smoother.imu_rows import ImuRows, mended, signals
+from odocal_ros.calib.smoother.imu_rows import ImuRows, mended, signals, SomeRows
 from odocal_ros.calib.smoother.state import ACCEL_AXIS, ACCEL_SIGNAL, GYRO_AXIS, GYRO_SIGNAL
+from odocal_ros.data.arrays import Ints
 from odocal_ros.nav.rotations import (
     exp_so3,
     matrix_from_quat,
@@ -65,11 +68,11 @@ class Intervals:
         """Return these sums with the derivatives of others."""
         return _with(self, other, 'AA', 'F', 'FF', 'turned', 'dv_by', 'dp_by', 'S_by')
 
-    def take(self, rows) -> 'Intervals':
+    def take(self, rows: slice) -> 'Intervals':
         """Return the intervals of a slice."""
         return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def shifted(self, gyro, accel_bias, accel) -> 'Intervals':
+    def shifted(self, gyro: Floats, accel_bias: Floats, accel: Floats) -> 'Intervals':
         """
         Return the sums for errors of the Imu that differ a little.
 
@@ -99,22 +102,28 @@ class Points:
         """Return these sums with the derivatives of others, of the same points."""
         return _with(self, other, 'F', 'FF')
 
-    def take(self, index) -> 'Points':
+    def take(self, index: Ints) -> 'Points':
         """Return the points that an index picks."""
         return Points(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
-def _with(sums, other, *names):
+Some = TypeVar('Some', Intervals, Points)
+
+
+def _with(sums: Some, other: Some, *names: str) -> Some:
     return replace(sums, **{name: getattr(other, name) for name in names})
 
 
-def turn(C, vectors):
+def turn(C: Floats, vectors: Floats) -> Floats:
     """Return C @ v row by row: (K, 3, 3), (K, 3)."""
-    return np.einsum('kij,kj->ki', C, vectors)
+    out: Floats = np.einsum('kij,kj->ki', C, vectors)
+    return out
 
 
-def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
-                 constants=None, owner=None, derivatives=True):
+def preintegrate(imu: ImuRows, gyro_bias: Floats, accel_bias: Floats,
+                 travel: Callable[[Floats], Floats], forward: Floats, t_points: Floats,
+                 constants: Floats | None = None, owner: Ints | None = None,
+                 derivatives: bool = True) -> tuple[Intervals, Points]:
     """
     Sum up all intervals.
 
@@ -142,7 +151,8 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
     Intervals, Points.
 
     """
-    out, points = [], []
+    out: list[Intervals] = []
+    points: list[Points] = []
     owner = owners(imu, t_points) if owner is None else owner
     for first, last, rows in imu.parts():
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
@@ -153,25 +163,25 @@ def preintegrate(imu: ImuRows, gyro_bias, accel_bias, travel, forward, t_points,
     return _joined(Intervals, out), _joined(Points, points)
 
 
-def owners(imu, t):
+def owners(imu: ImuRows, t: Floats) -> Ints:
     """Return the intervals between keyframes in which times lie: (m,)."""
     return np.clip(np.searchsorted(imu.t[imu.key], t, side='right') - 1, 0, len(imu.key) - 2)
 
 
-def _joined(cls, parts):
+def _joined(cls: type[Some], parts: list[Some]) -> Some:
     if len(parts) == 1:
         return parts[0]
     return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts])
                   for f in fields(cls)})
 
 
-def _mean(t, x, key):
+def _mean(t: Floats, x: Floats, key: Ints) -> Floats:
     """Return the means of x (n, 3) between keyframes, by the trapezoid rule: (K, 3)."""
     step = (x[:-1] + x[1:]) * (np.diff(t) / 2)[:, None]
     return np.add.reduceat(step, key[:-1]) / np.diff(t[key])[:, None]
 
 
-def _cross(a, M):
+def _cross(a: Floats, M: Floats) -> Floats:
     """Return [a x] M: (n, 3), (n, 3, 3)."""
     x, y, z = (a[:, i, None] for i in range(3))
     out = np.empty_like(M)
@@ -184,7 +194,8 @@ def _cross(a, M):
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
-    def __init__(self, imu, mended, gyro_bias, accel_bias, derivatives):
+    def __init__(self, imu: SomeRows, mended: tuple[Floats, Floats], gyro_bias: Floats,
+                 accel_bias: Floats, derivatives: bool) -> None:
         t, key = self.t, self.key = imu.t, imu.key
         self.f_b, self.turn = imu.f_b, imu.turn
         turn, f = mended
@@ -211,25 +222,25 @@ class _Chunk:
             self.F_before, self.F = self._sums(*ends)
             self.FF_before, self.FF = self._twice(self.F_before, *ends)
 
-    def _widen(self, x, like):
+    def _widen(self, x: Floats, like: Floats) -> Floats:
         return x.reshape(-1, *(1,) * (like.ndim - 1))
 
-    def _running(self, step):
+    def _running(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the sum before each step since the interval's begin, and each interval's sum."""
         total = np.cumsum(step, axis=0)
         before = total - step
         start = before[self.key[:-1]]
         return before - start[self.own], total[self.key[1:] - 1] - start
 
-    def _sums(self, at_start, at_end):
+    def _sums(self, at_start: Floats, at_end: Floats) -> tuple[Floats, Floats]:
         return self._running((at_start + at_end) * self._widen(self.dt / 2, at_start))
 
-    def _twice(self, before, at_start, at_end):
+    def _twice(self, before: Floats, at_start: Floats, at_end: Floats) -> tuple[Floats, Floats]:
         """Integrate once more what grows from ``before`` by rates linear over the step."""
         dt = self._widen(self.dt, at_start)
         return self._running(before * dt + (2 * at_start + at_end) * (dt**2 / 6))
 
-    def intervals(self, travel, forward) -> Intervals:
+    def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
         """Return the sums of each interval; without derivatives zeros stand for them."""
         ds = np.diff(travel(self.t)) / 2
         _, S = self._running((self.Rs + self.Re) * self._widen(ds, self.Rs))
@@ -254,15 +265,15 @@ class _Chunk:
                          _mean(self.t, self.f_b, self.key),
                          np.maximum.reduceat(self.dt, self.key[:-1]))
 
-    def _turned(self):
+    def _turned(self) -> tuple[Floats, Floats, Floats]:
         """Return what gyro bias and constants turn: before each step, in it, in all."""
         x = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
-                            signals(self)[:, GYRO_SIGNAL]], axis=1) / 2
+                            signals(self.turn, self.f_b, self.dt)[:, GYRO_SIGNAL]], axis=1) / 2
         step = (self.Rs + self.Re)[:, :, [0, 1, 2, *GYRO_AXIS]] * x[:, None, :]
         before, total = self._running(step)
         return before, step, total
 
-    def points(self, t, interval, first) -> Points:
+    def points(self, t: Floats, interval: Ints, first: int) -> Points:
         """Return the sums up to times within given intervals of the chunk."""
         j = np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
                     self.key[interval + 1] - 1)

@@ -9,9 +9,13 @@
 
 """Priors as a part, (S11): what is believed of biases, constants, and where a leg begins."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from odocal_ros.calib.smoother.part import hold, Part, WANTED
+from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.part import Here, hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
     BA,
     BG,
@@ -25,9 +29,14 @@ from odocal_ros.calib.smoother.state import (
     TYRES,
     V,
 )
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 # where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up
-START_SIGMAS = {'position': (P, 1e4), 'velocity': (V, 100.0),
+START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
+    'position': (P, 1e4), 'velocity': (V, 100.0),
                 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
 # believed of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
@@ -50,22 +59,22 @@ class PriorRows(Part):
 
     name = 'priors'
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.priors = here.state, here.priors
         absent = {'heading'} - {*problem.outside}
         absent |= {'speed_truncation'} if problem.leg.travel.coarse is None else set()
         self.shared = {name: where for name, where in SHARED.items() if name not in absent}
 
-    def _biases(self):
+    def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""
         state, priors = self.state, self.priors
         yield BG, state.gyro_bias[0], priors.gyro_bias
         yield BA, state.accel_bias[0], priors.accel_bias
 
-    def _constants_off(self):
+    def _constants_off(self) -> Floats:
         return self.state.constants - self.priors.centre
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations; the start is held but loosely, where it is."""
         for columns, sigma in START_SIGMAS.values():
             hold(out, 0, columns, sigma**2, 0.0)
@@ -75,18 +84,19 @@ class PriorRows(Part):
         out.corner[range(M), range(M)] += w
         out.g_border -= w * self._constants_off()
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
         total = sum((value**2 / sigma**2).sum() for _, value, sigma in self._biases())
-        return total + (self._constants_off()**2 / self.priors.constants**2).sum()
+        out: float = total + (self._constants_off()**2 / self.priors.constants**2).sum()
+        return out
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what the turn-on biases do."""
         first = self.to_told(near[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 
-    def shared_effects(self, covariance):
+    def shared_effects(self, covariance: Floats) -> Iterator[tuple[str, Floats]]:
         """Yield what errors do that are the same in every leg: names, (3, k)."""
         for name, where in self.shared.items():
             yield name, covariance[:WANTED, where] / self.priors.constants[where]

@@ -19,6 +19,7 @@ from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.outside import Heading, Velocity
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import Intervals, owners, Points, preintegrate
@@ -44,6 +45,9 @@ from odocal_ros.calib.smoother.state import (
     SPEED_OFFSET,
     State,
 )
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.coarse_speed import CoarseSpeed
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen
 
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
@@ -69,17 +73,18 @@ class Problem:
     use: np.ndarray          # (k,) bool, fixes within the keyframes
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
-    outside: dict            # velocity and heading within the keyframes, where there are any
+    outside: dict[str, Velocity | Heading]    # within the keyframes, where there are any
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
     first_levels: Levels = field(default_factory=lambda: Levels({}))
-    least: dict = field(default_factory=dict)     # levels
-    shaken: dict = field(default_factory=dict)    # levels of the Imu to come down from
-    per_effective: dict = field(default_factory=dict)     # velocity, heading: errors that are one
+    least: dict[str, float] = field(default_factory=dict)     # levels
+    shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
+    # velocity, heading, steps of speed: errors that are one
+    per_effective: dict[str, float] = field(default_factory=dict)
     kept: 'Sums | None' = None                    # the last, which the next fit may do with
 
     @classmethod
-    def of(cls, leg, config, imu=None):
+    def of(cls, leg: SmootherLeg, config: Config, imu: ImuRows | None = None) -> 'Problem':
         """Return the problem of a leg; ``imu``: its rows, with keyframes of one's own."""
         imu = ImuRows.of(leg, SPACING) if imu is None else imu
         t = imu.t[imu.key]
@@ -100,7 +105,8 @@ class Problem:
     @property
     def fix_sigma(self) -> float:
         """Return what the fixes usually state, m on a level axis."""
-        return np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
+        out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
+        return out
 
     def sums_near(self, state: State) -> 'Sums':
         """Return the last sums where they were made near a state, else those about it."""
@@ -157,14 +163,15 @@ class Sums:
             points={name: own.derived_as(other.points[name])
                     for name, own in self.points.items()})
 
-    def _apart(self, state):
+    def _apart(self, state: State) -> tuple[Floats, Floats, Floats]:
         a, b = state, self.about
         c = a.constants - b.constants
         gyro = (a.gyro_bias - b.gyro_bias)[:-1]
         gyro = np.concatenate([gyro, np.broadcast_to(c[GYRO], (len(gyro), len(c[GYRO])))], axis=1)
         return gyro, (a.accel_bias - b.accel_bias)[:-1], c
 
-    def near(self, state):
+    def near(self,
+             state: State) -> tuple[Intervals, dict[str, Points], Floats | float, float, float]:
         """Return the sums for a state nearby, and what they leave to be taken in: see Here."""
         gyro, accel, c = self._apart(state)
         later = c[ODO_DELAY], c[GNSS_DELAY]
@@ -172,7 +179,7 @@ class Sums:
             return self.intervals, self.points, 0.0, *later
         return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, *later
 
-    def hold_at(self, state, limits=SAME_SUMS) -> bool:
+    def hold_at(self, state: State, limits: Floats = SAME_SUMS) -> bool:
         """Tell whether a state is near enough: for first order, or within other limits."""
         gyro, accel, c = self._apart(state)
         rate, force = self.intervals.mean_rate, self.intervals.mean_force
@@ -183,14 +190,15 @@ class Sums:
         return bool(np.all(np.array([np.abs(a).max() for a in apart]) < limits))
 
 
-def _errors(signals, constants, axes, by):
+def _errors(signals: Floats, constants: Floats, axes: tuple[int, ...],
+            by: tuple[int, ...]) -> Floats:
     """Return what constants make of signals (K, s) on each axis: (K, 3)."""
     matrix = np.zeros((3, signals.shape[1]))
     matrix[axes, by] = constants
     return signals @ matrix.T
 
 
-def imperfect_sigmas(grade, duration):
+def imperfect_sigmas(grade: Grade, duration: float) -> Floats:
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
@@ -213,7 +221,7 @@ def imperfect_sigmas(grade, duration):
     return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
 
 
-def _priors(config, grade, leg) -> Priors:
+def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     sigma = np.full(M, np.inf)
     sigma[ODO_ARM] = sigma[GNSS_ARM] = max(config.gnss.lever_arm_sigma, 1e-4)
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
@@ -229,6 +237,6 @@ def _priors(config, grade, leg) -> Priors:
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)
 
 
-def _offset(coarse):
+def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:
     """Return what a speed in steps lacks, and its sigma: none of a step to half of it."""
     return (0.0, NO_ERROR) if coarse is None else (coarse.step / 4, coarse.step / 4)

@@ -9,11 +9,17 @@
 
 """What a fit shows of the vehicle beside its values: what varies, what is off, what that costs."""
 
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.calib.receiver_lag import lag_reasons
+from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.problem import imperfect_sigmas
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.problem import imperfect_sigmas, Problem
 from odocal_ros.calib.smoother.state import (
     BA,
     BY_SPEED,
@@ -27,9 +33,11 @@ from odocal_ros.calib.smoother.state import (
     PITCH,
     YAW,
 )
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.settings.grades import G, grade_of
+from odocal_ros.settings.config import Config
+from odocal_ros.settings.grades import G, Grade, grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 IMU_SCALES = tuple(i for i, name in enumerate(CONSTANTS) if name.startswith(
@@ -40,7 +48,7 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
-def model_floor(value, believed):
+def model_floor(value: Floats, believed: Floats) -> Floats:
     """
     Return what the model does not hold of scale, yaw and pitch, 1 sigma: (3,) relative, rad.
 
@@ -56,7 +64,7 @@ def model_floor(value, believed):
     return floor
 
 
-def beside(value, covariance, grade) -> dict:
+def beside(value: Floats, covariance: Floats, grade: Grade) -> dict[str, Any]:
     """
     Return what stands beside the estimates: figures by their names in calibration.json.
 
@@ -64,7 +72,7 @@ def beside(value, covariance, grade) -> dict:
     """
     sigma = np.sqrt(np.diag(covariance))
     # scale_by_speed: the slope at FAST
-    out: dict = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
+    out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
                  for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
                                        ('scale_by_time', BY_TIME, '1/s'))}
     for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
@@ -75,11 +83,11 @@ def beside(value, covariance, grade) -> dict:
     return out
 
 
-def _figure(value, unit):
+def _figure(value: float, unit: str) -> dict[str, Any]:
     return {'value': float(value), 'sigma': None, 'unit': unit}
 
 
-def _of_housing(found, found_sigma, sigma, misalignment):
+def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
     """
     Return the sigma of an angle against the housing's axes, where that of the Imu's own is given.
 
@@ -89,10 +97,11 @@ def _of_housing(found, found_sigma, sigma, misalignment):
     if not misalignment:
         return sigma
     told = min(1.0, found_sigma**2 / (2 * misalignment**2))
-    return np.sqrt(sigma**2 + misalignment**2 * (1 + told) / 2 + (found / 2)**2)
+    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + told) / 2 + (found / 2)**2)
+    return out
 
 
-def level_pitch(fit, near, widen) -> dict:
+def level_pitch(fit: Fit, near: Neighbours, widen: float) -> dict[str, Any]:
     """Return the pitch against what the accelerometer calls level: method_real's third pitch."""
     k = len(near) // 2
     n = fit.solved.step.shape[1]
@@ -103,7 +112,7 @@ def level_pitch(fit, near, widen) -> dict:
             'sigma': float(np.sqrt(row @ C @ row) * widen), 'unit': 'rad'}
 
 
-def remarks(problem, fit, sigma, config) -> list[Reason]:
+def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
     c, leg = fit.state.constants, problem.leg
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
@@ -125,7 +134,7 @@ def remarks(problem, fit, sigma, config) -> list[Reason]:
     return said + _arms(c, sigma, leg)
 
 
-def _noisy(problem, levels):
+def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
     """Say where fixes, white and slow errors together, err by more than they state."""
     slow = levels['slow'] * levels.correlation_time / 2 if levels.correlation_time else 0.0
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
@@ -135,7 +144,7 @@ def _noisy(problem, levels):
                    f'err {factor:.1f} times as much as their covariance says')]
 
 
-def _varies(fit, sigma):
+def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     """Say where the scale is not one number through the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
@@ -150,7 +159,7 @@ def _varies(fit, sigma):
                    'its mean over the way of this leg')]
 
 
-def _arms(c, sigma, leg):
+def _arms(c: Floats, sigma: Floats, leg: SmootherLeg) -> list[Reason]:
     """Say which lever arms lie far from where they are set."""
     said = []
     for name, where, axes in (('odometer.lever_arm', ODO_ARM, 'xy'),

@@ -9,12 +9,19 @@
 
 """Standstills as a part, (S10): no velocity at their keyframes, no turn in their intervals."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import Normal
 from odocal_ros.calib.smoother.motion import rotvec
-from odocal_ros.calib.smoother.part import hold, link, Part
+from odocal_ros.calib.smoother.part import Here, hold, link, Part
 from odocal_ros.calib.smoother.state import PHI, V
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import transpose
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 STILL_SPEED = 0.005                           # m/s at each keyframe of a standstill
 STILL_TURN = np.array([1e-4, 1e-4, 2e-5])     # rad/sqrt(s) about east, north, up
@@ -25,23 +32,25 @@ class Rests(Part):
 
     name = 'rests'
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.still = here.state, problem.still
         self.pair = self.still[:-1] & self.still[1:]
         self.turn_variance = STILL_TURN**2 * here.intervals.T[:, None]
 
-    def turned(self):
+    def turned(self) -> Floats:
         """Return the turn within each interval, rad: (K, 3)."""
         C = self.state.C_nb
-        return rotvec(C[1:] @ transpose(C[:-1]))
+        out: Floats = rotvec(C[1:] @ transpose(C[:-1]))
+        return out
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         weight = self.still[:, None] / STILL_SPEED**2
         hold(out, slice(None), V, 1.0, self.state.v_n, weight)
         link(out, PHI, 1.0, self.pair[:, None] / self.turn_variance, self.turned())
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
         total = (self.state.v_n[self.still]**2).sum() / STILL_SPEED**2
-        return total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()
+        out: float = total + (self.turned()[self.pair]**2 / self.turn_variance[self.pair]).sum()
+        return out

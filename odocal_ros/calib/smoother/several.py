@@ -9,28 +9,35 @@
 
 """Several legs of the smoother to one result, on the border of their equations."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
+from odocal_ros.calib.border import Border
 from odocal_ros.calib.budget import budget_table, correlations, PARAMETERS
 from odocal_ros.calib.causes import cause_of_change, change_in_words
 from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
-from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps
+from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
 from odocal_ros.calib.smoother.imperfect import weighed_together
 from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED
 from odocal_ros.calib.smoother.remarks import beside, model_floor
 from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 DAY = 86400e9        # ns
 
 
-def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
+def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
+                 numbers: Sequence[int] | None = None) -> MethodResult:
     """
     Combine what the smoother says of several legs of one vehicle.
 
@@ -88,11 +95,11 @@ def combine_legs(results, times_ns, config, numbers=None) -> MethodResult:
                         found.carried)
 
 
-def _joint(borders, steps) -> Joint:
+def _joint(borders: list[Border], steps: Floats) -> Joint:
     return joint(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED], CONSTANTS[:WANTED])
 
 
-def _changed(change, times_ns, numbers) -> Reason:
+def _changed(change: ScaleStep, times_ns: Ints, numbers: list[int]) -> Reason:
     """Say by how much the scale changed between two legs, since when, and why that may be."""
     relative = float(np.expm1(change.change))
     since = str(np.datetime64(int(times_ns[change.leg - 1]), 'ns').astype('datetime64[m]'))
@@ -101,11 +108,11 @@ def _changed(change, times_ns, numbers) -> Reason:
                   f'in {_name(numbers[change.leg])}: {cause_of_change(relative)}')
 
 
-def _name(number) -> str:
+def _name(number: int) -> str:
     return f'leg {number}' if number else 'the saved result'
 
 
-def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
+def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Say in which constants legs differ, and which leg differs most from the others."""
     J, said = len(found.deviation), []
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.spread}
@@ -125,7 +132,7 @@ def _disputed(found: Joint, numbers) -> tuple[Reason, ...]:
     return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
 
 
-def _sources(used, C, floor) -> tuple[Source, ...]:
+def _sources(used: Floats, C: Floats, floor: Floats) -> tuple[Source, ...]:
     """Return the budget: what is believed of the vehicle, and what is the legs' own."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
@@ -136,7 +143,8 @@ def _sources(used, C, floor) -> tuple[Source, ...]:
             Source('model', np.diag(floor)))
 
 
-def _details(found: Joint, value, C, sources, legs):
+def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...],
+             legs: int) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(C))
     return {
         'legs_used': legs, 'widened': found.factor,

@@ -12,10 +12,14 @@
 import numpy as np
 
 from odocal_ros.calib.result import Source
+from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.part import WANTED
+from odocal_ros.calib.smoother.priors import PriorRows
+from odocal_ros.data.arrays import Floats
 
 
-def shares(fit, neighbours) -> tuple[Source, ...]:
+def shares(fit: Fit, neighbours: Neighbours) -> tuple[Source, ...]:
     """
     Return the sources of error of (ln K, yaw, pitch); their covariances add up to the whole.
 
@@ -30,14 +34,15 @@ def shares(fit, neighbours) -> tuple[Source, ...]:
             flat = np.moveaxis(effects, -2, 0).reshape(WANTED, -1)
             covariance[name] = covariance.get(name, 0.0) + flat @ flat.T
     shared = [Source(name, effects, True)
-              for name, effects in parts['priors'].shared_effects(solved)]
+              for name, effects in fit.weighted[PriorRows].shared_effects(solved)]
     rest = solved[:WANTED, :WANTED] - sum(covariance.values()) - sum(
         s.effects @ s.effects.T for s in shared)
     own = [Source(name, _root(value)) for name, value in covariance.items()]
     return (*own, *shared, Source('standstill', _root(rest)))
 
 
-def _root(covariance):
+def _root(covariance: Floats) -> Floats:
     """Return a square root of a covariance, rounding below zero taken for zero."""
     value, vector = np.linalg.eigh(covariance)
-    return vector * np.sqrt(np.maximum(value, 0.0))
+    out: Floats = vector * np.sqrt(np.maximum(value, 0.0))
+    return out

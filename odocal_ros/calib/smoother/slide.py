@@ -15,14 +15,21 @@ goes straight on nothing tells a vehicle that goes a little askew from an Imu th
 there an ordinary road's noise is believed, whatever the residuals of the single seconds say.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from odocal_ros.calib.smoother.noise import TURNING_RATE
+from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.noise import Levels, TURNING_RATE
 from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.start import rest_bias
 from odocal_ros.data.pieces import chunks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import SWAY
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 # m/sqrt(s), least slide where turns test it. Tuned: the simulator's vehicles, which do not slide,
 # then have the yaw sigma of their errors (docs/decisions/0005)
@@ -36,7 +43,7 @@ NO_TURN = np.pi / 2    # rad turned in all: less than one crossroads tests nothi
 SIDEWAYS = ('side', 'side_turn', 'up')
 
 
-def turned(leg, imu) -> float:
+def turned(leg: SmootherLeg, imu: ImuRows) -> float:
     """Return the angle driven in turns, all counted positive, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
@@ -50,13 +57,13 @@ def turned(leg, imu) -> float:
     return float(angle[(angle > TURNING_RATE * T) & (way > 0.2 * T)].sum())    # m/s: moving
 
 
-def least_slide(angle) -> float:
+def least_slide(angle: float) -> float:
     """Return the least sideways and vertical noise, m/sqrt(s), by the angle turned in all, rad."""
     tested = np.clip((angle - NO_TURN) / NO_TURN, 0.0, 1.0)
     return float(ORDINARY_ROAD * (TURN_SLIDE / ORDINARY_ROAD)**tested)
 
 
-def assumed(problem, levels):
+def assumed(problem: 'Problem', levels: Levels) -> list[Reason]:
     """Say where a road's noise was assumed and not seen, and decides: reasons."""
     least = problem.least['side']
     if least < 2e-3**2 or all(      # m^2/s, worth a word

@@ -13,7 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 
 # factor on the variance of an interval from which it is a slip: it lies 3.7 sigmas off
@@ -29,14 +32,15 @@ class Slip:
     metres: float
 
 
-def along(fit, neighbours):
+def along(fit: Fit, neighbours: Neighbours) -> Floats:
     """Return what the odometer turned beyond the ground in each interval, m: (K,)."""
     rows = fit.weighted[MotionRows]
     estimate, _ = rows.road_noise(neighbours)
-    return -estimate[:, 0] * rows.along_size()
+    out: Floats = -estimate[:, 0] * rows.along_size()
+    return out
 
 
-def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:
+def find_slips(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> tuple[Slip, ...]:
     """Return the runs that lie far out along, by more than a count, m; largest first."""
     turned, t = along(fit, neighbours), fit.state.t
     noise, worth = 4 * float(np.sqrt(fit.levels['along'])), 0.05    # sigmas of a second; m
@@ -52,7 +56,7 @@ def find_slips(fit, neighbours, count=0.0) -> tuple[Slip, ...]:
                         key=lambda s: -abs(s.metres)))
 
 
-def slip_reasons(fit, slips, count=0.0):
+def slip_reasons(fit: Fit, slips: tuple[Slip, ...], count: float = 0.0) -> list[Reason]:
     """Say where the wheels slipped and how much, one by one or whenever the speed changes."""
     level = fit.levels.roots()
     # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts

@@ -9,11 +9,20 @@
 
 """Slow errors of fixes as a part, (S9): a Gauss-Markov process at the keyframes."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import Neighbours, Normal
 from odocal_ros.calib.smoother.least import LEAST
-from odocal_ros.calib.smoother.part import hold, JUMP, link, Part
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.part import Here, hold, JUMP, link, Part
 from odocal_ros.calib.smoother.state import SLOW
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 # prior of the correlation time, log-normal: s, and sigma of the logarithm. Physical: errors of
 # receivers over open land stay for a minute or several (docs/decisions/0009)
@@ -31,24 +40,24 @@ class SlowError(Part):
 
     name = 'slow'
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.T = here.state, here.intervals.T
         self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
         self.told = not np.isnan(problem.fix_time)
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return first levels by what the fixes state, and their least."""
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
             **dict.fromkeys(('slow', 'slow_up'), 2 * LEAST.fix**2 / USUAL_TIME),
             'correlation_time': 5.0}      # s: less is not told from white
 
-    def in_use(self, levels):
+    def in_use(self, levels: Levels) -> bool:
         """Tell whether slow errors are estimated."""
         return levels.correlation_time > 0
 
-    def weigh(self, levels):
+    def weigh(self, levels: Levels) -> None:
         """Set decay (K, 1), variances of what drives it (K, 3) and of its values (3,), m^2."""
         decay = np.exp(-self.T / levels.correlation_time)
         gain = np.array([levels['slow'], levels['slow'], levels['slow_up']])
@@ -57,22 +66,23 @@ class SlowError(Part):
         self.decay = decay[:, None]
         self.log_R = np.log(self.drive).sum() + np.log(self.power).sum()
 
-    def residual(self):
+    def residual(self) -> Floats:
         """Return what it does beyond its decay: (K, 3) m."""
         s = self.state.slow_n
         return s[1:] - self.decay * s[:-1]
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         link(out, SLOW, self.decay, 1 / self.drive, self.residual())
         hold(out, 0, SLOW, self.power, self.state.slow_n[0])
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the sum of squares, in sigmas."""
         first = (self.state.slow_n[0]**2 / self.power).sum()
-        return (self.residual()**2 / self.drive).sum() + first
+        out: float = (self.residual()**2 / self.drive).sum() + first
+        return out
 
-    def components(self, near):
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return of each level its quadratic sum and what is expected of it."""
         i, s = np.arange(SLOW.start, SLOW.stop), self.state.slow_n
         a, q, r = self.decay, self.drive, self.residual()
@@ -80,21 +90,22 @@ class SlowError(Part):
         num, den = r**2 / q, 1 - var / q
         begin, begin_var = s[0]**2 / self.power, near[0][i, i] / self.power
         level = num.sum(axis=0) + begin, den.sum(axis=0) + (1 - begin_var)
-        found = {'slow': tuple(float(x[:2].sum()) for x in level),
-                 'slow_up': tuple(float(x[2]) for x in level)}
+        q_sum, expected = level
+        found = {'slow': (float(q_sum[:2].sum()), float(expected[:2].sum())),
+                 'slow_up': (float(q_sum[2]), float(expected[2]))}
         if not self.told:
             found['correlation_time'] = self._time(
                 r * s[:-1] + both - a * before, num - den, begin + begin_var - 1)
         return found
 
-    def _variances(self, near):
+    def _variances(self, near: Neighbours) -> tuple[Floats, Floats, Floats]:
         """Return variances left: of the value before, with that after, of the drive: (K, 3)."""
         i, n, a = np.arange(SLOW.start, SLOW.stop), self.n, self.decay
         before, both, after = np.split(near.entries(np.r_[i, i, n + i], np.r_[i, n + i, n + i]), 3,
                                        axis=1)
         return before, both, after + a**2 * before - 2 * a * both
 
-    def jumps(self, near):
+    def jumps(self, near: Neighbours) -> Floats:
         """
         Return what drives the error in each interval, on the axis that it moves most: (2, K, 1).
 
@@ -105,7 +116,7 @@ class SlowError(Part):
         most = np.argmax(np.abs(z) / np.sqrt(seen), axis=1)[:, None]
         return np.stack([np.take_along_axis(x, most, axis=1) for x in (z, seen)])
 
-    def _time(self, product, excess, begin):
+    def _time(self, product: Floats, excess: Floats, begin: Floats) -> tuple[float, float]:
         """
         Return the score of the logarithm of the correlation time and its information, as a level.
 
@@ -121,7 +132,7 @@ class SlowError(Part):
         information = 3 * float((da**2 / (1 - a**2) + dq**2 / 2).sum() + 0.5) + TIME_SPREAD**-2
         return information + score, information
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what unit errors of what drives it, and of its first value, do."""
         told, n = self.all_told(near), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)

@@ -20,14 +20,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import Fit, fit, Outline
+from odocal_ros.calib.smoother.estimate import Fit, fit, Outline, Trace
 from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME
+from odocal_ros.data.arrays import Floats
 
 WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
 
 
-def correlation(t, residual, width=2.0):
+def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
     """
     Return the correlation of neighbouring bins of residuals and its sigma, were they white.
 
@@ -47,7 +49,7 @@ def correlation(t, residual, width=2.0):
             float(1 / np.sqrt(residual.shape[1] * len(beside))))
 
 
-def are_slow(problem, first: Fit) -> bool:
+def are_slow(problem: Problem, first: Fit) -> bool:
     """Tell whether the errors of the fixes stay for a while: as told, or by a first fit."""
     if not np.isnan(problem.fix_time):
         return problem.fix_time > 0.0
@@ -60,7 +62,7 @@ def are_slow(problem, first: Fit) -> bool:
     return alike > max(0.05, 1.5 * sigma) or _hidden(t, first.levels['fix'])
 
 
-def _hidden(t, level) -> bool:
+def _hidden(t: Floats, level: float) -> bool:
     """
     Tell whether the fixes of a short leg scatter less than they say.
 
@@ -71,10 +73,11 @@ def _hidden(t, level) -> bool:
     t : (m,) s.   level : variance of the scatter, of the stated; good to 1 / sqrt(m) of itself,
     two components each.
     """
-    return t[-1] - t[0] < 90.0 and level < 1 - 4 / np.sqrt(len(t))
+    out: bool = t[-1] - t[0] < 90.0 and level < 1 - 4 / np.sqrt(len(t))
+    return out
 
 
-def with_slow_errors(problem, first: Outline, trace=None) -> Fit:
+def with_slow_errors(problem: Problem, first: Outline, trace: Trace | None = None) -> Fit:
     """
     Return the fit with slow fix errors beside the white ones.
 

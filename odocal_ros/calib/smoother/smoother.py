@@ -14,22 +14,24 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import fit
+from odocal_ros.calib.smoother.estimate import Fit, fit, Trace
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import no_imu, not_settled, outcome, refused
-from odocal_ros.calib.smoother.point_rows import alike
+from odocal_ros.calib.smoother.point_rows import alike, PointRows
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
 from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import State
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 
 
-def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
+def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
     """
     Estimate scale, yaw and pitch mounting of a leg from all its samples.
 
@@ -65,14 +67,14 @@ def smooth(leg: SmootherLeg, config, trace=None) -> MethodResult:
     return outcome(leg, problem, best, config)
 
 
-def best_fit(problem, config, trace=None):
+def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
     """Return the likeliest fit, what is imperfect in odometer and Imu judged."""
     # no name for what is passed on: the equations of one fit at a time
     return judge_imperfect(problem, judge_offset(
         problem, likeliest_fit(problem, config, trace), trace), trace)
 
 
-def likeliest_fit(problem, config, trace=None):
+def likeliest_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
     """Return the likeliest fit of those from several starts, slow fix errors judged."""
     fits = []
     start = first_state(problem.leg, problem.imu, problem.priors)
@@ -88,12 +90,14 @@ def likeliest_fit(problem, config, trace=None):
         # passes that tell starts apart, and slow fix errors from white ones
         fits.append(fit(problem, one.state, levels, 3, trace=trace))
     best = max(fits, key=lambda f: f.likelihood)
-    problem.per_effective = {name: alike(best.weighted.parts[name])
-                    for name in (*problem.outside, SpeedSteps.name) if name in best.weighted.parts}
-    slow, best, fits = are_slow(problem, best), best.outline(), []
+    problem.per_effective = {
+        name: alike(part) for name, part in best.weighted.parts.items()
+        if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}
+    slow, about = are_slow(problem, best), best.outline()
+    del best, fits      # the equations of one fit at a time
     if slow:
-        return with_slow_errors(problem, best, trace)
-    return fit(problem, best.state, best.levels, about=best, trace=trace)
+        return with_slow_errors(problem, about, trace)
+    return fit(problem, about.state, about.levels, about=about, trace=trace)
 
 
 def too_little(fixes: int, seconds: float) -> Reason | None:
@@ -105,7 +109,8 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
                   f'needs {fewest} in {shortest:.0f} s at least')
 
 
-def bound(leg: SmootherLeg, config, truth: State, levels: Levels, imperfect=None):
+def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
+          imperfect: Floats | None = None) -> Floats:
     """
     Return the covariance of the constants at a given state, covariance only.
 
@@ -133,7 +138,8 @@ def bound(leg: SmootherLeg, config, truth: State, levels: Levels, imperfect=None
     return solve(equations.at(levels).normal()).covariance
 
 
-def keyframe_times(leg: SmootherLeg, config):
+def keyframe_times(leg: SmootherLeg, config: Config) -> Floats:
     """Return the times of the keyframes of a leg, s: (N,)."""
     problem = Problem.of(leg, config)
-    return problem.imu.t[problem.imu.key]
+    out: Floats = problem.imu.t[problem.imu.key]
+    return out

@@ -18,11 +18,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit
-from odocal_ros.calib.smoother.state import SPEED_OFFSET
+from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import Priors, SPEED_OFFSET
 
 
-def judge_offset(problem, now: Fit, trace=None) -> Fit:
+def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     """
     Return a fit with the offset of a coarse speed taken as that of truncation or of rounding.
 
@@ -50,7 +51,7 @@ def judge_offset(problem, now: Fit, trace=None) -> Fit:
     return replace(last, iterations=about.iterations + last.iterations)
 
 
-def _held(priors, value, sigma):
+def _held(priors: Priors, value: float, sigma: float) -> Priors:
     """Return priors with the offset known."""
     constants, centre = priors.constants.copy(), priors.centre.copy()
     constants[SPEED_OFFSET], centre[SPEED_OFFSET] = sigma, value

@@ -14,9 +14,12 @@ The way that such a speed adds up to is not used along the vehicle (noise.py): i
 a cell, for as long as the value stands.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from odocal_ros.calib.smoother.motion import gravity_n, means_by_way, speeding_up, varies_with
+from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
@@ -36,6 +39,11 @@ from odocal_ros.calib.smoother.state import (
     V,
     YAW,
 )
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.coarse_speed import Told
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 class SpeedSteps(PointRows):
@@ -44,7 +52,7 @@ class SpeedSteps(PointRows):
     name, source = 'steps', 'speed_steps'
     levels_of = {'steps': slice(0, 1)}
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         leg, state, points = problem.leg, here.state, here.points[self.name]
         self.state, self.points = state, points
         self.told, self.k = _within(problem), points.interval
@@ -74,17 +82,18 @@ class SpeedSteps(PointRows):
         self.raw = (self.said - self.speed + self.gained * here.odo_later)[:, None]
 
     @classmethod
-    def there(cls, problem):
+    def there(cls, problem: 'Problem') -> bool:
         """Tell whether the odometer sends such a speed."""
         return problem.leg.by_steps and len(_within(problem).t) > 0
 
     @classmethod
-    def times(cls, problem, constants):
+    def times(cls, problem: 'Problem', constants: Floats) -> Floats:
         """Return when the speeds were so, s."""
-        return _within(problem).t - constants[ODO_DELAY]
+        out: Floats = _within(problem).t - constants[ODO_DELAY]
+        return out
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """
         Return the first level, a factor on the variances by the grid, and the least.
 
@@ -92,11 +101,11 @@ class SpeedSteps(PointRows):
         """
         return {'steps': 1.0}, {'steps': 0.25}
 
-    def stated(self, rows):
+    def stated(self, rows: Floats) -> Floats:
         """Return rows in the sigmas that the grid gives."""
         return rows / self.sigma[:, None, None]
 
-    def jacobians(self, n):
+    def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """Return derivatives by the keyframe before and by constants: (m, 1, n), (m, 1, M)."""
         state, ahead, v, tau = self.state, self.ahead, self.v_n, self.points.tau[:, None]
         J, c = np.zeros((len(v), n)), np.zeros((len(v), M))
@@ -121,7 +130,8 @@ class SpeedSteps(PointRows):
         return J[:, None], c[:, None]
 
 
-def _within(problem):
+def _within(problem: 'Problem') -> Told:
     """Return what the speeds tell within the keyframes."""
-    t = problem.imu.t[problem.imu.key]
-    return problem.leg.travel.coarse.told.between(t[0], t[-1])
+    t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
+    assert coarse is not None, 'by_steps'
+    return coarse.told.between(t[0], t[-1])

@@ -22,9 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from odocal_ros.calib.check import pieces, steady
+from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.part import Total
-from odocal_ros.calib.smoother.preintegrate import preintegrate
-from odocal_ros.calib.smoother.state import LN_K, M, PITCH, State, YAW
+from odocal_ros.calib.smoother.preintegrate import Intervals, preintegrate
+from odocal_ros.calib.smoother.state import LN_K, M, PITCH, Priors, State, YAW
+from odocal_ros.data.arrays import Bools, Complexes, Floats
 from odocal_ros.data.pieces import by_row, chunks
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
@@ -44,9 +47,9 @@ class Start:
     fix_spread: float       # m, of the fixes about the track
 
 
-def standing(leg, t):
+def standing(leg: SmootherLeg, t: Floats) -> Bools:
     """Tell which of the times lie inside a standstill, half a second from its ends: (N,) bool."""
-    def within(t):
+    def within(t: Floats) -> Bools:
         inside = np.zeros(len(t), bool)
         for begin, end in leg.standstills:
             inside |= (t >= begin + 0.5) & (t <= end - 0.5)
@@ -54,7 +57,7 @@ def standing(leg, t):
     return by_row(within, t)
 
 
-def rest_bias(leg, imu):
+def rest_bias(leg: SmootherLeg, imu: ImuRows) -> tuple[Floats, float]:
     """Return the mean turn rate of all standstills, (3,), and how long they last, s."""
     inside = standing(leg, imu.t)
     still = inside[:-1] & inside[1:]
@@ -68,7 +71,7 @@ def rest_bias(leg, imu):
     return turned.sum / length, length
 
 
-def first_state(leg, imu, priors, yaw=None) -> Start:
+def first_state(leg: SmootherLeg, imu: ImuRows, priors: Priors, yaw: float | None = None) -> Start:
     """
     Return a state to start from.
 
@@ -107,11 +110,11 @@ def first_state(leg, imu, priors, yaw=None) -> Start:
         psi = chi + yaw
     elif yaw_sigma > 0.2:       # rad: the nearest of four ways to mount is in doubt
         psi = chi
-    return Start(_state(leg, t, C_nL(psi) @ C_Lk, bias, track, wrap(psi - chi)),
+    return Start(_state(leg, t, C_nL(psi) @ C_Lk, bias, track, float(wrap(psi - chi))),
                  yaw_sigma, track.spread)
 
 
-def _sums(leg, imu, bias):
+def _sums(leg: SmootherLeg, imu: ImuRows, bias: Floats) -> tuple[Intervals, Floats]:
     K = len(imu.key) - 1
     sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
                            np.array([1.0, 0.0, 0.0]), np.empty(0), derivatives=False)
@@ -122,7 +125,8 @@ def _sums(leg, imu, bias):
     return sums, C
 
 
-def _level(leg, sums, C_0k, bias_sigma):
+def _level(leg: SmootherLeg, sums: Intervals, C_0k: Floats,
+           bias_sigma: Floats) -> tuple[Floats, Floats]:
     """Return up in the frame of the first keyframe and the change of the gyro bias: (3,) each."""
     C, T = C_0k[:-1], sums.T
     force = np.einsum('kij,kj->ki', C, sums.dv) / T[:, None]
@@ -149,7 +153,7 @@ def _level(leg, sums, C_0k, bias_sigma):
 class _Track:
     """The odometer's track in the level frame, x of b taken as forward, laid on the fixes."""
 
-    def __init__(self, leg, t, C_Lk, sums):
+    def __init__(self, leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals) -> None:
         step = (C_Lk[:-1] @ sums.S)[:, :2, 0]
         self.X = np.concatenate([[0.0], np.cumsum(step[:, 0] + 1j * step[:, 1])])
         inside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
@@ -185,7 +189,7 @@ class _Track:
         laid = np.interp(t_fix, t, self.place)
         self.spread = max(float(np.median(np.abs(laid - z))) / 1.18, 1e-3)
 
-    def _place(self, t, t_fix, z, sums):
+    def _place(self, t: Floats, t_fix: Floats, z: Complexes, sums: Intervals) -> Complexes:
         steps = np.diff(self.X) * np.exp(1j * (self.chi_at[:-1] + self.chi_at[1:]) / 2) * self.K
         path = np.concatenate([[0.0], np.cumsum(steps)])
         self.path = path
@@ -193,7 +197,7 @@ class _Track:
         return path + _smooth(t, t_fix, off.real) + 1j * _smooth(t, t_fix, off.imag)
 
 
-def _line(t, y):
+def _line(t: Floats, y: Floats) -> tuple[float, float]:
     """Return value at the first time and slope of a line through points, by medians."""
     if len(t) < 3:
         return float(np.median(y)), 0.0
@@ -205,22 +209,24 @@ def _line(t, y):
     return float(np.median(y - slope * (t - t[0]))), slope
 
 
-def _smooth(t, t_fix, y, window=20.0):
+def _smooth(t: Floats, t_fix: Floats, y: Floats, window: float = 20.0) -> Floats:
     """Return medians over windows, interpolated to t: outliers do not count."""
     if not len(y):
         return np.zeros(len(t))
     cells = np.floor((t_fix - t_fix[0]) / window).astype(int)
     at = np.unique(cells)
     middle = [np.median(t_fix[cells == c]) for c in at]
-    return np.interp(t, middle, [np.median(y[cells == c]) for c in at])
+    out: Floats = np.interp(t, middle, [np.median(y[cells == c]) for c in at])
+    return out
 
 
-def _speed(leg, t):
+def _speed(leg: SmootherLeg, t: Floats) -> Floats:
     s = leg.travel.at
     return (s(t + SPEED_WINDOW) - s(t - SPEED_WINDOW)) / (2 * SPEED_WINDOW)
 
 
-def _heading(leg, t, C_Lk, sums, track):
+def _heading(leg: SmootherLeg, t: Floats, C_Lk: Floats, sums: Intervals,
+             track: _Track) -> tuple[float, float]:
     """
     Return the rotation from the level frame to n that the accelerations ask for, and its sigma.
 
@@ -255,7 +261,8 @@ def _heading(leg, t, C_Lk, sums, track):
     return float(np.angle(x[0])), float(sigma)
 
 
-def _state(leg, t, C_nb, bias, track, yaw):
+def _state(leg: SmootherLeg, t: Floats, C_nb: Floats, bias: Floats, track: _Track,
+           yaw: float) -> State:
     N = len(t)
     turned = np.exp(1j * (track.chi_at - track.chi))
     c, s = turned.real, turned.imag

@@ -135,9 +135,10 @@ class State:
     @property
     def C_bv(self) -> Floats:
         """Return the rotation from vehicle to body axes, roll 0: (3, 3)."""
-        return C_bv(self.constants[YAW], self.constants[PITCH])
+        out: Floats = C_bv(self.constants[YAW], self.constants[PITCH])
+        return out
 
-    def moved(self, step, step_constants) -> 'State':
+    def moved(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state with an increment of every unknown: (N, n), (M,)."""
         slow = self.slow_n + step[:, SLOW] if step.shape[1] > BARE else self.slow_n
         return replace(
@@ -148,7 +149,7 @@ class State:
             constants=upright(self.constants + step_constants))
 
 
-def upright(constants):
+def upright(constants: Floats) -> Floats:
     """
     Return constants whose pitch is within a quarter turn: the same forward axis, the top up.
 
@@ -161,12 +162,12 @@ def upright(constants):
     return out
 
 
-def C_bv(yaw, pitch):
+def C_bv(yaw: float, pitch: float) -> Floats:
     """Return the rotation from vehicle to body axes for mounting angles, rad, roll 0."""
     return matrix_from_rpy([0.0, pitch, yaw]).T
 
 
-def C_bv_gradient(yaw, pitch):
+def C_bv_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
     """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     by_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])

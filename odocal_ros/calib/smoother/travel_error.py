@@ -9,11 +9,20 @@
 
 """The odometer's rounding as a part, (S6): how far a reading at a keyframe may be off."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import Neighbours, Normal
 from odocal_ros.calib.smoother.least import LEAST
-from odocal_ros.calib.smoother.part import hold, Part
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.part import Here, hold, Part
 from odocal_ros.calib.smoother.state import E
+from odocal_ros.data.arrays import Bools, Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 class TravelError(Part):
@@ -21,34 +30,35 @@ class TravelError(Part):
 
     name = 'travel'
 
-    def __init__(self, problem, here):
+    def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.still = here.state, problem.still
         self.least = problem.least['travel']
         self.weight = once_a_rest(problem.still)
 
     @classmethod
-    def first_levels(cls, problem):
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
         """Return the level of rounding to a count, which is the least too."""
         leg = problem.leg
         least = LEAST.travel / leg.rough_scale
         level = {'travel': max(leg.travel.quantum**2 / 12, least**2)}
         return level, level
 
-    def weigh(self, levels):
+    def weigh(self, levels: Levels) -> None:
         """Set the variance, scale units squared."""
         self.variance = max(self.least, levels['travel'])
         self.log_R = self.weight.sum() * np.log(self.variance)
 
-    def add(self, out):
+    def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
         hold(out, slice(None), slice(E, E + 1), self.variance, self.state.travel_error[:, None],
              self.weight[:, None])
 
-    def cost(self):
+    def cost(self) -> float:
         """Return the weighted sum of squares."""
-        return (self.weight * self.state.travel_error**2).sum() / self.variance
+        out: float = (self.weight * self.state.travel_error**2).sum() / self.variance
+        return out
 
-    def components(self, near):
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return of the level its quadratic sum and what is expected of it, in motion."""
         e, moving = self.variance, ~self.still
         last = near[-1][self.n + E, self.n + E]
@@ -56,7 +66,7 @@ class TravelError(Part):
         x = self.state.travel_error[moving]
         return {'travel': (float((x**2).sum() / e), float((1 - spread[moving] / e).sum()))}
 
-    def effects(self, near):
+    def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what a unit error of each reading does."""
         told = self.all_told(near)
         root = np.sqrt(self.weight / self.variance)
@@ -64,7 +74,7 @@ class TravelError(Part):
         yield 'quantisation', travel[:, :, None]
 
 
-def once_a_rest(still):
+def once_a_rest(still: Bools) -> Floats:
     """
     Return the weight of what is believed of the rounding at each keyframe, (N,).
 

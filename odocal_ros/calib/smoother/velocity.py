@@ -9,12 +9,16 @@
 
 """A velocity from outside: that of the GNSS antenna, at the times it was sent for."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
+from odocal_ros.calib.smoother.outside import Velocity
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
-from odocal_ros.calib.smoother.preintegrate import turn
+from odocal_ros.calib.smoother.part import Here
+from odocal_ros.calib.smoother.preintegrate import Points, turn
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
@@ -27,10 +31,14 @@ from odocal_ros.calib.smoother.state import (
     M,
     PHI,
     PITCH,
+    State,
     V,
     YAW,
 )
 from odocal_ros.nav.rotations import skew
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 
 class VelocityRows(OutsideRows):
@@ -39,20 +47,21 @@ class VelocityRows(OutsideRows):
     name, source = 'velocity', 'fix_velocity'
     levels_of = {'velocity': slice(0, 2), 'velocity_up': slice(2, 3)}
 
-    def rows(self, problem, here):
+    def rows(self, problem: 'Problem', here: Here) -> Rows:
         """Return the rows."""
         return _velocity(problem, here.state, here.points['velocity'], here.fix_later)
 
     @staticmethod
-    def least(sent):
+    def least(sent: Velocity) -> dict[str, float]:
         """Return the least levels."""
         sigma = np.median(sent.sigma, axis=0)
         return {'velocity': (LEAST.velocity / sigma[0])**2,
                 'velocity_up': (LEAST.velocity / sigma[2])**2}
 
 
-def _velocity(problem, state, points, later):
+def _velocity(problem: 'Problem', state: State, points: Points, later: float) -> Rows:
     leg, sent, k = problem.leg, problem.outside['velocity'], points.interval
+    assert isinstance(sent, Velocity)
     C, tau = state.C_nb[k], points.tau[:, None]
     C_t = C @ points.R
     arm_v = leg.antenna_arm - leg.imu_arm + state.constants[GNSS_ARM]
@@ -75,4 +84,4 @@ def _velocity(problem, state, points, later):
     c[:, :, GNSS_DELAY] = faster
     c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * points.rate[:, 2:]
     c[:, :, ACCEL] = C @ points.F
-    return Rows(k, raw, J, c, 1 / sent.sigma)
+    return Rows(k, raw, J, c, np.asarray(1 / sent.sigma))

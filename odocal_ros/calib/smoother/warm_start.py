@@ -28,6 +28,7 @@ from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW
 from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
+from odocal_ros.data.arrays import Floats
 
 
 def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
@@ -79,7 +80,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     on['travel_error'][n:] = 0.0
     f = state.scale * state.forward
 
-    def travel(t):
+    def travel(t: Floats) -> Floats:
         return leg.travel.at(t + c[ODO_DELAY])
     sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
                            f, np.empty(0), c, derivatives=False)

@@ -25,9 +25,11 @@ from odocal_ros.calib.wheels.model import make_bins
 from odocal_ros.calib.wheels.rounds import Rounds
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.settings.config import Config
 
 
-def solve(leg: WheelLeg, config, turn_rate=True, n_bins=100) -> Solution | None:
+def solve(leg: WheelLeg, config: Config, turn_rate: bool = True,
+          n_bins: int = 100) -> Solution | None:
     """
     Estimate scale, ratio, heading and track width of a leg.
 

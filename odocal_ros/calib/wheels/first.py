@@ -13,12 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import State
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS, RAYLEIGH_MEDIAN
 
 
-def thinned(leg, rate=20.0):
+def thinned(leg: WheelLeg, rate: float = 20.0) -> WheelLeg:
     """
     Return a leg with no more epochs than a rate, Hz: of sums, nothing is lost.
 
@@ -27,11 +29,13 @@ def thinned(leg, rate=20.0):
     t = leg.left.t
     step = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / rate))
     pick = np.unique(np.append(np.arange(0, len(t), step), len(t) - 1))
-    return replace(leg, **{side: Track(*(getattr(getattr(leg, side), name)[pick] for name in (
-        't', 'q_nb', 's', 'P'))) for side in ('left', 'right')})
+
+    def few(track: Track) -> Track:
+        return Track(track.t[pick], track.q_nb[pick], track.s[pick], track.P[pick])
+    return replace(leg, left=few(leg.left), right=few(leg.right))
 
 
-def first_state(leg, inside, variance):
+def first_state(leg: WheelLeg, inside: Bools, variance: Floats) -> tuple[State, Floats]:
     """Return a first state by the mean track against the fixes in the level, and residuals."""
     t = leg.t_fix[inside]
     P = ((leg.left.at(t) + leg.right.at(t) - leg.left.at(leg.start.t) - leg.right.at(leg.start.t))
@@ -53,7 +57,7 @@ def first_state(leg, inside, variance):
     return state, (y - A @ x).reshape(-1, 2)
 
 
-def near_neighbours(residual, sigma, beside=7):
+def near_neighbours(residual: Floats, sigma: Floats, beside: int = 7) -> Bools:
     """
     Tell which fixes lie with those beside them.
 
@@ -67,4 +71,5 @@ def near_neighbours(residual, sigma, beside=7):
     windows = np.lib.stride_tricks.sliding_window_view(padded, span, axis=0)
     off = np.hypot(*(residual - np.median(windows, axis=-1)).T)
     usual = max(np.median(off / sigma) / RAYLEIGH_MEDIAN, 0.2)
-    return off <= OUTLIER_SIGMAS * usual * sigma
+    out: Bools = off <= OUTLIER_SIGMAS * usual * sigma
+    return out

@@ -15,14 +15,17 @@ track against that of the way, be it a mounting angle or a level that drifts.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.two_point import PITCH_LIMIT, PITCH_PRIOR
 from odocal_ros.calib.wheels.judge_noise import slow_means, spread
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import Bins, Equations, State
 from odocal_ros.calib.wheels.noise import node_covariance
+from odocal_ros.data.arrays import Bools, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,7 @@ class Height:
     known: bool
 
 
-def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
+def solve_height(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since: float) -> Height:
     """Solve the vertical part: height at the start, pitch, and tilt at the nodes."""
     n, a = len(eq.turn), leg.alignment
     unknown = Height(0.0, PITCH_PRIOR, float(np.nan_to_num(state.start_n[2])),
@@ -84,7 +87,7 @@ def solve_height(leg, eq: Equations, bins: Bins, state: State, since) -> Height:
                   np.maximum(tilt.reshape(2, -1).mean(axis=0), 0.0), True)
 
 
-def _fix_noise(leg, bins, r, use):
+def _fix_noise(leg: WheelLeg, bins: Bins, r: Floats, use: Bools) -> Floats:
     """
     Return the covariance of bin means of the heights, (N, N) m^2.
 
@@ -99,7 +102,8 @@ def _fix_noise(leg, bins, r, use):
     return np.diag(0.5 * white + 1e-6) + 0.5 * root[:, None] * slow * root
 
 
-def _solve(V, r, X, use, LQ, state):
+def _solve(V: Floats, r: Floats, X: Floats, use: Bools, LQ: Floats,
+           state: State) -> tuple[Any, ...] | None:
     inverse = np.linalg.inv(V[np.ix_(use, use)])
     right = X[use].T @ inverse
     # the prior of the pitch, weakly of the height: 3 km
@@ -115,7 +119,7 @@ def _solve(V, r, X, use, LQ, state):
     return delta, covariance, LQ[use].T @ left, P, -(covariance @ right @ LQ[use])[1], off
 
 
-def _climb(eq, Q, L, P, cross, sigma):
+def _climb(eq: Equations, Q: Floats, L: Floats, P: Floats, cross: Floats, sigma: float) -> float:
     """Return the mean variance of the climb of the track after the fit, rad^2."""
     n = len(eq.turn)
     level = eq.forward[:, :2] / np.maximum(np.hypot(*eq.forward[:, :2].T), 1e-9)[:, None]

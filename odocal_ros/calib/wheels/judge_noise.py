@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import FEWEST_SCATTERED
 from odocal_ros.calib.wheels.model import Bins
+from odocal_ros.data.arrays import Floats
 
 # grids of sizes, 0 for none: slow errors of the fixes, of their stated variance; slip of a wheel,
 # m/sqrt(s)
@@ -65,7 +66,7 @@ class TurnNoise:
     counts: float = 1.0
 
 
-def white_share(t_fix, residual, covariance_n, bins: Bins):
+def white_share(t_fix: Floats, residual: Floats, covariance_n: Floats, bins: Bins) -> float:
     """
     Return the variance of the fixes' errors from one to the next, of that stated.
 
@@ -79,7 +80,8 @@ def white_share(t_fix, residual, covariance_n, bins: Bins):
     return max(float(step[near].mean()), 1e-4)      # of the stated variance: keeps it solvable
 
 
-def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise:
+def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
+                covariance_n: Floats, white: float, told: float) -> FixNoise:
     """
     Judge the slow part of the fixes' errors.
 
@@ -128,7 +130,7 @@ def judge_fixes(r, X, known, bins, t_fix, covariance_n, white, told) -> FixNoise
                     float(times[best[0]]) if best[1] else np.nan, W + slow)
 
 
-def judge_turns(r, X, known, counts, walk) -> TurnNoise:
+def judge_turns(r: Floats, X: Floats, known: Floats, counts: Floats, walk: Floats) -> TurnNoise:
     """
     Judge how far rounding to counts and slips make the wheels' turn err.
 
@@ -153,7 +155,7 @@ def judge_turns(r, X, known, counts, walk) -> TurnNoise:
     return TurnNoise(float((p @ SLIP_NOISES**2).sum()), float(levels @ p.sum(axis=1)))
 
 
-def log_size_prior(sizes, usual, spread):
+def log_size_prior(sizes: Floats, usual: float, spread: float) -> Floats:
     """
     Return the log prior of sizes of a grid, the first of them 0: (n,).
 
@@ -164,13 +166,13 @@ def log_size_prior(sizes, usual, spread):
     return log
 
 
-def inverse_root(covariance):
+def inverse_root(covariance: Floats) -> Floats:
     """Return the inverse of the Cholesky root of a covariance, (n, n), kept solvable."""
     tiny = 1e-13 * np.diag(covariance).max()
     return np.linalg.inv(np.linalg.cholesky(covariance + tiny * np.eye(len(covariance))))
 
 
-def evidence(r, X, root, shape, sizes):
+def evidence(r: Floats, X: Floats, root: Floats, shape: Floats, sizes: Floats) -> Floats:
     """
     Return the restricted log likelihood of r = X b + e, cov e = known + size shape, by size.
 
@@ -184,11 +186,12 @@ def evidence(r, X, root, shape, sizes):
     Q, R = np.linalg.qr(half / length[:, None])
     fitted = (e[:, None] @ Q)[:, 0]
     pivots = np.abs(np.diagonal(R, axis1=1, axis2=2)) * length
-    return -0.5 * (np.log(d).sum(axis=1) + 2 * np.log(pivots).sum(axis=1)
-                   + (e**2).sum(axis=1) - (fitted**2).sum(axis=1))
+    out: Floats = -0.5 * (np.log(d).sum(axis=1) + 2 * np.log(pivots).sum(axis=1)
+                          + (e**2).sum(axis=1) - (fitted**2).sum(axis=1))
+    return out
 
 
-def slow_means(begin, end, time):
+def slow_means(begin: Floats, end: Floats, time: float) -> Floats:
     """
     Return the covariance of bin means of a Gauss-Markov process of unit variance, (N, N).
 
@@ -203,7 +206,7 @@ def slow_means(begin, end, time):
     return out
 
 
-def spread(bins: Bins, t_fix):
+def spread(bins: Bins, t_fix: Floats) -> tuple[Floats, Floats]:
     """Return begin and end of the fixes of each bin, s; the middle of an empty one."""
     t, n = t_fix[bins.fix], len(bins.edges) - 1
     begin, end = np.full(n, np.inf), np.full(n, -np.inf)

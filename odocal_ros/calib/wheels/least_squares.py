@@ -26,6 +26,7 @@ from odocal_ros.calib.wheels.model import (
     SCALE,
     WIDTH,
 )
+from odocal_ros.data.arrays import Bools, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,8 @@ class Drift:
     by_gyro_scale: NDArray[np.float64]
 
 
-def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
+def least_squares(V: Floats, r: Floats, X: Floats, drift: Drift, use: Bools, weight: Floats,
+                  value: Floats) -> Fit:
     """
     Solve r = X step + e, cov e = V, with priors; and the drift, whose share of e is L phi.
 
@@ -97,7 +99,7 @@ def least_squares(V, r, X, drift: Drift, use, weight, value) -> Fit:
     return Fit(step, normal, B, use, P, left, LQ.T @ left, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def design(eq: Equations):
+def design(eq: Equations) -> Floats:
     """Return the derivatives of the observations by the parameters, (3N, p)."""
     n = len(eq.turn)
     X = np.zeros((3 * n, len(PARAMETERS)))

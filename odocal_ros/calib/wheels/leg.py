@@ -93,7 +93,7 @@ def positions(leg: WheelLeg, t: Floats, k_left: float, k_right: float, heading_e
     return leg.start.position_n + way + turn @ (C_bv(heading_error, pitch) @ leg.lever_b)
 
 
-def C_bv(heading_error, pitch):
+def C_bv(heading_error: float, pitch: float) -> Floats:
     """Return the rotation that takes v to b for a heading error and a pitch, roll 0, (3, 3)."""
     x = forward_b(-heading_error, pitch)
     y = np.array([-np.cos(pitch) * np.sin(heading_error), np.cos(heading_error),
@@ -101,7 +101,7 @@ def C_bv(heading_error, pitch):
     return np.stack([x, y, np.cross(x, y)], -1)
 
 
-def wheel_factors(scale, log_ratio):
+def wheel_factors(scale: float, log_ratio: float) -> tuple[float, float]:
     """
     Return the left and the right factor, m per unit.
 

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.calib.wheels.leg import C_bv, WheelLeg
 from odocal_ros.calib.wheels.way import Way
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.receiver_filter import smoothing
 from odocal_ros.nav.rotations import exp_so3, matrix_from_quat
 
@@ -77,14 +78,14 @@ class Bins:
     of_fix: NDArray[np.int64]
     share: Array
 
-    def mean(self, x):
+    def mean(self, x: Floats) -> Floats:
         """Return the bins' weighted means of values at the fixes: (k, ...) to (N, ...)."""
         out = np.zeros((len(self.edges) - 1, *x.shape[1:]))
         np.add.at(out, self.of_fix, x * self.share.reshape(-1, *[1] * (x.ndim - 1)))
         return out
 
     @property
-    def filled(self):
+    def filled(self) -> Bools:
         """Tell which bins hold fixes."""
         return np.bincount(self.of_fix, minlength=len(self.edges) - 1) > 0
 
@@ -128,12 +129,14 @@ class Equations:
     way: Array
 
     @property
-    def length(self):
+    def length(self) -> Floats:
         """Return the length of the way in each bin, (N,) m."""
-        return np.linalg.norm(self.way, axis=1)
+        out: Floats = np.linalg.norm(self.way, axis=1)
+        return out
 
 
-def make_bins(t_fix, keep, variance, t_start, t_stop, n) -> Bins:
+def make_bins(t_fix: Floats, keep: Bools, variance: Floats, t_start: float, t_stop: float,
+              n: int) -> Bins:
     """Return n bins of equal length over a range, s, with the fixes of a mask in them."""
     edges = np.linspace(t_start, t_stop, n + 1)
     fix = np.flatnonzero(keep & (t_fix >= t_start) & (t_fix <= t_stop))
@@ -169,20 +172,20 @@ def equations(leg: WheelLeg, bins: Bins, state: State, since: float) -> Equation
         np.interp(bins.edges, way.t, way.by_gyro_scale), step_n)
 
 
-def _arm(leg, state, way, t):
+def _arm(leg: WheelLeg, state: State, way: Way, t: Floats) -> Floats:
     """Return the attitude of v less that at the start mark, (k, 3, 3)."""
     C = leg.left.C_nb_at(t) - leg.left.C_nb_at(np.array(leg.start.t))
     return exp_so3(way.phi(t)) @ C @ C_bv(state.heading, state.pitch)
 
 
-def _smoothed(leg, state, way, t):
+def _smoothed(leg: WheelLeg, state: State, way: Way, t: Floats) -> tuple[Floats, Floats]:
     """Return what smoothing adds to places at times, and its derivative: (k, 3) m each."""
     grid = np.arange(way.t[0], way.t[-1], 2 * VELOCITY_WINDOW)
     place = way.at('v', grid) + _arm(leg, state, way, grid) @ leg.lever_b
     return smoothing(grid, place, np.gradient(place, grid, axis=0), t, state.fix_lag_square)
 
 
-def _axes(leg, edges, since):
+def _axes(leg: WheelLeg, edges: Floats, since: float) -> Floats:
     """Return the attitude summed over time from ``since`` to each node, (N + 1, 3, 3) s."""
     track = leg.left
     C = matrix_from_quat(track.q_nb)
@@ -191,4 +194,5 @@ def _axes(leg, edges, since):
     flat = total.reshape(-1, 9)
     here = np.stack([np.interp(edges, track.t, c) for c in flat.T], -1)
     then = np.array([np.interp(since, track.t, c) for c in flat.T])
-    return (here - then).reshape(-1, 3, 3)
+    out: Floats = (here - then).reshape(-1, 3, 3)
+    return out

@@ -19,9 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.calib.wheels.judge_noise import TurnNoise
 from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import Bins, Equations, State
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.alignment import Alignment
+from odocal_ros.settings.config import Config
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +37,16 @@ class Part:
     covariance: NDArray[np.float64] | None = None
     shared: bool = False
 
-    def whole(self):
+    def whole(self) -> Floats:
         """Return its covariance, (n, n)."""
-        return self.root @ self.root.T if self.covariance is None else self.covariance
+        if self.covariance is not None:
+            return self.covariance
+        assert self.root is not None, self.name
+        whole: Floats = self.root @ self.root.T
+        return whole
 
 
-def node_covariance(t, since, alignment):
+def node_covariance(t: Floats, since: float, alignment: Alignment) -> dict[str, Floats]:
     """
     Return the covariance of the gyro's heading drift at nodes, by name: each (N + 1, N + 1).
 
@@ -50,13 +58,13 @@ def node_covariance(t, since, alignment):
             'gyro_bias_walk': alignment.gyro_bias_walk**2 * low**2 * (3 * high - low) / 6}
 
 
-def drift_covariance(alignment, bins: Bins, eq: Equations, since):
+def drift_covariance(alignment: Alignment, bins: Bins, eq: Equations, since: float) -> Floats:
     """Return the covariance of the heading's drift at the nodes, all in all, (N + 1, N + 1)."""
     by_bias = eq.phi_axes[:, 2] * alignment.gyro_bias_sigma
     return sum(node_covariance(bins.edges, since, alignment).values()) + by_bias @ by_bias.T
 
 
-def phi_loading(eq: Equations, width):
+def phi_loading(eq: Equations, width: float) -> Floats:
     """Return what a unit drift of heading at each node makes of the observations, (3N, N + 1)."""
     n = len(eq.turn)
     mean = np.zeros((n, n + 1))
@@ -65,7 +73,7 @@ def phi_loading(eq: Equations, width):
     return np.concatenate([-eq.by_phi[:, :, 1], eq.by_phi[:, :, 0], -width * mean])
 
 
-def bridge_loading(eq: Equations, width):
+def bridge_loading(eq: Equations, width: float) -> Floats:
     """
     Return what a mean drift of 1 rad between the nodes of each bin makes, (3N, N).
 
@@ -77,7 +85,7 @@ def bridge_loading(eq: Equations, width):
     return np.concatenate([-so_far * eq.way[:, 1], so_far * eq.way[:, 0], -width * np.eye(n)])
 
 
-def walk_root(moving):
+def walk_root(moving: Floats) -> Floats:
     """
     Return the root of the bin means of a walk that grows by 1 a root second in motion, (N, 2N).
 
@@ -88,7 +96,8 @@ def walk_root(moving):
     return np.concatenate([so_far * np.sqrt(moving), np.diag(np.sqrt(moving / 12))], axis=1)
 
 
-def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, turns, config):
+def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since: float,
+                turns: TurnNoise, config: Config) -> list[Part]:
     """
     Return all parts but the fixes' own errors, their latency and the gyro's scale.
 
@@ -106,7 +115,7 @@ def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, t
     drift['gyro_noise'] = drift['gyro_noise'] + within @ within.T
     parts += [Part(name, covariance=whole) for name, whole in drift.items()]
 
-    def stacked(level, turn=nothing):
+    def stacked(level: Floats, turn: Floats = nothing) -> Floats:
         return np.concatenate([level[:, 0], level[:, 1], turn])
 
     yaw_rate = np.diff(eq.yaw) / np.diff(bins.edges)
@@ -121,7 +130,7 @@ def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since, t
     return parts + _events(leg, eq, bins, state)
 
 
-def quantisation(leg, eq, bins, state, level):
+def quantisation(leg: WheelLeg, eq: Equations, bins: Bins, state: State, level: float) -> Floats:
     """
     Return the covariance of what rounding to counts makes: a draw a standstill, many moving.
 
@@ -148,7 +157,7 @@ def quantisation(leg, eq, bins, state, level):
     return out
 
 
-def _slip_walk(eq):
+def _slip_walk(eq: Equations) -> Floats:
     """Return the root of what both wheels slipping by 1 m/sqrt(s) do: (3N, 4N)."""
     walk = walk_root(eq.moving)
     along = [eq.forward[:, axis, None] * walk * np.sqrt(0.5) for axis in range(2)]
@@ -156,7 +165,7 @@ def _slip_walk(eq):
     return np.block([[along[0], none], [along[1], none], [none, walk * np.sqrt(2.0)]])
 
 
-def _events(leg, eq, bins, state):
+def _events(leg: WheelLeg, eq: Equations, bins: Bins, state: State) -> list[Part]:
     """Return travel in doubt and slips seen, of unknown wheel, as parts."""
     parts = []
     for name, (t, size), unit in (('odometer_gaps', leg.doubt, state.scale),
@@ -176,7 +185,7 @@ def _events(leg, eq, bins, state):
     return parts
 
 
-def tilted(eq: Equations, state: State, tilt_variance) -> Part:
+def tilted(eq: Equations, state: State, tilt_variance: Floats) -> Part:
     """Return what a level not known makes of the turns, as a part: half the tilt squared."""
     n = len(eq.turn)
     variance = (tilt_variance[:-1] + tilt_variance[1:]) / 2
@@ -185,7 +194,7 @@ def tilted(eq: Equations, state: State, tilt_variance) -> Part:
     return Part('level', np.concatenate([np.zeros(2 * n), state.width * turn])[:, None])
 
 
-def unknown_width(eq: Equations, drift) -> Part:
+def unknown_width(eq: Equations, drift: Floats) -> Part:
     """Return what keeps turns over a width not known from telling the gyro's drift, as a part."""
     n = len(eq.turn)
     mean = phi_loading(eq, TRACK_WIDTH.of_a_car)[2 * n:]

@@ -14,15 +14,18 @@ import numpy as np
 from odocal_ros.calib.check import NOISIER_WORTH
 from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.two_point import PITCH_PRIOR
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import PARAMETERS
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import INFORMED_SHARE, REMARK_SIGMAS, TYRE_SPREAD
 
 
-def correlation(covariance, names=PARAMETERS):
+def correlation(covariance: Floats, names: tuple[str, ...] = PARAMETERS) -> dict[str, float]:
     """Return the correlation of each pair of parameters, for calibration.json."""
     sigma = np.sqrt(np.diag(covariance))
     rho = covariance / np.outer(sigma, sigma)
@@ -30,7 +33,7 @@ def correlation(covariance, names=PARAMETERS):
             for i in range(len(names)) for j in range(i + 1, len(names))}
 
 
-def without_turns(solution: Solution):
+def without_turns(solution: Solution) -> tuple[float, float]:
     """
     Return what the fixes alone would tell of left and right, the patent's way.
 
@@ -60,7 +63,8 @@ def without_turns(solution: Solution):
     return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])
 
 
-def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reason, ...]:
+def separable(solution: Solution, sigma_ratio: float, config: Config,
+              turn_rate: bool) -> tuple[Reason, ...]:
     """Return why left and right cannot be told apart, empty if they can."""
     limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
     if turn_rate and sigma_ratio <= limit:
@@ -75,7 +79,7 @@ def separable(solution: Solution, sigma_ratio, config, turn_rate) -> tuple[Reaso
                    'left and right are not stated'),)
 
 
-def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ...]]:
+def width_told(solution: Solution, sigma: float, given: float) -> tuple[bool, tuple[Reason, ...]]:
     """Tell whether the drive itself tells the track width, and why not where none is given."""
     width = solution.state.width
     if solution.width_told and width <= TRACK_WIDTH.least:
@@ -91,7 +95,7 @@ def width_told(solution: Solution, sigma, given) -> tuple[bool, tuple[Reason, ..
                           f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
 
 
-def judge_width(width, sigma, given) -> tuple[Reason, ...]:
+def judge_width(width: float, sigma: float, given: float) -> tuple[Reason, ...]:
     """Return what is to be said of a track width told by the drive beside the one given, m."""
     if not given or abs(width - given) <= REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
@@ -100,7 +104,7 @@ def judge_width(width, sigma, given) -> tuple[Reason, ...]:
                    f'{width:.4f} +- {sigma:.4f} m, odometer.track_width says {given:.4g} m'),)
 
 
-def judge_heading(leg, heading, config) -> tuple[Reason, ...]:
+def judge_heading(leg: WheelLeg, heading: float, config: Config) -> tuple[Reason, ...]:
     """Return what is to be said of the yaw mounting angle."""
     a = leg.alignment
     if not a.heading_separable:

@@ -23,6 +23,7 @@ from odocal_ros.calib.wheels.model import (
     WIDTH,
 )
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 
@@ -40,7 +41,7 @@ class WheelPriors:
     latency: float
     gyro_scale: float
 
-    def steps(self, leg: WheelLeg, state: State, told, rounds):
+    def steps(self, leg: WheelLeg, state: State, told: bool, rounds: int) -> tuple[Floats, Floats]:
         """Return inverse variances and values, (p,) each, as steps from a state."""
         weight, value = np.zeros((2, len(PARAMETERS)))
         given = self.width or TRACK_WIDTH.of_a_car
@@ -63,12 +64,12 @@ class WheelPriors:
             value[3:5] = leg.start.position_n[:2] - state.start_n[:2]
         return weight, value
 
-    def nuisances(self, X, state):
+    def nuisances(self, X: Floats, state: State) -> Floats:
         """Return the covariance that NUISANCES add to rows of derivatives, (k, k)."""
         X = X[:, NUISANCES] * self._nuisances(state)
         return X @ X.T
 
-    def _nuisances(self, state):
+    def _nuisances(self, state: State) -> list[float]:
         # a receiver that smooths over a second is late by one, whatever was thought of its stamps
         late = abs(state.latency)
         latency = late if late > REMARK_SIGMAS * self.latency else self.latency

@@ -9,6 +9,8 @@
 
 """The method ``wheels``: from the solution of a leg to estimates, sources and reasons."""
 
+from typing import Any
+
 import numpy as np
 
 from odocal_ros.calib.budget import budget_table, HEIGHT_UNKNOWN, total_covariance
@@ -27,11 +29,14 @@ from odocal_ros.calib.wheels.observable import (
 )
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.calib.wheels.unseen import solve_with_slips
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import HEADING_LIMIT
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.earth import A
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.screen import Inputs
+from odocal_ros.settings.config import Config
 
 PARAMETERS = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle',
               'track_width')       # rows of the sources: relative for scales, rad, m
@@ -39,7 +44,7 @@ NOTE = ('heading_error is how far the heading at the start must be turned, count
         'error less the yaw mounting angle, which a drive cannot tell apart')
 
 
-def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
+def fit_wheels(leg: WheelLeg, config: Config, turn_rate: bool = True) -> MethodResult:
     """
     Return left and right scale, heading error and track width of a leg with their sigmas.
 
@@ -66,7 +71,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
     if solution is None:
         return refused(leg, Reason(Code.NO_FIX, 'fewer than five fixes between the marks, or less '
                                    'than five seconds of them'))
-    covariance = np.linalg.inv(solution.fit.normal)
+    covariance = np.linalg.inv(solution.fit.normal).astype(np.float64, copy=False)
     sigma = np.sqrt(np.diag(covariance))
     # relative: a scale no better than 10 % is none
     if not (np.isfinite(sigma).all() and sigma[SCALE] < 0.1 and sigma[HEADING] < HEADING_LIMIT):
@@ -105,7 +110,7 @@ def fit_wheels(leg: WheelLeg, config, turn_rate=True) -> MethodResult:
                                  slips))
 
 
-def refused(leg, reason) -> MethodResult:
+def refused(leg: WheelLeg | Inputs, reason: Reason) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
     unit = {'yaw_mounting_angle': 'rad', 'heading_error': 'rad', 'track_width': 'm',
             'scale_ratio': '1', 'gyro_bias_z': 'rad/s'}
@@ -114,7 +119,7 @@ def refused(leg, reason) -> MethodResult:
         n: Estimate(None, None, unit.get(n, leg.scale_unit)) for n in names}, PARAMETERS)
 
 
-def _rows(solution):
+def _rows(solution: Solution) -> Floats:
     """Return the derivatives of PARAMETERS by the solution's own parameters, (5, p)."""
     ratio = np.exp(solution.state.log_ratio)
     rows = np.zeros((5, len(solution.priors)))
@@ -125,18 +130,19 @@ def _rows(solution):
     return rows
 
 
-def _root(covariance):
+def _root(covariance: Floats) -> Floats:
     value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
-    return vector * np.sqrt(np.maximum(value, 0.0))
+    out: Floats = vector * np.sqrt(np.maximum(value, 0.0))
+    return out
 
 
-def _sources(leg, solution: Solution):
+def _sources(leg: WheelLeg, solution: Solution) -> tuple[Source, ...]:
     """Return the parts of the covariance as effects on PARAMETERS, each with its name."""
     rows = _rows(solution)
     BX = rows @ solution.fit.B
     sources = []
     for part in solution.parts:
-        effects = BX @ part.root if part.root is not None else _root(BX @ part.covariance @ BX.T)
+        effects = BX @ part.root if part.root is not None else _root(BX @ part.whole() @ BX.T)
         if effects.shape[1] > len(rows):
             effects = _root(effects @ effects.T)
         sources.append(Source(part.name, effects, part.shared))
@@ -157,13 +163,13 @@ def _sources(leg, solution: Solution):
     return tuple(sources)
 
 
-def _height_sigma(leg):
+def _height_sigma(leg: WheelLeg) -> float:
     if not np.isfinite(leg.fixes_n[:, 2]).any():
         return HEIGHT_UNKNOWN
     return float(np.sqrt(np.median(leg.covariance_n[:, 2, 2])))
 
 
-def _second_order(solution):
+def _second_order(solution: Solution) -> float:
     """
     Return what climb and heading not known make of the scale, relative.
 
@@ -177,7 +183,7 @@ def _second_order(solution):
     return float(np.hypot(unknown, 1.5e-6))
 
 
-def _gyro_bias(leg, solution):
+def _gyro_bias(leg: WheelLeg, solution: Solution) -> Estimate:
     a = leg.alignment
     value, sigma = solution.bias_z
     up = solution.eq.phi_axes[-1, 2]
@@ -188,7 +194,8 @@ def _gyro_bias(leg, solution):
     return Estimate(float(up @ a.gyro_bias) + value, sigma, 'rad/s')
 
 
-def _details(leg, solution: Solution, covariance, sources, scale, slips):
+def _details(leg: WheelLeg, solution: Solution, covariance: Floats, sources: tuple[Source, ...],
+             scale: tuple[float, ...], slips: tuple[dict[str, Any], ...]) -> dict[str, Any]:
     state, noise = solution.state, solution.noise
     condition, ratio_sigma = without_turns(solution)
     used = solution.fit.use[:2 * len(solution.eq.turn)]

@@ -13,10 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.wheels.height import solve_height
+from odocal_ros.calib.wheels.height import Height, solve_height
 from odocal_ros.calib.wheels.judge_noise import judge_fixes, judge_turns, TurnNoise, white_share
-from odocal_ros.calib.wheels.least_squares import design, Drift, least_squares
+from odocal_ros.calib.wheels.least_squares import design, Drift, Fit, least_squares
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.model import (
+    Bins,
+    Equations,
     equations,
     FIX_LAG2,
     GYRO,
@@ -25,6 +28,7 @@ from odocal_ros.calib.wheels.model import (
     OFFSET,
     RATIO,
     SCALE,
+    State,
     WIDTH,
 )
 from odocal_ros.calib.wheels.noise import (
@@ -40,13 +44,16 @@ from odocal_ros.calib.wheels.noise import (
 from odocal_ros.calib.wheels.priors import WheelPriors
 from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 
 class Rounds:
     """The rounds of relinearisation over one leg, five at most."""
 
-    def __init__(self, leg, config, bins, turn_rate, width):
+    def __init__(self, leg: WheelLeg, config: Config, bins: Bins, turn_rate: bool,
+                 width: float) -> None:
         self.leg, self.config, self.turn_rate = leg, config, turn_rate
         self.bins, self.width = bins, width
         self.priors = WheelPriors(width, turn_rate, config.gnss.time_sigma,
@@ -56,7 +63,7 @@ class Rounds:
         self.bad = np.zeros(n, bool)
         self.turns, self.told, self.rounds = TurnNoise(), False, 0
 
-    def run(self, state, fixes):
+    def run(self, state: State, fixes: int) -> Solution:
         """Return the solution from a first state."""
         again, dropped, small = False, 0, 0.01      # sigmas: of no step that matters
         for k in range(5):
@@ -70,7 +77,8 @@ class Rounds:
         return replace(solution, dropped=fixes - solution.kept,
                        settled=bool(np.all(np.abs(step) < 10 * small)))
 
-    def _round(self, eq, state, height, judge):
+    def _round(self, eq: Equations, state: State, height: Height,
+               judge: bool) -> tuple[Solution, Floats]:
         leg, n = self.leg, len(eq.turn)
         L = phi_loading(eq, state.width)
         r = np.concatenate([eq.residual[:, 0], eq.residual[:, 1], eq.turn]) + L @ state.phi[:, 2]
@@ -82,7 +90,7 @@ class Rounds:
         parts.append(tilted(eq, state, height.tilt_variance))
         if not (self.width or self.told):
             parts.append(unknown_width(eq, self._drift(eq)))
-        known = sum(p.whole() for p in parts)
+        known: Floats = sum((p.whole() for p in parts), np.zeros(()))
         if judge or self.rounds == 0:
             self._judge_fixes(eq, state, r, X, known, judge)
         fix = np.zeros((3 * n, 3 * n))
@@ -104,7 +112,8 @@ class Rounds:
                         kept, 0, self._bias(fit, L, eq), self.told, False), \
             step[[SCALE, RATIO, HEADING]]
 
-    def _turns_tell(self, eq, V, r, X, state, L):
+    def _turns_tell(self, eq: Equations, V: Floats, r: Floats, X: Floats, state: State,
+                    L: Floats) -> bool:
         """Tell whether the turns are far above what the gyro may have drifted."""
         if not self.turn_rate:
             return False
@@ -121,21 +130,22 @@ class Rounds:
         drift = self._fit(V, r, X, level, state, L, eq).phi_sigma
         return bool(far > np.sqrt((drift**2).mean()))
 
-    def _drift(self, eq):
+    def _drift(self, eq: Equations) -> Floats:
         return drift_covariance(self.leg.alignment, self.bins, eq, self.since)
 
-    def _used(self, n):
+    def _used(self, n: int) -> Bools:
         level = self.bins.filled & ~self.bad
         return np.concatenate([level, level, np.full(n, self.turn_rate)])
 
-    def _fit(self, V, r, X, use, state, L, eq):
+    def _fit(self, V: Floats, r: Floats, X: Floats, use: Bools, state: State, L: Floats,
+             eq: Equations) -> Fit:
         drift = Drift(L, self._drift(eq), eq.by_gyro_scale)
         return least_squares(V, r, X, drift, use, *self._steps(state))
 
-    def _steps(self, state):
+    def _steps(self, state: State) -> tuple[Floats, Floats]:
         return self.priors.steps(self.leg, state, self.told, self.rounds)
 
-    def _bias(self, fit, L, eq):
+    def _bias(self, fit: Fit, L: Floats, eq: Equations) -> tuple[float, float]:
         """Return the gyro's bias about the vertical beyond that of the alignment, and sigma."""
         variance = self.leg.alignment.gyro_bias_sigma**2
         up = eq.phi_axes[:, 2]
@@ -144,7 +154,7 @@ class Rounds:
         left = toward**2 @ variance - c @ fit.P @ c
         return float(c @ fit.left), float(np.sqrt(max(left, 0.0)))
 
-    def _drop_bins(self, fit, n):
+    def _drop_bins(self, fit: Fit, n: int) -> bool:
         """Leave out bins that stray from what all others say; tell whether there are new ones."""
         z = np.zeros(3 * n)
         z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
@@ -154,7 +164,7 @@ class Rounds:
         self.bad |= far
         return True
 
-    def _judge_turns(self, eq, state, r, X, judge):
+    def _judge_turns(self, eq: Equations, state: State, r: Floats, X: Floats, judge: bool) -> None:
         if not ((judge or self.rounds == 0) and self.turn_rate):
             return      # at first too: else the drift would take the slip upon itself
         n = len(eq.turn)
@@ -173,7 +183,8 @@ class Rounds:
         self.turns = judge_turns(r[turn], columns, known, rounding[1] - rounding[0],
                                  2 * walk @ walk.T)
 
-    def _judge_fixes(self, eq, state, r, X, known, judge):
+    def _judge_fixes(self, eq: Equations, state: State, r: Floats, X: Floats, known: Floats,
+                     judge: bool) -> None:
         leg, bins, n = self.leg, self.bins, len(eq.turn)
         level = slice(0, 2 * n)
         k = np.array([SCALE, HEADING, 3, 4])
@@ -186,7 +197,7 @@ class Rounds:
             self.config.gnss.correlation_time if judge else 0)
 
 
-def _stepped(state, fit, height, widen):
+def _stepped(state: State, fit: Fit, height: Height, widen: float) -> State:
     """Return the state after a step."""
     step = fit.step
     return replace(

@@ -36,13 +36,14 @@ from odocal_ros.calib.wheels.whole_drive import (
     unlike,
     WHOLE_DRIVE_SIGMAS,
 )
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Reason
-from odocal_ros.screening.wheel_pair import pair, runs
+from odocal_ros.screening.wheel_pair import Pair, pair, runs
 from odocal_ros.settings.levels import NORMAL_MEDIAN
 
+Event = tuple[float, float, float]      # begin, end, s, and size, m
 SLIP_SPANS = (10, 30, 80, 200, 500)    # steps between the ends: slips of up to 1, 3, 8, 20, 50 s
 # 1 sigma of what two wheels on real ground part by without a slip. Physical, judgement: m in any
 # window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)
@@ -88,7 +89,7 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
         return (), NO_SLIPS
     signals = signals_of(two, metres_per_unit)
     x, covariance = fitted(two, signals, metres_per_unit)
-    if x is None or x[0] <= 0:
+    if x is None or covariance is None or x[0] <= 0:
         return (), NO_SLIPS
     ratio = x[0]                                          # right counts over left ones
     per_right = metres_per_unit * (1 + 1 / ratio) / 2     # m per count of the right wheel
@@ -114,7 +115,7 @@ def wheel_faults(left: Travel, right: Travel, imu: tuple[Floats, Floats, Floats]
     return reasons + slip_reason(slips), slips
 
 
-def _level(two, apart, quantum_m):
+def _level(two: Pair, apart: Floats, quantum_m: float) -> Floats:
     """
     Return the difference of the ways, m, without the slope it has on most of the way.
 
@@ -127,10 +128,11 @@ def _level(two, apart, quantum_m):
     moves = run > max(np.median(run) / 2, 2 * two.quantum)
     slope = np.median(climb[moves] / run[moves]) if moves.any() else 0.0
     doubt = 2 * quantum_m * (two.quantum > 0) / max(np.median(run), 1e-9)
-    return apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * way
+    out: Floats = apart - np.sign(slope) * max(abs(slope) - doubt, 0.0) * way
+    return out
 
 
-def _without(two, events):
+def _without(two: Pair, events: list[Event]) -> Pair:
     """Return the wheels with the cells of slips not known."""
     known, around = two.known.copy(), 2.0       # s each side that may be part of it
     for begin, end, _ in events:
@@ -138,7 +140,8 @@ def _without(two, events):
     return replace(two, known=known)
 
 
-def _events(two, apart, quantum_m, width):
+def _events(two: Pair, apart: Floats, quantum_m: float,
+            width: float) -> tuple[list[Event], list[Event]]:
     """
     Return (begin, end, size) of the jumps of the difference: s, s, m, in order.
 
@@ -161,14 +164,15 @@ def _events(two, apart, quantum_m, width):
         for k in np.flatnonzero(far):
             hits[k + MEAN_STEPS:k + span] = True
         windows.append((span, jump, limit, far))
-    over, lasting = [], []
+    over: list[Event] = []
+    lasting: list[Event] = []
     for a, b in runs(hits):
         event = _measured(two, apart, windows, a, b)
         (over if _ends(two, apart, event) else lasting).append(event)
     return over, lasting
 
 
-def _ends(two, apart, event):
+def _ends(two: Pair, apart: Floats, event: Event) -> bool:
     """Tell whether a slip is over: short, or the wheels go on after it as they did before it."""
     way = _way(two)
     begin, end = np.interp(event[:2], two.t, way)
@@ -182,17 +186,18 @@ def _ends(two, apart, event):
     return True
 
 
-def _slope(two, event):
+def _slope(two: Pair, event: Event) -> float:
     """Return the size of a slip by the way it took, seen from a tenth to nine tenths of it."""
     begin, end = np.interp(event[:2], two.t, _way(two))
-    return 0.8 * event[2] / max(end - begin, 1e-9)
+    out: float = 0.8 * event[2] / max(end - begin, 1e-9)
+    return out
 
 
-def _way(two):
+def _way(two: Pair) -> Floats:
     return np.append(0.0, np.cumsum(np.abs(np.diff(two.left + two.right)) / 2))
 
 
-def _limit(two, jump, span, quantum_m, width):
+def _limit(two: Pair, jump: Floats, span: int, quantum_m: float, width: float) -> Floats:
     """Return how far each jump between two means may go by chance, m."""
     n, ends = len(jump), span + MEAN_STEPS - 1
     way = _way(two)
@@ -208,17 +213,19 @@ def _limit(two, jump, span, quantum_m, width):
     # rounding is bounded: both ends of both wheels are off by a count at most
     rounding = np.minimum(WHOLE_DRIVE_SIGMAS**2 * (rounding[span:] + rounding[:-span]),
                           (2 * quantum_m)**2)
-    return np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (spread**2 + TYRE_BLUR**2 + turn**2) + rounding)
+    out: Floats = np.sqrt(WHOLE_DRIVE_SIGMAS**2 * (spread**2 + TYRE_BLUR**2 + turn**2) + rounding)
+    return out
 
 
-def _measured(two, apart, windows, a, b):
+def _measured(two: Pair, apart: Floats, windows: list[tuple[int, Floats, Floats, Bools]], a: int,
+              b: int) -> Event:
     """Return (begin, end, size) of the jump within steps a to b: the window that shows it best."""
     found = (0.0, 0.0, 0, 0)
     for span, jump, limit, far in windows:
         low, high = max(0, a - MEAN_STEPS), max(0, b - span + 1)
-        k = low + np.flatnonzero(far[low:high])
-        if len(k):
-            k = int(k[np.argmax(np.abs(jump[k]))])
+        at = low + np.flatnonzero(far[low:high])
+        if len(at):
+            k = int(at[np.argmax(np.abs(jump[at]))])
             # a longer window must show more than its own noise, or it only adds that
             if abs(jump[k]) > abs(found[0]) + bool(found[1]) * limit[k] / WHOLE_DRIVE_SIGMAS:
                 found = (float(jump[k]), float(limit[k]), k, span)
@@ -230,10 +237,11 @@ def _measured(two, apart, windows, a, b):
     late = np.flatnonzero(share >= 0.9)
     late = late[late >= MEAN_STEPS // 2]
     end = int(late[0]) if len(late) else len(inner) - 1
-    return two.t[k + min(begin, end)], two.t[k + max(begin, end)], size
+    return float(two.t[k + min(begin, end)]), float(two.t[k + max(begin, end)]), size
 
 
-def _which(two, mean, imu, track, latitude, event):
+def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: Track,
+           latitude: float, event: Event) -> int:
     """
     Return which wheel slipped: -1, +1, or 0 where acceleration does not tell.
 

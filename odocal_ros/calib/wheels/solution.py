@@ -19,6 +19,7 @@ from odocal_ros.calib.wheels.judge_noise import FixNoise, TurnNoise
 from odocal_ros.calib.wheels.least_squares import Fit
 from odocal_ros.calib.wheels.model import Bins, Equations, NUISANCES, State
 from odocal_ros.calib.wheels.noise import Part
+from odocal_ros.data.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Solution:
     width_told: bool
     settled: bool
 
-    def covariance(self):
+    def covariance(self) -> Floats:
         """Return the covariance of the observations, what is believed of nuisances and all."""
         X = self.X[:, NUISANCES]
         return sum(p.whole() for p in self.parts) + X / self.priors[NUISANCES] @ X.T

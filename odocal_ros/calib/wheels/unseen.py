@@ -15,22 +15,30 @@ elsewhere and the gyro hold against it, each by its weight, so that one no large
 noise makes is none. What is found joins the slips of the leg, and the fit is made again.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from odocal_ros.calib.wheels.estimate import solve
+from odocal_ros.calib.wheels.least_squares import Fit
+from odocal_ros.calib.wheels.leg import WheelLeg
 from odocal_ros.calib.wheels.slips import TURN_DOUBT, TYRE_BLUR
+from odocal_ros.calib.wheels.solution import Solution
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_faults import SIDES
+from odocal_ros.settings.config import Config
 
+Found = tuple[tuple[float, float], float, float, int]      # as unseen_slip returns it
 SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)    # s, of the slips looked for; those between are seen too
 # statistical: sigmas from which a slip is seen, of 1000 places looked at: once in 25 000 legs
 UNSEEN_SIGMAS = 5.5
 
 
-def solve_with_slips(leg, config, turn_rate=True):
+def solve_with_slips(leg: WheelLeg, config: Config, turn_rate: bool = True,
+                     ) -> tuple[Solution | None, tuple[Reason, ...], tuple[dict[str, Any], ...]]:
     """
     Return the solution of a leg with its unseen slips in the covariance, and what they are.
 
@@ -48,7 +56,8 @@ def solve_with_slips(leg, config, turn_rate=True):
     Solution, None where the fixes are too few; reasons; the slips for calibration.json.
 
     """
-    solution, seen = solve(leg, config, turn_rate), []
+    solution = solve(leg, config, turn_rate)
+    seen: list[Found] = []
     # four at most: a leg with more slips all the time, and its noise says so
     while turn_rate and solution and not leg.uneven and len(seen) < 4:
         found = unseen_slip(solution, leg.slips[0])
@@ -58,12 +67,14 @@ def solve_with_slips(leg, config, turn_rate=True):
         seen.append(found)
         bin_s = float(solution.bins.edges[1] - solution.bins.edges[0])
         more = drawn_out([begin - bin_s], [end + bin_s], [size])
-        leg = replace(leg, slips=tuple(map(np.append, leg.slips, more)))
+        t, size_m = (np.append(*pair) for pair in zip(leg.slips, more, strict=True))
+        leg = replace(leg, slips=(t, size_m))
         solution = solve(leg, config)
     return solution, tuple(_said(*found) for found in seen), tuple(map(_slip, sorted(seen)))
 
 
-def drawn_out(begin: Floats, end: Floats, size: Floats) -> tuple[Floats, Floats]:
+def drawn_out(begin: Sequence[float] | Floats, end: Sequence[float] | Floats,
+              size: Sequence[float] | Floats) -> tuple[Floats, Floats]:
     """
     Return slips as steps, s and m, that together may be any slip of that size in that time.
 
@@ -80,18 +91,19 @@ def drawn_out(begin: Floats, end: Floats, size: Floats) -> tuple[Floats, Floats]
     return np.concatenate([*t, []]), np.concatenate([*steps, []])
 
 
-def unseen_slip(solution, known_t=()):
+def unseen_slip(solution: Solution, known_t: Sequence[float] | Floats = ()) -> Found | None:
     """
     Return the slip of one wheel that stands out most: (begin, end) s, size and sigma m, wheel.
 
     size > 0 where the wheel ran farther than the ground.   wheel : 0 left, 1 right, -1 either.
     known_t : s, of slips that are known already.   None where nothing stands out.
     """
-    best = None
+    best: tuple[float, Found] | None = None
     for length in SLIP_LENGTHS:
-        spans, columns, turn = _ramps(solution, length)
-        if not len(spans):
+        ramps = _ramps(solution, length)
+        if ramps is None:
             continue
+        spans, columns, turn = ramps
         far = np.ones(len(spans), bool)
         for t in known_t:
             # 30 s from one that is known: its begin and end are no others
@@ -104,12 +116,12 @@ def unseen_slip(solution, known_t=()):
         if score[k, j] > (best[0] if best else 0.0):
             # twice the log odds, 12 to 1, at which one wheel is named before the other
             wheel = int(k) if z[k, j]**2 - z[1 - k, j]**2 > 5.0 else -1
-            best = (score[k, j], tuple(map(float, spans[j])), float(size[k, j]),
-                    float(size[k, j] / z[k, j]), wheel)
-    return best and best[1:]
+            best = (float(score[k, j]), ((float(spans[j, 0]), float(spans[j, 1])),
+                                         float(size[k, j]), float(size[k, j] / z[k, j]), wheel))
+    return best[1] if best else None
 
 
-def _scores(fit, columns):
+def _scores(fit: Fit, columns: Floats) -> tuple[Floats, Floats]:
     """Return the size of each slip by all observations, in sigmas and m: (2, m) each."""
     flat = columns[fit.use].reshape(fit.use.sum(), -1)
     weight = np.einsum('uk,uk->k', flat, fit.P @ flat)
@@ -118,13 +130,14 @@ def _scores(fit, columns):
     return ((pull / np.sqrt(weight)).reshape(2, -1), (pull / weight).reshape(2, -1))
 
 
-def _ramps(solution, length):
+def _ramps(solution: Solution, length: float) -> tuple[Floats, Floats, Floats] | None:
     """
     Return the slips of a length, s, that grow with the way, and what 1 m of each does.
 
     Returns
     -------
     (m, 2) s, begin and end; (3N, 2, m) of the left and of the right wheel; (m,) rad turned there.
+    None where the leg is too short for them.
 
     """
     edges, eq = solution.bins.edges, solution.eq
@@ -132,7 +145,7 @@ def _ramps(solution, length):
     at = edges[0] + half * np.arange(1, 2 * (len(edges) - 1))
     n = max(1, round(length / half))                        # steps that make a ramp
     if n > len(at) // 3:
-        return np.empty((0, 2)), None, None
+        return None
     here = np.clip(((at - edges[0]) / (2 * half)).astype(int), 0, len(edges) - 2)
     way = np.maximum(eq.length[here], 1e-6)
     total = np.append(0.0, np.cumsum(way))
@@ -148,13 +161,13 @@ def _ramps(solution, length):
     return spans, columns, turn
 
 
-def _slip(found):
+def _slip(found: Found) -> dict[str, Any]:
     (begin, end), size, sigma, wheel = found
     return {'t': begin, 'duration': end - begin, 'metres': size, 'sigma': sigma,
             'wheel': (*SIDES, 'one of them')[wheel]}
 
 
-def _said(span, size, sigma, wheel):
+def _said(span: tuple[float, float], size: float, sigma: float, wheel: int) -> Reason:
     which = 'one of the wheels parts from the other' if wheel < 0 else (
         f'the {SIDES[wheel]} wheel {"spins" if size > 0 else "slides"}')
     # of less than 5 s begin and end are not told apart

@@ -9,23 +9,30 @@
 
 """The way of a leg by its wheels and gyro, turned by what the gyro is found to err by."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from odocal_ros.calib.wheels.leg import wheel_factors
+from odocal_ros.calib.wheels.leg import wheel_factors, WheelLeg
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2
-from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.dead_reckoning import forward_b, Track
 from odocal_ros.nav.rotations import matrix_from_quat
 
+if TYPE_CHECKING:
+    from odocal_ros.calib.wheels.model import Bins, State
 
-def turned(phi, v):
+
+def turned(phi: Floats, v: Floats) -> Floats:
     """Return vectors turned by rotation vectors, rad: (..., 3); far faster than by matrices."""
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
     across = _cross(phi, v)
-    return v + np.sinc(angle / np.pi) * across + np.sinc(angle / 2 / np.pi)**2 / 2 * _cross(
-        phi, across)
+    out: Floats = v + np.sinc(angle / np.pi) * across + np.sinc(angle / 2 / np.pi)**2 / 2 * _cross(
+               phi, across)
+    return out
 
 
-def _cross(a, b):
+def _cross(a: Floats, b: Floats) -> Floats:
     (x, y, z), (u, v, w) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
@@ -38,7 +45,7 @@ class Way:
     by_gyro_scale : (m,) derivative of the heading's drift by the gyro's scale error.
     """
 
-    def __init__(self, leg, bins, state, since):
+    def __init__(self, leg: WheelLeg, bins: 'Bins', state: 'State', since: float) -> None:
         self.bins, self.state = bins, state
         edges = bins.edges
         margin = 1.0        # s of the track beyond the bins, for fixes that are late or early
@@ -80,32 +87,32 @@ class Way:
         first = {k: self._interp(v, edges[:1])[0] for k, v in self.total.items()}
         self.total = {k: v - first[k] for k, v in self.total.items()}
 
-    def _interp(self, total, t):
+    def _interp(self, total: Floats, t: Floats) -> Floats:
         return np.stack([np.interp(t, self.t, c) for c in total.T], -1)
 
-    def at(self, name, t):
+    def at(self, name: str, t: Floats) -> Floats:
         """Return a sum at times: (k, 3)."""
         return self._interp(self.total[name], t)
 
     @property
-    def turned(self):
+    def turned(self) -> bool:
         """Tell whether anything turns the computed attitude."""
         return bool(self.state.phi.any() or self.state.gyro_scale)
 
-    def phi(self, t):
+    def phi(self, t: Floats) -> Floats:
         """Return by what the computed attitude is to be turned at times: (k, 3) rad, n."""
         phi = np.stack([np.interp(t, self.bins.edges, p) for p in self.state.phi.T], -1)
         g = self.state.gyro_scale
         phi[:, 2] += g * (1 + g) * np.interp(t, self.t, self.by_gyro_scale)
         return phi
 
-    def _by_gyro_scale(self, track, since):
+    def _by_gyro_scale(self, track: Track, since: float) -> Floats:
         """Return -(turn since the gyro counts) / (1 + g)^2 by epoch: drift is g (1 + g) it."""
         x = matrix_from_quat(track.q_nb) @ self.d_b
         yaw = np.unwrap(arctan2(x[:, 1], x[:, 0]))
         return -(yaw - np.interp(since, track.t, yaw)) / (1 + self.state.gyro_scale)**2
 
-    def _yaw(self):
+    def _yaw(self) -> Floats:
         """Return the turn by gyro at each epoch, (m,)."""
         x = matrix_from_quat(self.q_nb) @ self.d_b
         if self.turned:
@@ -116,7 +123,7 @@ class Way:
         turn = np.diff(yaw) * (level[:-1] + level[1:]) / 2
         return np.append(0.0, np.cumsum(turn))
 
-    def by_phi(self, t):
+    def by_phi(self, t: Floats) -> Floats:
         """Return what of the way turns with each node, (N, N + 1, 3) m."""
         bins, n = self.bins, len(self.bins.edges) - 1
         whole, late = (np.diff(self.at(name, bins.edges), axis=0) for name in ('v', 'xv'))
@@ -131,13 +138,13 @@ class Way:
         out[k, k + 1] += part_late
         return out
 
-    def _bin_mean(self, x):
+    def _bin_mean(self, x: Floats) -> Floats:
         """Return the means over bins of values at epochs, by time: (m, ...) to (N,)."""
         n = len(self.bins.edges) - 1
         time = np.bincount(self.of, self.weight, n)
         return np.bincount(self.of, (x[:-1] + x[1:]) / 2 * self.weight, n) / np.maximum(time, 1e-9)
 
-    def turn(self, state):
+    def turn(self, state: 'State') -> tuple[Floats, Floats, Floats]:
         """Return residual (N,) m and derivatives (N, 5) of the turn equation, yaw at the nodes."""
         left, right = (k * (s - s[0]) for k, s in zip(self.k, self.s, strict=True))
         ratio = np.exp(state.log_ratio)
@@ -148,7 +155,7 @@ class Way:
         means = np.stack([self._bin_mean(c) for c in (*by.T, g)], -1)
         return -means[:, -1], means[:, :-1], np.interp(self.bins.edges, self.t, self.yaw)
 
-    def rests(self):
+    def rests(self) -> tuple[Floats, Floats, Floats]:
         """
         Return the share of bins spent in each standstill, seconds in motion, counts.
 
@@ -163,11 +170,11 @@ class Way:
         share = np.zeros((n, len(runs)))
         for r, (a, b) in enumerate(runs):
             share[:, r] = np.bincount(self.of[a:b], self.weight[a:b], n) / time
-        counts = sum(np.bincount(self.of, np.abs(np.diff(s)) * (self.weight > 0), n)
-                     for s in self.s) / 2
-        return share, time * (1 - share.sum(axis=1)), counts
+        left, right = (np.bincount(self.of, np.abs(np.diff(s)) * (self.weight > 0), n)
+                       for s in self.s)
+        return share, time * (1 - share.sum(axis=1)), (left + right) / 2
 
-    def forward(self):
+    def forward(self) -> Floats:
         """Return the mean forward axis of each bin, (N, 3)."""
         n = len(self.bins.edges) - 1
         x = matrix_from_quat(self.q_nb)[:-1] @ self.d_b

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 
 SLIP_GRID = 0.1     # s between the rows in which slips are looked for: the shortest is a second
@@ -42,7 +43,7 @@ class WheelSlips:
     change: float = 0.0
 
     @property
-    def t(self):
+    def t(self) -> Floats:
         """Return the middle of each, s."""
         return (self.begin + self.end) / 2
 
@@ -50,12 +51,12 @@ class WheelSlips:
 NO_SLIPS = WheelSlips()
 
 
-def slips_of(events, wheel) -> WheelSlips:
+def slips_of(events: list[tuple[float, float, float]], wheel: list[int]) -> WheelSlips:
     """Return slips by (begin s, end s, size m, right less left) and by wheel, -1, 0 or +1."""
     begin, end, size = np.array(events).T
-    wheel = np.array(wheel, np.int64)
+    which = np.array(wheel, np.int64)
     # a left wheel that spins makes right less left negative
-    return WheelSlips(begin, end, np.where(wheel < 0, -size, size), wheel)
+    return WheelSlips(begin, end, np.where(which < 0, -size, size), which)
 
 
 def slip_reason(slips: WheelSlips) -> tuple[Reason]:

@@ -18,8 +18,9 @@ that changes on the way.
 import numpy as np
 
 from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.wheel_pair import robust_fit
+from odocal_ros.screening.wheel_pair import Pair, robust_fit
 
 # statistical: sigmas from which wheels part, of tens of thousands of windows in a leg: once in 500
 # million each by chance, whose noise is not quite normal
@@ -27,7 +28,7 @@ WHOLE_DRIVE_SIGMAS = 6.0
 MEAN_STEPS = 10     # steps that speed, turn rate and the ends of a window are averaged over: 1 s
 
 
-def signals_of(two, metres_per_unit):
+def signals_of(two: Pair, metres_per_unit: float) -> Floats:
     """
     Return what the right way is made of, at the edges: (n, 6).
 
@@ -42,12 +43,13 @@ def signals_of(two, metres_per_unit):
     return np.stack([two.left, two.turn, two.t - two.t[0], speed, rate, load], -1)
 
 
-def _smooth(x, reach):
+def _smooth(x: Floats, reach: int) -> Floats:
     padded = np.pad(x, reach, mode='edge')
     return np.convolve(padded, np.full(2 * reach + 1, 1 / (2 * reach + 1)), mode='valid')
 
 
-def fitted(two, signals, metres_per_unit):
+def fitted(two: Pair, signals: Floats, metres_per_unit: float,
+           ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return the coefficients of the signals by cells of a second, and their covariance."""
     at = np.arange(0, len(two.t), MEAN_STEPS)
     A, y = np.diff(signals[at], axis=0), np.diff(two.right[at])
@@ -65,7 +67,7 @@ def fitted(two, signals, metres_per_unit):
     return x, covariance
 
 
-def swapped(width, sigma, track_width):
+def swapped(width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
                                                        track_width / 2):
         return (Reason(Code.WHEEL_DEAD, 'both wheels count alike in turns, too: turn and '
@@ -82,7 +84,8 @@ def swapped(width, sigma, track_width):
                    f'{sigma:.2g} m'),)
 
 
-def changed(two, signals, metres_per_unit):
+def changed(two: Pair, signals: Floats,
+            metres_per_unit: float) -> tuple[tuple[Reason, ...], float]:
     """
     Say that the wheels' ratio is not the same before and after some place of the way.
 
@@ -97,7 +100,7 @@ def changed(two, signals, metres_per_unit):
         at = int(np.searchsorted(way, share * way[-1]))
         late = np.where(np.arange(len(way)) > at, two.left - two.left[at], 0.0)
         x, covariance = fitted(two, np.column_stack([signals, late]), metres_per_unit)
-        if x is None or x[0] <= 0:
+        if x is None or covariance is None or x[0] <= 0:
             continue
         change, sigma = x[-1] / x[0], np.sqrt(covariance[-1, -1]) / x[0]
         least = max(2e-3, WHOLE_DRIVE_SIGMAS * sigma)       # tyres warm up alike to that
@@ -117,7 +120,7 @@ def changed(two, signals, metres_per_unit):
                    f'it, that of each wheel {50 * abs(held):.2f} %'),), held
 
 
-def unlike(ratio, width, limit):
+def unlike(ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
     """Say that one wheel counts far finer: the mean count is no longer of the axle's middle."""
     if max(ratio, 1 / ratio) <= 1 + limit:
         return ()
