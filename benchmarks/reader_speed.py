@@ -10,14 +10,15 @@
 """
 Reading and replaying an hour's bag beside plain reading: each ratio beside its goal, in one run.
 
-    python benchmarks/reader_speed.py [--minutes 60] [--repeat 5] [--camera] [--wall]
+    python benchmarks/reader_speed.py [--minutes 60] [--repeat 5] [--camera] [--wall] [--growth]
                                       [--only WORD ...] [--folder DIR]
 
 Writes simulated bags of a town drive (200 Hz Imu, 50 Hz counts, 5 Hz fixes; --camera adds 1 GB of
 pictures), each read once before it is timed. Every figure is the median of processes of their own,
 in processor seconds (--wall: on the clock), taken in turn, so that a busy machine hurts all alike.
 ``read`` are the file's bytes, unpacked where they are packed; ``raw`` is rosbags' iteration over
-the wanted topics, nothing decoded; neither counts its imports.
+the wanted topics, nothing decoded; neither counts its imports. ``auto`` is the replay with all
+files and the report, less what the methods themselves take. --growth compares 10 min with 3 h.
 """
 
 import argparse
@@ -72,15 +73,31 @@ with open_bag(path) as bag:
 rows = [recorder.rows(slot) for slot in topics.values()]
 print(clock() - began)
 """
+AUTO = TIMED + """
+from odocal_ros.offline.cli import main
+from odocal_ros.pipeline import leg_run
+run, spent = leg_run.run_methods, 0.0
+def timed(*args):
+    global spent
+    began = clock()
+    found = run(*args)
+    spent += clock() - began
+    return found
+leg_run.run_methods = timed
+main(['replay', str(path), '--quiet', '--force', '--output', sys.argv[3]])
+print(spent)
+"""
 ODOCAL = [sys.executable, '-m', 'odocal_ros.offline.cli']
 FILES = ['--set', 'output.formats=[params, transform]']
 # what, beside what, and at most so many times that, by kind of bag
 GOALS = (('arrays', 'read', {'mcap': 5.0, 'zstd': 4.0, 'sqlite3': 15.0}),
          ('arrays', 'raw', {'mcap': 1 / 8, 'zstd': 1 / 8, 'sqlite3': 1 / 1.8}),
          ('two_point', 'raw', {'mcap': 0.8, 'sqlite3': 1.4}),
-         ('inspect', 'raw', {'mcap': 0.6, 'sqlite3': 1.2}))
+         ('inspect', 'raw', {'mcap': 0.6, 'sqlite3': 1.2}),
+         ('auto', 'raw', {'mcap': 1.2}))
 PEAK = {60: 300, 180: 600}       # MiB of two_point, by minutes
 HELP = 2.5                       # times a bare python
+SHORT, LONG, GROWTH = 10.0, 180.0, 1.1      # min, min, times proportional
 
 
 def main() -> None:
@@ -90,6 +107,7 @@ def main() -> None:
     parser.add_argument('--repeat', type=int, default=5)
     parser.add_argument('--camera', action='store_true', help='add 1 GB of camera messages')
     parser.add_argument('--wall', action='store_true', help='time on the clock')
+    parser.add_argument('--growth', action='store_true', help='10 min beside 3 h')
     parser.add_argument('--only', nargs='*', default=['mcap', 'zstd', 'sqlite3', 'help'])
     parser.add_argument('--folder', type=Path, help='keep and reuse the bags here')
     args = parser.parse_args()
@@ -97,9 +115,14 @@ def main() -> None:
     print(f'{"what":34} {"s":>7} {"beside":>8} {"s":>7} {"ratio":>7} {"goal":>7}')
     with tempfile.TemporaryDirectory() as scratch:
         for kind in [kind for kind in args.only if kind != 'help']:
-            path = _bag(args.folder or Path(scratch), kind, args.minutes, args.camera)
-            _compare(path, kind, args.repeat, clock, args.minutes)
-        if 'help' in args.only:
+            folder = args.folder or Path(scratch)
+            if args.growth:
+                _grown(*(_bag(folder, kind, minutes, args.camera) for minutes in (SHORT, LONG)),
+                       args.repeat, clock)
+            else:
+                _compare(_bag(folder, kind, args.minutes, args.camera), kind, args.repeat, clock,
+                         args.minutes)
+        if 'help' in args.only and not args.growth:
             bare, shown = (_medians({'x': command}, args.repeat, clock)[0]['x'] for command in (
                 [sys.executable, '-c', 'pass'], [*ODOCAL, '--help']))
             _line('odocal --help', shown, 'python', bare, HELP)
@@ -135,6 +158,25 @@ def _write(path, kind, minutes, camera):
 
 def _compare(path, kind, repeat, clock, minutes):
     """Print the ratios of a bag."""
+    seconds, peak = _measured(path, repeat, clock)
+    for what, beside, goals in GOALS:
+        if kind in goals:
+            _line(f'{path.name}: {what}', seconds[what], beside, seconds[beside], goals[kind])
+    most = PEAK.get(minutes)
+    print(f'{f"{path.name}: peak of two_point":34} {peak["two_point"]:7.0f} MiB'
+          + f' (goal {most})' * bool(most), flush=True)
+
+
+def _grown(short, long, repeat, clock):
+    """Print how what is done grows from a short bag to a long one."""
+    (few, _), (many, _) = (_measured(path, repeat, clock) for path in (short, long))
+    for what in ('arrays', 'two_point', 'inspect', 'auto'):
+        _line(f'{long.name}: {what}', many[what], f'{SHORT:g} min', few[what],
+              GROWTH * LONG / SHORT)
+
+
+def _measured(path, repeat, clock):
+    """Return the median seconds of all that is done with a bag, and the peaks, MiB."""
     file = next(f for f in sorted(path.iterdir()) if f.suffix != '.yaml')
     with file.open('rb') as f:
         while f.read(2**20):      # in pieces, for the same reason as in _bag
@@ -145,13 +187,8 @@ def _compare(path, kind, repeat, clock, minutes):
         commands['two_point'] = [*ODOCAL, 'replay', str(path), '--method', 'two_point',
                                  '--quiet', '--force', '--output', out, *FILES]
         commands['inspect'] = [*ODOCAL, 'inspect', str(path)]
-        seconds, peak = _medians(commands, repeat, clock)
-    for what, beside, goals in GOALS:
-        if kind in goals:
-            _line(f'{path.name}: {what}', seconds[what], beside, seconds[beside], goals[kind])
-    most = PEAK.get(minutes)
-    print(f'{f"{path.name}: peak of two_point":34} {peak["two_point"]:7.0f} MiB'
-          + f' (goal {most})' * bool(most), flush=True)
+        commands['auto'] = [sys.executable, '-c', AUTO, str(path), clock, out]
+        return _medians(commands, repeat, clock)
 
 
 def _line(what, seconds, beside, others, goal) -> None:
@@ -165,8 +202,11 @@ def _medians(commands, repeat, clock):
     for _ in range(repeat):
         for name, command in commands.items():
             out, spent, rss = _run(command, clock)
-            own = name in ('read', 'raw', 'arrays')        # they say what they took themselves
-            seconds[name].append(float(out.split()[-1]) if own else spent)
+            if name in ('read', 'raw', 'arrays'):      # they say what they took themselves
+                spent = float(out.split()[-1])
+            elif name == 'auto':                       # it says what its methods took
+                spent -= float(out.split()[-1])
+            seconds[name].append(spent)
             peak[name] = max(peak[name], rss / 1024)
     return {name: statistics.median(each) for name, each in seconds.items()}, peak
 
