@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import medians
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import rpy_from_matrix
 from odocal_ros.reasons import Code, Reason
@@ -90,7 +91,7 @@ def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
         Its rough scale.
 
     """
-    mean = np.median(f_i, axis=0)
+    mean = medians(f_i)
     size = float(np.linalg.norm(mean))
     if size < 1e-3:
         return Mounting(None, None, np.pi, True, 0.0)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from odocal_ros.library.read_bag import Recording
 
 Spans = list[tuple[int, int]]    # (start, stop) stamps, ns
+Stops = tuple[Ints, tuple[Floats, float] | None]     # as ``stops_of`` gives them
 EPOCH = Decimal('1e8')        # numbers above are seconds since 1970, below since the bag's start
 EACH_STOP = 'each-stop'
 OPENING = 0.2                 # of the distance: a first stop later than this splits no leg
@@ -161,7 +162,7 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
 
 def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[LegSpan | str],
               marks: Sequence[tuple[int, int]], config: Config,
-              inputs: Inputs | None = None) -> Spans:
+              stops: Stops | None = None) -> Spans:
     """
     Return (start, stop) stamps of the legs of one bag.
 
@@ -178,8 +179,8 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
         As the node marked them.
     config : Config
         What counts as a standstill, least distance.
-    inputs : Inputs, optional
-        What ``screen`` makes of all that the topics have in common, where that is known.
+    stops : optional
+        What ``stops_of`` finds in all that the topics have in common, where that is known.
 
     Raises
     ------
@@ -188,16 +189,20 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
 
     """
     first, last = _common(recorder)
+
+    def stops_known() -> Stops:
+        return stops or stops_of(screen(recorder.close(first, last, preroll=0.0), config,
+                                        judged=False)[0], first, config)
     legs = [_placed(a, bag, first, last) for a in asked if isinstance(a, LegSpan)]
     if EACH_STOP in asked:
-        legs += _each_stop(recorder, first, last, config, inputs)
+        legs += _each_stop(stops_known(), config)
     if legs:
         return legs
     if marks:
         return _marked(marks, last, bag)
     if config.leg.automatic:
         return by_themselves(recorder, last, config) or [(first, last)]
-    return [_by_standstill(recorder, first, last, config, inputs)]
+    return [_by_standstill(first, last, stops_known())]
 
 
 def _marked(marks: Sequence[tuple[int, int]], last: int, bag: 'Bag | Recording') -> Spans:
@@ -239,11 +244,17 @@ def _s(stamp: int, bag: 'Bag | Recording') -> str:
     return f'{(stamp - bag.start_ns) * 1e-9:.2f}'
 
 
-def _stops(recorder: LegRecorder, first: int, last: int, config: Config,
-           inputs: Inputs | None) -> tuple[Ints, tuple[Floats, float] | None]:
-    """Return standstills of the whole recording, stamps, and metres driven before each time."""
-    if inputs is None:
-        inputs, _ = screen(recorder.close(first, last, preroll=0.0), config)
+def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
+    """
+    Return the standstills of a recording, and how far was driven until then.
+
+    inputs : of all that its topics have in common, screened.   first : ns, where they begin.
+
+    Returns
+    -------
+    (k, 2) ns, and (k, 2) m driven before each with the whole way, None where that is not known.
+
+    """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None
     scale = place(inputs, config).rough or 1.0
@@ -262,10 +273,9 @@ def by_themselves(recorder: LegRecorder, last: int, config: Config) -> Spans:
             if (leg.stop_ns or last) > leg.start_ns]
 
 
-def _by_standstill(recorder: LegRecorder, first: int, last: int, config: Config,
-                   inputs: Inputs | None) -> tuple[int, int]:
+def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
     """Return one leg, from the first standstill to the last; intermediate stops never split."""
-    stops, driven = _stops(recorder, first, last, config, inputs)
+    stops, driven = known
     if driven is None or not len(stops):
         return first, last
     metres, whole = driven
@@ -279,10 +289,9 @@ def _by_standstill(recorder: LegRecorder, first: int, last: int, config: Config,
     return start, stop
 
 
-def _each_stop(recorder: LegRecorder, first: int, last: int, config: Config,
-               inputs: Inputs | None) -> Spans:
+def _each_stop(known: Stops, config: Config) -> Spans:
     """Return a leg from each standstill to the next that is long enough."""
-    stops, driven = _stops(recorder, first, last, config, inputs)
+    stops, driven = known
     legs: Spans = []
     lengths = []
     if driven is None:

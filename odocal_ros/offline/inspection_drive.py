@@ -20,8 +20,9 @@ from odocal_ros.calib.mounting import mounting, with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.pieces import lengths, medians
 from odocal_ros.errors import BadData, BadUsage
-from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs
+from odocal_ros.library.legs import EACH_STOP, find_legs, LegSpan, marked_legs, stops_of
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.stretches import (
     Drive,
@@ -99,12 +100,13 @@ def _units(inputs: Inputs, config: Config,
     """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
         imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
-    w_i, f_i = inputs.w_b @ inputs.C_bi, inputs.f_b @ inputs.C_bi
+    w_i, f_i = inputs.w_b, inputs.f_b
+    if not np.array_equal(inputs.C_bi, np.eye(3)):
+        w_i, f_i = w_i @ inputs.C_bi, f_i @ inputs.C_bi
     options = []
-    if 0.85 < np.linalg.norm(np.median(f_i, axis=0)) < 1.15:
+    if 0.85 < np.linalg.norm(medians(f_i)) < 1.15:
         options.append(f'imu.accel_scale={9.80665 * config.imu.accel_scale:.10g}')
-    spread = np.linalg.norm(w_i - np.median(w_i, axis=0), axis=1)
-    if np.percentile(spread, 99.9) > MAX_RATE:
+    if np.percentile(lengths(w_i - medians(w_i)), 99.9) > MAX_RATE:
         options.append(f'imu.gyro_scale={RAD_PER_DEG * config.imu.gyro_scale!r}')
         w_i = w_i * RAD_PER_DEG
     return options, w_i, f_i
@@ -122,7 +124,7 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config
         'forward_i': None if m.forward_i is None else m.forward_i.tolist(),
         'forward_sigma': m.forward_sigma if m.forward_i is not None else None,
         'needed': m.rpy is not None and not agrees and not set_already}
-    up_i = np.median(f_i, axis=0)
+    up_i = medians(f_i)
     up_i = up_i / max(float(np.linalg.norm(up_i)), 1e-9)
     ratio = turn_ratio(inputs.t_imu, w_i @ up_i, drive.t_fix, drive.fixes_n, drive.sigma)
     found['drive']['gyro_over_course'] = ratio
@@ -146,11 +148,12 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
         return {'start': base + start, 'stop': base + stop, 'way': way, 'chord': chord} | more
 
     marks = marked_legs(bag)
+    stops = stops_of(inputs, first, config)
     found['legs'] = [described(a, b, marked=bool(marks))
-                     for a, b in find_legs(recorder, bag, [], marks, config, inputs)]
-    stops = find_legs(recorder, bag, [EACH_STOP], [], config, inputs) if len(
+                     for a, b in find_legs(recorder, bag, [], marks, config, stops)]
+    each = find_legs(recorder, bag, [EACH_STOP], [], config, stops) if len(
         drive.stops) > 2 else []
-    found['each_stop'] = [described(a, b) for a, b in stops]
+    found['each_stop'] = [described(a, b) for a, b in each]
     found['straight'] = [
         described(first + round(a * 1e9), first + round(b * 1e9)) for a, b in (
             _from_rest(drive.stops, *ends)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import across, lengths, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
@@ -60,13 +61,12 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
     samples = oriented(samples)
     f_i = samples.f_i[~beyond('f_i', samples.f_i)]
     w_i = samples.w_i[~beyond('w_i', samples.w_i)]
-    mean = np.median(f_i, axis=0) if len(f_i) else np.zeros(3)
+    mean = medians(f_i) if len(f_i) else np.zeros(3)
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
-    fast = float(np.percentile(np.linalg.norm(w_i - np.median(w_i, axis=0), axis=1), 99.9)) \
-        if len(w_i) else 0.0
+    fast = float(np.percentile(lengths(w_i - medians(w_i)), 99.9)) if len(w_i) else 0.0
     there = ~np.isnan(samples.yaw_variance)
-    turned = there & (np.abs(samples.q_ni[:, :3]).max(axis=1, initial=0.0) > 1e-9)
+    turned = there & (across(np.maximum, np.abs(samples.q_ni[:, :3])) > 1e-9)
     variance = samples.yaw_variance[turned]
     known = variance[variance > 0]
     return {

@@ -84,9 +84,12 @@ class Inputs:
                        travel_right=self.travel_right and self.travel_right.mirrored(spans))
 
 
-def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
+def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple[Reason, ...]]:
     """
     Clean a leg.
+
+    judged : False for its motion alone: clocks, gyro and wheels that fail are not looked for, and
+    orientations stay as sent.
 
     Returns
     -------
@@ -100,14 +103,16 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
             found.append(Reason(code, f'no {LABEL[slot]} message between the marks'))
     offset = _offsets(config)
-    found += judge_clocks(leg, offset, LABEL)
+    if judged:
+        found += judge_clocks(leg, offset, LABEL)
 
     def rows(slot: str) -> tuple[Any, Floats]:
         return usable_rows(slot, leg, config, offset[slot], found)
 
     imu, t_imu = rows('imu')
     heading, t_heading = rows('heading')
-    imu, heading = oriented(imu), oriented(heading)
+    if judged:
+        imu, heading = oriented(imu), oriented(heading)
     let_go()
     velocity, t_velocity = rows('fix_velocity')
     travelled = wheels(leg, config, rows, found)
@@ -121,12 +126,13 @@ def screen(leg: Leg, config: Config) -> tuple[Inputs, tuple[Reason, ...]]:
     _gaps('odometer', travelled.mean.t, found)
     if travelled.right is not None:      # the mean stands on the left wheel's rows
         _gaps('odometer_right', travelled.right.t, found)
-    found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
+    if judged:
+        found += frozen(t_imu, imu.w_i, travelled.mean, config.leg.max_gap)
     C_bi = matrix_from_rpy(config.imu.mounting_rpy)
     t_stop = (leg.stop_ns - leg.start_ns) * 1e-9
     w_b = _turned(imu.w_i, config.imu.gyro_scale, C_bi)
     f_b = _turned(imu.f_i, config.imu.accel_scale, C_bi)
-    if travelled.left is not None and travelled.right is not None and not unfelt:
+    if judged and travelled.left is not None and travelled.right is not None and not unfelt:
         found += broken_wheels(travelled.left, travelled.right, (t_imu, w_b, f_b), (0.0, t_stop))
     let_go()
     if not leg.form.sides:       # of two wheels of unknown sides only the mean has a meaning

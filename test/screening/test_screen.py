@@ -395,3 +395,18 @@ def test_an_orientation_that_is_none_is_not_used(leg, q, variance):
     assert not np.isfinite(inputs.yaw_variance[40:60]).any()
     assert np.abs(np.nan_to_num(inputs.q_ni)).max() <= 7.0
     assert len(inputs.t_imu) == len(leg.imu.stamp_ns)
+
+
+@pytest.mark.parametrize('options', [{}, {'two_wheels': True}, {'odometer': 'speed'}])
+def test_the_motion_alone_is_that_of_the_whole_screening(options):
+    some = drive(scenario='town', duration=120.0, imu_grade='consumer', outliers=0.02, seed=4,
+                 **options)
+    spoilt = changed(some.imu, w_i=lambda a: a.__setitem__(slice(1500, 3500), 0.5),
+                     q_ni=lambda a: a.__setitem__(slice(40, 60), 1e200))
+    leg = replace(some.leg(), imu=spoilt)
+    whole, found = screen(leg, settings(some))
+    alone, _ = screen(leg, settings(some), judged=False)
+    assert Code.IMU_GAP in {r.code for r in found}        # which the search for legs does not ask
+    for name in ('t_imu', 'w_b', 'f_b', 't_fix', 'geodetic', 'covariance_n'):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    np.testing.assert_array_equal(alone.travel.s, whole.travel.s)
