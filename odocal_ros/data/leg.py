@@ -90,6 +90,12 @@ class LegRecorder:
             self._rows[slot].feed(block)
             self._newest[slot] = int(block.stamp_ns[-1])
 
+    def adopt(self, slot: str, other: 'LegRecorder', own: str) -> None:
+        """Hold the rows that another recorder has of a slot of its own, where it has any."""
+        if len(other.rows(own).stamp_ns):
+            self._rows[slot] = other._rows[own].snapshot()
+            self._newest[slot] = other._newest[own]
+
     def newest_ns(self, slot: str) -> int:
         """Return the stamp of the last row fed, 0 before the first."""
         return self._newest[slot]

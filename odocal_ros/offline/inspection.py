@@ -190,12 +190,12 @@ def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
         rows = taps[topic].recorder
         if slot == 'odometer':
             recorder.form = taps[topic].reader.form or recorder.form
-            recorder.feed('odometer_right', rows.rows('odometer_right'))
+            recorder.adopt('odometer_right', rows, 'odometer_right')
         if slot == 'odometer_right':
             recorder.form_right = taps[topic].reader.form
         own = 'odometer' if slot == 'odometer_right' else taps[topic].reader.slot
         if own == slot or slot == 'odometer_right':
-            recorder.feed(slot, rows.rows(own))
+            recorder.adopt(slot, rows, own)
     return recorder
 
 

@@ -136,3 +136,15 @@ def test_a_first_row_years_after_the_mark_is_no_part_of_the_leg():
     assert recorder.close(5, 25).odometer.value.tolist() == [1, 2]
     with pytest.raises(BadData, match='the leg lasts 4000 days'):
         recorder.close(5, 40 + late)
+
+
+def test_rows_of_another_recorder_are_held_uncopied():
+    """Under another name too; what comes to that one later is not, and nothing is none."""
+    one, both = recorded(TOPICS, [('odometer', 0, 100)]), recorded(TOPICS, [('imu', 0, 50)])
+    both.adopt('odometer_right', one, 'odometer')
+    both.adopt('imu', one, 'imu')
+    assert np.shares_memory(both.rows('odometer_right').value, one.rows('odometer').value)
+    one.feed('odometer', take(TOPICS['odometer'], slice(100, 200)))
+    np.testing.assert_array_equal(both.rows('odometer_right').value, np.arange(100) * 7)
+    assert both.newest_ns('odometer_right') == TOPICS['odometer'].stamp_ns[99]
+    assert len(both.rows('imu').stamp_ns) == 50
