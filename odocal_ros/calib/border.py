@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the data of a leg tell of the constants of the vehicle: information, no prior in it."""
+"""The information of a leg's data on the constants of the vehicle, no prior in it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,13 +24,13 @@ class Border:
     The data of a leg as a quadratic in the constants x, all else of the leg eliminated.
 
     Their log likelihood is pull (x - value) - (x - value)' information (x - value) / 2, but for a
-    constant (docs/method.md, several legs). Constants go by their names; ln K, rad, m, s.
+    constant, docs/method.md (S33). Constants go by their names; ln K, rad, m, s.
 
     names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
-    centre, sigma : (m,) what was believed beforehand, inf where nothing is.   used : (m,) the
-    sigmas with those priors widened that the leg gainsaid.   usual : (m,) of what may be there or
-    not, and which of both the leg's own evidence says, the sigma of what is there; 0 of others.
+    centre, sigma : (m,) of the priors, inf where there is none.   used : (m,) the sigmas, those
+    widened that the leg gainsaid.   usual : (m,) of what may be there or not, and which of both
+    the leg's own evidence says, the sigma of what is there; 0 of others.
     """
 
     names: tuple[str, ...]
@@ -54,7 +54,7 @@ class Border:
         Return the border of a leg whose constants differ from the vehicle's by errors of its own.
 
         sigmas : by name, of each constant's own error d, inf: the leg then says nothing of it.
-        The data see x + d; d is taken out: D - D A (1 + A' D A)^-1 A' D, A the sigmas as columns.
+        The data see x + d; d is taken out, docs/method.md (S34).
         """
         D, at = self.information, [self.names.index(name) for name in sigmas]
         size = np.array(list(sigmas.values()))
@@ -69,7 +69,7 @@ class Border:
                        pull=self.pull - taken @ (A.T @ self.pull))
 
     def only(self, names: Sequence[str]) -> 'Border':
-        """Return what is told of some constants, where of the others is known what is believed."""
+        """Return the information on some constants, the others taken out with their priors."""
         at = np.isin(self.names, names)
         free = self.loosened({n: s for n, s in zip(self.names, self.used, strict=True)
                               if n not in names})
@@ -84,9 +84,9 @@ class Border:
         value[i] = about + wrap(value[i] - about)
         return replace(self, value=value)
 
-    def told(self, unit: Floats) -> 'Border':
+    def determined(self, unit: Floats) -> 'Border':
         """
-        Return what is left of it in directions in which it tells as much as a prior, or more.
+        Return what is left of it in directions in which it is worth a prior, or more.
 
         unit : (m,) prior sigmas, in which such information is 1.
         """

@@ -44,7 +44,7 @@ class Carried:
         """
         Return what it tells of some constants.
 
-        keeps : of what is believed of each, by how much it may have changed until it is used.
+        keeps : of each prior sigma, the share by which it may have changed until it is used.
         """
         border = self.border.only(names)
         return replace(self, border=border.loosened(

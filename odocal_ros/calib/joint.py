@@ -11,8 +11,7 @@
 Several legs of a vehicle to one estimate of its constants: that of one fit of all their rows.
 
 Each leg comes as its border. Constants are those of the vehicle, the same in every leg, but that
-ln K walks at random from leg to leg; what is believed beforehand counts once. Equations:
-docs/method.md, several legs.
+ln K walks at random from leg to leg; priors count once: docs/method.md (S35).
 """
 
 from collections.abc import Sequence
@@ -36,7 +35,7 @@ class Joint:
     The constants by all legs.
 
     names, value, covariance : (m,), (m, m), of the last leg where they walk.
-    sigma, used : (m,) believed beforehand, first and with what legs gainsaid.
+    sigma, used : (m,) of the priors, first and with what legs gainsaid.
     chi2, freedom : disagreement of the legs before anything was widened, and what it should be.
     spread : sigma by which legs differ, of each constant that does.   deviation : (J, m) of each
     leg from the others, in sigmas, before that.   factor : on all sigmas, in ``covariance``.
@@ -126,7 +125,7 @@ def _spread(legs: LinkedLegs, spread: dict[str, float], name: str, target: float
     Return the sigma of a constant between legs at which they differ in it as much as they may.
 
     target : the disagreement that is left where the constant is each leg's own, and one for each
-    leg but one (Paule and Mandel 1982). No more than was believed of it: what is known to 1 %
+    leg but one (Paule and Mandel 1982). No more than its prior: what is known to 1 %
     does not differ by 4 %, and legs told of it without that say what their noise wants.
     """
     i = legs.names.index(name)

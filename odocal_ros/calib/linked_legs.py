@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The rows of several legs as one least squares: constants they share, one that walks, priors."""
+"""The rows of several legs as one least squares: docs/method.md (S35) to (S37)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,13 +46,13 @@ class LinkedLegs:
     def take(self, borders: list[Border]) -> None:
         """Take legs in place of those there, on the names of all."""
         self.borders = borders
-        self._told: list[Border] | None = None
+        self._determined: list[Border] | None = None
 
-    def told(self) -> list[Border]:
-        """Return of each leg what it tells at least as well as it was believed."""
-        if self._told is None:      # asked for each constant anew
-            self._told = [b.told(self.unit) for b in self.borders]
-        return self._told
+    def determined(self) -> list[Border]:
+        """Return of each leg what it determines at least as well as the priors do."""
+        if self._determined is None:      # asked for each constant anew
+            self._determined = [b.determined(self.unit) for b in self.borders]
+        return self._determined
 
     def columns(self, j: int) -> Ints:
         """Return where the constants of leg j stand among the unknowns: z, then k by leg."""
@@ -86,7 +86,7 @@ class LinkedLegs:
     def solve(self, spread: dict[str, float] | None = None) -> tuple[Floats, Floats]:
         """Return the unknowns and their covariance, of leg j at ``place``."""
         A, b = self.system(spread)
-        prior, centre = self._beliefs(A.shape[1])
+        prior, centre = self._prior_rows(A.shape[1])
         Q, R = np.linalg.qr(np.concatenate([A, prior]))
         inverse = np.linalg.inv(R)
         x = inverse @ (Q.T @ np.concatenate([b, centre]))
@@ -95,8 +95,8 @@ class LinkedLegs:
             scale[self.place(j)] = self.unit
         return x * scale, inverse @ inverse.T * np.multiply.outer(scale, scale)
 
-    def _beliefs(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
-        """Return what is believed of constants, but for some, as rows and what they should be."""
+    def _prior_rows(self, columns: int, but: Sequence[int] | Ints = ()) -> tuple[Floats, Floats]:
+        """Return the priors of constants, but for some, as rows and what they should be."""
         held = np.setdiff1d(np.flatnonzero(np.isfinite(self.used)), but)
         prior = np.zeros((len(held), columns))
         prior[np.arange(len(held)), self.place(0)[held]] = 1.0     # columns are in its units
@@ -113,7 +113,7 @@ class LinkedLegs:
 
     def evidence(self, at: Ints) -> tuple[Floats, Floats]:
         """
-        Return what legs tell of some constants, what is believed of the others taken in.
+        Return the legs' information on some constants, the others taken out with their priors.
 
         Returns
         -------
@@ -121,14 +121,14 @@ class LinkedLegs:
 
         """
         A, b = self.system()
-        prior, centre = self._beliefs(A.shape[1], at)
+        prior, centre = self._prior_rows(A.shape[1], at)
         rows, b = _left(np.concatenate([A, prior]), np.concatenate([b, centre]),
                         self.place(0)[at])
         rows = rows / self.unit[at]
         return rows.T @ rows, rows.T @ b
 
-    def believing(self, at: Ints, sigmas: Floats) -> list[Border]:
-        """Return the borders with what is to be believed of some constants."""
+    def with_priors(self, at: Ints, sigmas: Floats) -> list[Border]:
+        """Return the borders with other prior sigmas of some constants."""
         first, used = self.sigma.copy(), self.used.copy()
         first[at] = used[at] = sigmas
         return [replace(b, sigma=first, used=used) for b in self.borders]
@@ -137,13 +137,13 @@ class LinkedLegs:
         """
         Return the legs' cost when they are one vehicle's, and what it should be.
 
-        Of what legs tell at least as well as it was believed: farther off than that their
+        Of what legs determine at least as well as the priors: farther off than that their
         equations need not be true.
         """
-        A, b = self.system(spread, self.told())
+        A, b = self.system(spread, self.determined())
         # priors hold what no leg tells: else two legs that tell half of the constants each, in
         # directions that are never the same, would have one set of them, however far apart
-        prior, centre = self._beliefs(A.shape[1])
+        prior, centre = self._prior_rows(A.shape[1])
         U, size, _ = np.linalg.svd(np.concatenate([A, prior]), full_matrices=False)
         of_legs, U = slice(len(A)), U[:, size > 1e-8 * size[0]]      # below is rounding
         rest = (b - U[of_legs] @ (U.T @ np.concatenate([b, centre])))
@@ -158,7 +158,7 @@ class LinkedLegs:
         """
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
-        for j, border in enumerate(self.told()):
+        for j, border in enumerate(self.determined()):
             border = border.loosened(spread) if spread else border
             D, where = border.information, self.place(j)
             pull = border.pull - D @ (x[where] - border.value)
@@ -178,7 +178,7 @@ def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
 
 
 def _on(border: Border, names: tuple[str, ...]) -> Border:
-    """Return a border on more names, of which it says and believes nothing."""
+    """Return a border on more names, of which it has neither information nor prior."""
     if border.names == names:
         return border
     at = [names.index(n) for n in border.names]

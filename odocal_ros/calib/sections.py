@@ -55,7 +55,7 @@ def sections(way: Floats, reckoned_n: Floats, fix_n: Floats, sigma: Floats) -> S
     reckoned_n, fix_n : (k, 3) arrays
         Dead-reckoned and fixed positions, m.
     sigma : (k,) array
-        Of a fix as stated, m per horizontal axis; a hundredth of it is the least believed.
+        Of a fix as stated, m per horizontal axis; a hundredth of it is the least taken.
 
     """
     whole = way[-1] - way[0] if len(way) else 0.0

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the data of a leg tell of its constants, the states and what was believed taken out."""
+"""The information of a leg on its constants, states and priors taken out: docs/method.md (S33)."""
 
 import numpy as np
 
@@ -24,8 +24,8 @@ def border_of(fit: Fit, configured: Floats, grade: Grade) -> Border:
     """
     Return the border of a fit, at its last linearisation.
 
-    The normal matrix with the states eliminated, less what was believed of the constants: the
-    elimination leaves their corner's prior as it is.
+    The Schur complement of the constants less their priors, which the elimination leaves as they
+    are.
 
     configured : (M,) values of the settings that constants are corrections to.   grade : Grade,
     that the Imu is taken for.

@@ -8,7 +8,9 @@
 # the License.
 
 """
-Least squares on a chain, (S12): blocks that touch their neighbours, a border that touches all.
+Least squares on a chain with a border, and its Schur complement: docs/method.md (S22) to (S24).
+
+Blocks touch their neighbours, the border of constants touches all.
 
 The normal matrix is block tridiagonal with a border of constants. Blocks are eliminated one after
 the other by Cholesky; the way back gives the step, and the covariance of each pair of neighbours

@@ -10,10 +10,10 @@
 """
 Iterate: linearise, solve, estimate the noise, until nothing moves.
 
-The noise levels go to the maximum of the restricted likelihood ((S13), as Harville 1977 has it:
-quadratic sum over its expectation). What lies far outside its distribution is taken to have a
-heavy tail: fixes, slips of an interval, and priors (a lever arm, a delay, a turn-on bias) that
-the data gainsay.
+The variance components go to the maximum of the restricted likelihood, by their quadratic sums
+over what is expected of them, with over-relaxation: docs/method.md (S26), (S27). What lies far
+outside its distribution is taken to have a heavy tail: fixes, slips of an interval, and priors (a
+lever arm, a delay, a turn-on bias) that the data gainsay.
 """
 
 from collections.abc import Callable
@@ -248,7 +248,7 @@ def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats) -> Floats:
 def widened(first: Priors, now: Priors, state: State, solved: Solved, neighbours: Neighbours,
             fitted: bool) -> Priors:
     """
-    Return priors widened where the data are far from their centre.
+    Return priors widened where the data are far from their centre, docs/method.md (S30).
 
     Those of what is small give way only where the data know more than they do: nothing would
     gainsay a wide one. Nor do they while derivatives hold noise (fitted: they do not), which calls

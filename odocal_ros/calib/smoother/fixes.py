@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Fixes as rows, (S8): the antenna's place at the time of a fix, from the keyframe before it."""
+"""Fixes as rows, docs/method.md (S15), (S16): where the antenna is, from the keyframe before."""
 
 from typing import TYPE_CHECKING
 

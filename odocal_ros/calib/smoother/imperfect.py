@@ -14,10 +14,10 @@ An Imu with scale errors, axes that are not at right angles, a gyro that feels f
 that smooths; tyres that grow; a body that leans. A leg is fitted with all of them, as large as
 the grade of the Imu and the road's experience have them. Most drives then tell which are there:
 of each kind two priors (none; as usual) are weighed by their evidence, and the constants' priors
-become those whose posterior has the mean square of both.
+become those whose posterior has the mean square of both: docs/method.md (S28), (S29).
 
 Where fixes err slowly, metres come from the accelerometer, and its scale error is the odometer's.
-There no drive tells an error of a third of the grade from none: all are believed as usual.
+There no drive tells an error of a third of the grade from none: the prior of all is as usual.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def mixture_prior(data: Floats, pull: Floats, odds: float = 0.5) -> tuple[Floats
 def weigh_kinds(data: Floats, gradient: Floats | None,
                 kinds: Sequence[Bools | slice]) -> Floats:
     """
-    Return prior variances of all errors, each kind weighed with the others as last believed.
+    Return prior variances of all errors, each kind weighed with the others' priors as last.
 
     data : (k, k) information in units of the usual sigmas.   gradient : (k,) at no error, or None
     for errors that are not there.   kinds : slices.
@@ -96,7 +96,7 @@ def weigh_kinds(data: Floats, gradient: Floats | None,
 
 def judged_priors(now: Fit, grade: Grade, found: bool = True) -> Priors:
     """
-    Return a fit's priors with what is to be believed of imperfections.
+    Return a fit's priors with those of imperfections by evidence.
 
     grade : Grade, that the Imu is taken for.   found : False: as where there are none, whatever
     the fit's values.
@@ -133,9 +133,9 @@ def _taken(prior: Floats, last: Floats, sigma: Floats) -> Floats:
 
 def weighed_together(borders: list[Border], steps: Floats) -> list[Border]:
     """
-    Return borders of one vehicle with what all of them tell of imperfections believed.
+    Return borders of one vehicle with priors of imperfections by the evidence of all of them.
 
-    A leg that tells nothing of a kind believes it to be as usual; another, that there is none.
+    By itself a leg that does not determine a kind has it as usual, another none of it.
     Those whose fixes err slowly have no say.
 
     borders : by time.   steps : (J - 1,) sigmas by which the scale walks between them.
@@ -155,11 +155,11 @@ def weighed_together(borders: list[Border], steps: Floats) -> list[Border]:
     prior = weigh_kinds(data + 1e-3 * np.eye(len(at)), gradient * sigma,
                         [own for own in kind if own.any()])
     taken = _taken(prior, of.used[at], sigma)
-    return legs.believing(at, taken)
+    return legs.with_priors(at, taken)
 
 
 def judge_running(now: Fit, grade: Grade) -> Fit:
-    """Return a fit with what it tells of imperfections believed: where the next sets out."""
+    """Return a fit with priors of imperfections by its evidence: where the next sets out."""
     priors = judged_priors(now, grade)
     if priors is now.priors:
         return now

@@ -102,7 +102,7 @@ class ImuRows:
 
 
 def mended(imu: SomeRows, constants: Floats | None) -> tuple[Floats, Floats]:
-    """Return rotation vectors (n - 1, 3) and forces (n, 3) without the Imu's own errors."""
+    """Return turns (n - 1, 3), rad, and forces (n, 3) without M of docs/method.md (S3)."""
     if constants is None or not (constants[GYRO].any() or constants[ACCEL].any()):
         return imu.turn, imu.f_b
     gyro, accel = np.zeros((3, 6)), np.zeros((3, 3))

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The least noises that are believed: data may seem to have less, settings may say 0."""
+"""Bounds of variance components from below: data may seem to have less, settings may say 0."""
 
 from dataclasses import dataclass, field
 

@@ -37,7 +37,7 @@ def bias_sigmas(near: Neighbours, widen: float) -> Floats:
 
 def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray[Any]]:
     """
-    Return what the fit has less what each sensor says, and the noise it is believed to have.
+    Return the residuals of each sensor, fitted less measured, and the sigmas of its noise.
 
     Returns
     -------

@@ -8,7 +8,7 @@
 # the License.
 
 """
-The motion between keyframes, (S1) to (S5), (S7): residuals, their derivatives and noise.
+The motion between keyframes, docs/method.md (S5) to (S9): residuals and their derivatives.
 
 Rows of an interval: [position, velocity, attitude, gyro bias, accelerometer bias, odometer], each
 the state at its end less what the state at its begin and the preintegrated sums make of it. n
@@ -109,7 +109,7 @@ def speeding_up(state: State) -> Floats:
 
 
 def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
-    """Return what the scale varies with, as TYRES has it: (..., 4)."""
+    """Return what the scale varies with, docs/method.md (S11), as TYRES has it: (..., 4)."""
     # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
     force = faster + 0.1 + 1e-4 * speed**2
     return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
@@ -187,7 +187,7 @@ class Motion:
         return part
 
     def _vary(self) -> None:
-        """Work out how scale and forward axis change with speed, time and acceleration."""
+        """Work out how scale and forward axis change on the way: docs/method.md (S11), (S12)."""
         state, T, c = self.state, self.T, self.state.constants
         self.pushed = pushes(state)
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]

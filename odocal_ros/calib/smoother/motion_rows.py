@@ -156,9 +156,9 @@ class MotionRows(Part):
         """Yield what the unit noises of each level do."""
         units, given = [], []
         for rows, block in near.blocks():
-            told = self.to_told(block)
-            units.append(told @ self._units(rows)[1])
-            given.append(told @ np.swapaxes(self._J(rows), 1, 2)
+            cross = self.with_wanted(block)
+            units.append(cross @ self._units(rows)[1])
+            given.append(cross @ np.swapaxes(self._J(rows), 1, 2)
                          @ (self.whiten[rows] @ self.noise.given[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:

@@ -8,7 +8,7 @@
 # the License.
 
 """
-The noise model: variance components, and what a unit of each does to the rows of an interval.
+Variance components, and what a unit of each does to the rows of an interval: docs/method.md (S13).
 
 White noise that enters at a time within the interval acts on all that follows; the integral over
 that time is a three-point Gauss rule, exact for the polynomials that constant force and speed

@@ -60,7 +60,7 @@ UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
 SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
-# estimates where the drive tells them: lever arms and delays
+# estimates where the drive determines them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
@@ -118,8 +118,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
     ratio = {CONSTANTS[i]: float(after[i]) for i in (*OPTIONAL, *SCALES)}
-    found, undetermined = told(c + configured(leg), sigma, after, leg.scale_unit,
-                               leg.nominal_scale, config, widen)
+    found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
+                                     leg.nominal_scale, config, widen)
     reasons += undetermined
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
@@ -146,23 +146,23 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
 
 
 def floored(covariance: Floats, floor: Floats) -> Floats:
-    """Return the covariance of the constants with what the model does not hold, (3,) sigmas."""
+    """Return the covariance with a floor, (3,) sigmas, of the model: docs/method.md (S31)."""
     covariance = covariance.copy()
     covariance[range(len(floor)), range(len(floor))] += floor**2
     return covariance
 
 
-def told(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
-         config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
+def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nominal: float,
+               config: Config, doubt: float = 1.0) -> tuple[dict[str, Estimate], list[Reason]]:
     """
-    Return the estimates of the constants as far as the data tell them, and why not further.
+    Return the estimates of the constants that the data determine, and why not the others.
 
     Parameters
     ----------
     value, sigma : (M,) arrays
         Of the constants, ln K first, whole lever arms.
     ratio : (M,) array
-        Sigma by that believed beforehand.
+        Posterior sigma by that of the prior.
     scale_unit, nominal : str, float
         Of the scale; K0, 0 unknown.
     config : Config

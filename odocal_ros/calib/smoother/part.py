@@ -127,14 +127,14 @@ class Part:
         """Yield names of sources, and what their unit errors do to the constants: (..., 3, k)."""
         return ()
 
-    def to_told(self, block: Floats) -> Floats:
+    def with_wanted(self, block: Floats) -> Floats:
         """Return the covariance of scale, yaw and pitch with the unknowns: (k, 3, 2n + M)."""
         return block[:, 2 * self.n:2 * self.n + WANTED, :]
 
-    def all_told(self, near: Neighbours) -> Floats:
+    def all_with_wanted(self, near: Neighbours) -> Floats:
         """Return that of all intervals: (K, 3, 2n + M)."""
         # copies: a view of a few rows would hold the whole block
-        return np.concatenate([self.to_told(block).copy() for _, block in near.blocks()])
+        return np.concatenate([self.with_wanted(block).copy() for _, block in near.blocks()])
 
 
 class Total:

@@ -11,7 +11,7 @@
 Rows at times between keyframes, for sensors that say something of an instant.
 
 Each hangs on the keyframe before it, on the constants, and, where slow fix errors are estimated,
-on those of the keyframe after it. What lies far out loses weight as a heavy tail has it.
+on those of the keyframe after it. What lies far out loses weight: docs/method.md (S25).
 """
 
 from collections.abc import Callable, Iterator
@@ -212,10 +212,10 @@ class PointRows(Part):
         own, end = self._columns()
         parts = []
         for present, gather in self._intervals():
-            told = np.ascontiguousarray(self.to_told(near.of(present)))
-            X = told[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
+            cross = np.ascontiguousarray(self.with_wanted(near.of(present)))
+            X = cross[:, :, own] @ np.swapaxes(gather(self.J), 1, 2)
             if self.J_end is not None:
-                X = X + told[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
+                X = X + cross[:, :, end] @ np.swapaxes(gather(self.J_end), 1, 2)
             parts.append(X)
         yield self.source, np.concatenate(parts)
 

@@ -8,7 +8,7 @@
 # the License.
 
 """
-Preintegration: what Imu and odometer say of each interval (dR, dv, dp, S of (S1) to (S5)).
+Preintegration: dR, dv, dp and S of each interval, docs/method.md (S4).
 
 All in the body frame at the interval's begin, so that nothing depends on where the vehicle is:
 with R the attitude since then, dv, dp the single and double integral of R f, S the sum of R over

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Priors as a part, (S11): what is believed of biases, constants, and where a leg begins."""
+"""Priors as a part, docs/method.md (S21): of biases, constants, and where a leg begins."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
     'position': (P, 1e4), 'velocity': (V, 100.0),
                 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
-# believed of the vehicle, so the same in every leg
+# priors of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': constants_from('odometer_delay'),
           'fix_latency': constants_from('gnss_delay'),
@@ -55,7 +55,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
 
 
 class PriorRows(Part):
-    """Rows of the unknowns themselves: what is believed of each, beside no row of a sensor."""
+    """Rows of the unknowns themselves, each with its prior, beside no row of a sensor."""
 
     name = 'priors'
 
@@ -92,7 +92,7 @@ class PriorRows(Part):
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what the turn-on biases do."""
-        first = self.to_told(near[0][None])[0]
+        first = self.with_wanted(near[0][None])[0]
         yield 'gyro_bias', first[:, BG] / self.priors.gyro_bias
         yield 'accelerometer_bias', first[:, BA] / self.priors.accel_bias
 

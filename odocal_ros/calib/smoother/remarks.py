@@ -48,19 +48,19 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
-def model_floor(value: Floats, believed: Floats) -> Floats:
+def model_floor(value: Floats, prior: Floats) -> Floats:
     """
     Return what the model does not hold of scale, yaw and pitch, 1 sigma: (3,) relative, rad.
 
     The z accelerometer of an Imu that is mounted nose up feels a push ahead; what of its signal
     the y accelerometer has too, elsewhere a bias, is then taken for yaw. It is as far off a right
-    angle as the drive left to be believed of the other axes.
+    angle as the priors of the other axes are, as the drive left them.
 
-    value : (M,) constants.   believed : (M,) their prior sigmas, as the drive left them.
+    value : (M,) constants.   prior : (M,) their prior sigmas, as the drive left them.
     """
     floor = MODEL_FLOOR.copy()
     nose_up = forward_b(value[YAW], value[PITCH])[2]
-    floor[YAW] = np.hypot(floor[YAW], believed[[AXIS_XY, AXIS_ZX]].max() * nose_up)
+    floor[YAW] = np.hypot(floor[YAW], prior[[AXIS_XY, AXIS_ZX]].max() * nose_up)
     return floor
 
 

@@ -22,7 +22,7 @@ from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
 from odocal_ros.calib.smoother.imperfect import weighed_together
-from odocal_ros.calib.smoother.outcome import floored, in_words, OPTIONAL, SCALES, told
+from odocal_ros.calib.smoother.outcome import determined, floored, in_words, OPTIONAL, SCALES
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED
 from odocal_ros.calib.smoother.remarks import beside, model_floor
@@ -81,7 +81,7 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     scale = legs[-1].estimates['scale_factor']
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
                     (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
-    estimates, why = told(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    estimates, why = determined(found.value[at], sigma, ratio, scale.unit, nominal, config)
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
@@ -133,7 +133,7 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
 
 
 def _sources(used: Floats, C: Floats, floor: Floats) -> tuple[Source, ...]:
-    """Return the budget: what is believed of the vehicle, and what is the legs' own."""
+    """Return the budget: priors of the vehicle, shared, and what is the legs' own."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > 1e-9]      # of a correlation: rounding

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Where the sigma comes from, (S14): each kind of error's share of scale, yaw and pitch."""
+"""The error budget, docs/method.md (S32): each error's share of scale, yaw and pitch."""
 
 import numpy as np
 

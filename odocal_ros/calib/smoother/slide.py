@@ -8,11 +8,11 @@
 # the License.
 
 """
-How little the wheels are believed to slide sideways, and to heave: as the leg has tested it.
+Bounds from below of how much wheels slide sideways and heave: as the leg has tested it.
 
 Wheels slide in turns. A leg with turns shows how much, and its own figure stands. On a leg that
 goes straight on nothing tells a vehicle that goes a little askew from an Imu that is mounted so:
-there an ordinary road's noise is believed, whatever the residuals of the single seconds say.
+there an ordinary road's noise is taken, whatever the residuals of the single seconds say.
 """
 
 from typing import TYPE_CHECKING

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Slow errors of fixes as a part, (S9): a Gauss-Markov process at the keyframes."""
+"""Slow errors of fixes as a part, docs/method.md (S17): a Gauss-Markov process."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -43,7 +43,7 @@ class SlowError(Part):
     def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.T = here.state, here.intervals.T
         self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
-        self.told = not np.isnan(problem.fix_time)
+        self.time_given = not np.isnan(problem.fix_time)
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
@@ -93,7 +93,7 @@ class SlowError(Part):
         q_sum, expected = level
         found = {'slow': (float(q_sum[:2].sum()), float(expected[:2].sum())),
                  'slow_up': (float(q_sum[2]), float(expected[2]))}
-        if not self.told:
+        if not self.time_given:
             found['correlation_time'] = self._time(
                 r * s[:-1] + both - a * before, num - den, begin + begin_var - 1)
         return found
@@ -134,8 +134,8 @@ class SlowError(Part):
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what unit errors of what drives it, and of its first value, do."""
-        told, n = self.all_told(near), self.n
+        cross, n = self.all_with_wanted(near), self.n
         end = slice(n + SLOW.start, n + SLOW.stop)
-        push = told[:, :, end] - self.decay[:, :, None] * told[:, :, SLOW]
+        push = cross[:, :, end] - self.decay[:, :, None] * cross[:, :, SLOW]
         yield 'slow_fix_errors', push / np.sqrt(self.drive)[:, None]
-        yield 'slow_fix_errors', told[0, :, SLOW] / np.sqrt(self.power)
+        yield 'slow_fix_errors', cross[0, :, SLOW] / np.sqrt(self.power)

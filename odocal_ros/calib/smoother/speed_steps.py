@@ -8,7 +8,7 @@
 # the License.
 
 """
-The steps of a coarse speed as rows: how fast the vehicle is where the value sent changes.
+The steps of a coarse speed as rows, docs/method.md (S14): the speed where the value sent changes.
 
 The way that such a speed adds up to is not used along the vehicle (noise.py): its error is that of
 a cell, for as long as the value stands.

@@ -40,7 +40,7 @@ SPEED_WINDOW = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A first state, and how far it is to be believed."""
+    """A first state, and how well it is known."""
 
     state: State
     yaw_sigma: float        # rad, of the heading by acceleration

@@ -8,7 +8,7 @@
 # the License.
 
 """
-The unknowns of the smoother: a state at each keyframe, and constants of the leg.
+The state vector of the smoother, docs/method.md (S1), and the leg's constants, (S2).
 
 A block of the chain is [position, velocity, attitude error, gyro bias, accelerometer bias, travel
 error, (slow fix error)]; the attitude error phi turns the estimate: C_nb = exp(phi) C_hat. The
@@ -177,7 +177,7 @@ def C_bv_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """What is believed beforehand, 1 sigma: (3,), (3,), (M,), inf where nothing is."""
+    """Prior sigmas of the first biases and the constants: (3,), (3,), (M,), inf where none is."""
 
     gyro_bias: Floats
     accel_bias: Floats

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The odometer's rounding as a part, (S6): how far a reading at a keyframe may be off."""
+"""The odometer's reading error as a part, docs/method.md (S10): rounding at each keyframe."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -68,15 +68,15 @@ class TravelError(Part):
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what a unit error of each reading does."""
-        told = self.all_told(near)
+        cross = self.all_with_wanted(near)
         root = np.sqrt(self.weight / self.variance)
-        travel = np.concatenate([told[:, :, E], told[-1:, :, self.n + E]]) * root[:, None]
+        travel = np.concatenate([cross[:, :, E], cross[-1:, :, self.n + E]]) * root[:, None]
         yield 'quantisation', travel[:, :, None]
 
 
 def once_a_rest(still: Bools) -> Floats:
     """
-    Return the weight of what is believed of the rounding at each keyframe, (N,).
+    Return the weight of the rounding's prior at each keyframe, (N,).
 
     A counter that stands errs by the same all the time: its keyframes together count as one.
     """

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A velocity from outside: that of the GNSS antenna, at the times it was sent for."""
+"""A velocity from outside, docs/method.md (S18): the GNSS antenna's, when it was true."""
 
 from typing import TYPE_CHECKING
 

@@ -79,7 +79,7 @@ def least_squares(V: Floats, r: Floats, X: Floats, drift: Drift, use: Bools, wei
     use : (3N,) bool array
         Observations to use.
     weight, value : (p,) arrays
-        Inverse variance and value of what is believed of each step.
+        Inverse prior variance of each step, and the prior's value.
 
     """
     root = inverse_root(V[np.ix_(use, use)])

@@ -16,7 +16,7 @@ The two equations of the wheels, linearised about a state, on bins of time.
 d is the forward axis in b, D the latency of the fixes, w the track width, psi the turn of the
 vehicle by gyro. What the gyro errs by, phi(t) (true attitude = exp(phi) computed), is common to
 both: a random process with its values at nodes, linear in between, and -g / (1 + g) times the turn
-so far of a gyro that reads (1 + g) times the rate. D and g are believed to a sigma and estimated
+so far of a gyro that reads (1 + g) times the rate. D and g have priors and are estimated
 with all else: their squares matter (50 ms in a bend: 5 ppm of 2 km; 1 % of a full turn: 2000 ppm).
 So is the lag of a receiver that smooths, beyond a delay: a town of RTK fixes lagging by 1 s was
 500 ppm off at 5 ppm stated without it.
@@ -41,7 +41,7 @@ PARAMETERS = ('scale', 'log_ratio', 'heading', 'east', 'north', 'width', 'turn_o
               'gyro_scale', 'fix_lag_square')
 SCALE, RATIO, HEADING, EAST, NORTH, WIDTH, OFFSET, LATENCY, GYRO, FIX_LAG2 = range(
     len(PARAMETERS))
-NUISANCES = [LATENCY, GYRO, FIX_LAG2]    # estimated, believed beforehand, and no result
+NUISANCES = [LATENCY, GYRO, FIX_LAG2]    # with priors, estimated, and no result
 # s each side that a velocity is taken over: judgement, a few rows of an odometer, little of a turn
 VELOCITY_WINDOW = 0.25
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What is believed of the wheels' parameters before the drive speaks."""
+"""Priors of the wheels' parameters."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 @dataclass(frozen=True, eq=False)
 class WheelPriors:
     """
-    Sigmas known beforehand.
+    Prior sigmas.
 
     width : m, as configured, 0 unknown.   turn_rate : wheels' turns are used.
     latency : s.   gyro_scale : relative.
@@ -41,12 +41,14 @@ class WheelPriors:
     latency: float
     gyro_scale: float
 
-    def steps(self, leg: WheelLeg, state: State, told: bool, rounds: int) -> tuple[Floats, Floats]:
+    def steps(self, leg: WheelLeg, state: State, width_told: bool,
+              rounds: int) -> tuple[Floats, Floats]:
         """Return inverse variances and values, (p,) each, as steps from a state."""
         weight, value = np.zeros((2, len(PARAMETERS)))
         given = self.width or TRACK_WIDTH.of_a_car
         taped = TRACK_WIDTH.taped_share * given
-        loose = TRACK_WIDTH.any_sigma if told else TRACK_WIDTH.car_sigma if rounds > 2 else taped
+        loose = TRACK_WIDTH.any_sigma if width_told else (
+            TRACK_WIDTH.car_sigma if rounds > 2 else taped)
         weight[WIDTH] = 1 / (taped if self.width else loose)**2
         value[WIDTH] = given - state.width
         # without turns the fixes leave it open, and the mean of both hangs on its square: wheels

@@ -146,7 +146,7 @@ def _sources(leg: WheelLeg, solution: Solution) -> tuple[Source, ...]:
         if effects.shape[1] > len(rows):
             effects = _root(effects @ effects.T)
         sources.append(Source(part.name, effects, part.shared))
-    # what was believed beforehand is a source too: of the width given, of a surveyed start
+    # a prior is a source too: of the width given, of a surveyed start
     priors = np.linalg.inv(solution.fit.normal) * np.sqrt(solution.priors)
     keep = solution.priors > 0
     for name, column in (('fix_latency', LATENCY), ('gyro_scale', GYRO),

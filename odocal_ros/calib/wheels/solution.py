@@ -28,7 +28,7 @@ class Solution:
     The estimate: state, and how the observations make it.
 
     residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, p).
-    priors : (p,) inverse variance known beforehand.   parts : of the covariance.
+    priors : (p,) inverse prior variances.   parts : of the covariance.
     kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
     against that of the alignment.   width_told : the drive turns enough for the track width.
     """
@@ -51,6 +51,6 @@ class Solution:
     settled: bool
 
     def covariance(self) -> Floats:
-        """Return the covariance of the observations, what is believed of nuisances and all."""
+        """Return the covariance of the observations, with that of the nuisances' priors."""
         X = self.X[:, NUISANCES]
         return sum(p.whole() for p in self.parts) + X / self.priors[NUISANCES] @ X.T

@@ -1,0 +1,48 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The numbers of docs/method.md that the code cites are those of its equations."""
+
+from pathlib import Path
+import re
+
+from pages import ROOT
+
+import odocal_ros
+
+TAGS = [int(n) for n in re.findall(
+    r'\\tag\{S(\d+)\}', (ROOT / 'docs/method.md').read_text(encoding='utf-8'))]
+
+
+def _cited(text):
+    """Return the numbers that a text cites, (S5) to (S8) all four."""
+    ends = re.findall(r'\(S(\d+)\)(?: to \(S(\d+)\))?', text)
+    return {n for first, last in ends for n in range(int(first), int(last or first) + 1)}
+
+
+def _pages():
+    yield from Path(odocal_ros.__file__).parent.rglob('*.py')
+    yield from (ROOT / 'docs').rglob('*.md')
+
+
+def test_equations_are_numbered_in_order():
+    assert list(range(1, len(TAGS) + 1)) == TAGS
+    assert len(TAGS) > 30
+
+
+def test_each_equation_that_is_cited_exists():
+    for page in _pages():
+        lacks = _cited(page.read_text(encoding='utf-8')) - set(TAGS)
+        assert not lacks, f'{page} cites {lacks}'
+
+
+def test_the_code_cites_each_equation():
+    code = {n for page in _pages() if page.suffix == '.py'
+            for n in _cited(page.read_text(encoding='utf-8'))}
+    assert set(TAGS) - code == set()
