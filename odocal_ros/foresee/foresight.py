@@ -27,6 +27,7 @@ from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.ability import stated_variance, with_heading
 from odocal_ros.foresee.forecast import Abandoned, FARTHEST, Forecast, Prospect
+from odocal_ros.foresee.leg_so_far import screened_in_cells
 from odocal_ros.foresee.smoother_forecast import (
     gives_all,
     look,
@@ -41,7 +42,7 @@ from odocal_ros.planning.leg_profile import fix_figures, profile_of
 from odocal_ros.planning.predict import metres_to_go, predict, Prediction, Sigmas
 from odocal_ros.screening.force import felt
 from odocal_ros.screening.placed import place
-from odocal_ros.screening.screen import screen
+from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
 SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
@@ -117,9 +118,10 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 
 def _by_ends(leg, fix_rate, config, wanted) -> Forecast:
     """Return what two_point would make of the leg, its end points being what they are."""
-    driven = profile_of(leg, config)
-    sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(leg, config),
-                    **fix_figures(leg, config) | {'fix_rate': fix_rate})
+    inputs = screened_in_cells(leg, config).inputs
+    driven = profile_of(inputs, config)
+    sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(inputs, config),
+                    **fix_figures(inputs) | {'fix_rate': fix_rate})
     drive = _at_rest(_thinned(driven), wanted)
     now = predict(drive, sigmas)
 
@@ -165,9 +167,8 @@ def _heading_found(leg: Leg, config: Config) -> Config:
         'imu_orientation': stated_variance(take(leg.imu, before(leg.imu.stamp_ns)))})
 
 
-def _quantum(leg: Leg, config: Config) -> float:
+def _quantum(inputs: Inputs, config: Config) -> float:
     """Return the size of a count, m; raise BadData while metres are not known at all."""
-    inputs, _ = screen(leg, config)
     scale = place(inputs, config).rough
     if not scale:   # what the profile takes instead, 1, would promise far too much
         raise BadData('how far a count reaches is not known yet: drive on, or set '

@@ -14,10 +14,12 @@ Its rows in cells tell most of it, every few seconds in the worker (``pipeline.f
 the Imu is seen in the stamps themselves, at once, and is never forgotten.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from odocal_ros.data.leg import Leg
-from odocal_ros.pipeline.calibrate import faults
+from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.screen import imu_gap
 from odocal_ros.settings.config import Config, with_settings
@@ -57,9 +59,20 @@ class ImuGaps:
         return imu_gap(np.union1d(sound, t), 0.0, float(end), self._limit_s)
 
 
+@lru_cache(maxsize=1)      # faults and running estimate of one look ask of the same leg
+def screened_in_cells(leg: Leg, config: Config) -> Screened:
+    """Return what a leg is made of whose Imu rows are means over cells of time."""
+    return screened(leg, _with_cells(leg, config))
+
+
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
     """Return the faults of a leg whose Imu rows are means over cells of time."""
+    return faults(leg, screened_in_cells(leg, config), _with_cells(leg, config))
+
+
+def _with_cells(leg: Leg, config: Config) -> Config:
+    """Return config with cells to be no gaps of the Imu."""
     cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
         else 0.0
     limit_s = min(config.leg.max_gap + 2 * cell_s, MOST_GAP)
-    return faults(leg, with_settings(config, {'leg.max_gap': limit_s}))
+    return with_settings(config, {'leg.max_gap': limit_s})

@@ -200,6 +200,7 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
     from odocal_ros.library.topics import choose_topics
     from odocal_ros.messages.decode import make_reader
     from odocal_ros.planning.leg_profile import count_size, fix_figures, profile_of
+    from odocal_ros.screening.screen import screen
     with open_bag(path) as bag:
         chosen = choose_topics(bag.topics, config, topics)
         readers = {topic: make_reader(slot, bag.topics[topic].msgtype, config)
@@ -211,4 +212,6 @@ def from_bag(path: Path, config: Config, topics: dict[str, str],
             recorder.form_right = readers[chosen['odometer_right']].form
         start_ns, stop_ns = find_legs(recorder, bag, [], marked_legs(bag), config)[0]
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)
-    return profile_of(leg, config), fix_figures(leg, config) | {'quantum': count_size(leg, config)}
+    inputs, _ = screen(leg, config)
+    return profile_of(inputs, config), fix_figures(inputs) | {
+        'quantum': count_size(inputs, config)}

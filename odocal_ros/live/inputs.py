@@ -74,11 +74,6 @@ class Inputs:
         right = self.by_slot.get('odometer_right')
         return right.reader.form if right and right.reader else None
 
-    def set_sim_time(self, active: bool) -> None:
-        """Stamp arrivals with the node clock (sim time) or the sender's (else)."""
-        for one in self.by_slot.values():
-            one.gate.is_open = active
-
 
 def _wanted(config: Config) -> dict[str, tuple[str, ...]]:
     """Return slot -> message types allowed (empty: any) for the topics a configuration needs."""

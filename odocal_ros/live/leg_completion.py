@@ -73,6 +73,11 @@ class LegCompletion:
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
+    @property
+    def awaited(self) -> bool:
+        """Return whether there is work that somebody waits for."""
+        return self.session.state is State.COMPUTING or self._filing.busy
+
     def tick(self) -> None:
         """Take over what the worker has done and what time has brought."""
         self._worker.poll()

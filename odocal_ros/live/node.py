@@ -31,7 +31,9 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
 from odocal_ros.output.stored import known_imu
 
-TICK_S = 0.05
+# s between turns, and while somebody waits for an answer. A queue holds 25 of the long ones; of
+# 0.1 s each the node takes half as much again (benchmarks/live_load.py)
+TICK_S, AWAITED_TICK_S = 0.2, 0.05
 LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
 HELP = """\
 usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]
@@ -86,7 +88,7 @@ class Calibrator(SettledNode):
             self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
                                 callback_group=group)
         # on the steady clock: a paused or missing /clock must not silence the status
-        self.create_timer(TICK_S, self._tick, clock=self._steady)
+        self._timer = self.create_timer(TICK_S, self._tick, clock=self._steady)
 
     def destroy_node(self) -> None:
         """End worker, journal and clock callbacks with the node."""
@@ -126,7 +128,7 @@ class Calibrator(SettledNode):
     def _take_parameters(self, parameters) -> None:
         self.config = params.changed(self.config, parameters)
 
-    # what happens twenty times a second
+    # what happens five times a second
 
     def _tick(self) -> None:
         with self._lock:
@@ -140,6 +142,16 @@ class Calibrator(SettledNode):
                 self.publishing.show_diagnostics(self.recording, self.config)
             if self._due('status', 1 / self.config.publish.rate):
                 self.operation.show_status()
+            self._pace()
+
+    def _pace(self) -> None:
+        """Take turns as often as is wanted now."""
+        awaited = self.operation.awaited
+        period_s = AWAITED_TICK_S if awaited else min(TICK_S, 1 / self.config.publish.rate)
+        period_ns = round(period_s * 1e9)
+        if period_ns != self._timer.timer_period_ns:
+            self._timer.timer_period_ns = period_ns
+            self._timer.reset()
 
     def _due(self, task: str, period_s: float) -> bool:
         now_ns, period_ns = self._steady.now().nanoseconds, round(period_s * 1e9)
@@ -155,6 +167,7 @@ class Calibrator(SettledNode):
         try:
             with self._lock:
                 answer = act()
+                self._pace()
             response.success, response.message = (
                 await answer if isinstance(answer, Future) else answer)
         except OdocalError as refused:

@@ -118,10 +118,8 @@ class OdometryNode(SettledNode):
 
     def _look_around(self, now_ns: int) -> None:
         """Look for publishers, and say what is missing, seldom."""
-        sim = self.get_clock().ros_time_is_active  # type: ignore[attr-defined]
         for one in self._inputs.values():
             one.look()
-            one.gate.is_open = sim
             if not one.flowing():
                 one.find(self.config)
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]

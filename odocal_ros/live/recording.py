@@ -74,8 +74,6 @@ class Recording:
     def look_around(self, config: Config) -> None:
         """Look for publishers of topics that are silent."""
         self.inputs.update(config)
-        self.inputs.set_sim_time(
-            self._clock.ros_time_is_active)  # type: ignore[attr-defined]
 
     def forget(self, preroll_s: float, start_ns: int) -> None:
         """Bound the memory of what came before the pre-roll, of a leg that began then."""

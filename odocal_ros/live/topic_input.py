@@ -9,26 +9,23 @@
 
 """One topic of the node: raw messages as they wait, decoded in blocks by the readers of bags."""
 
-from collections import deque
 from collections.abc import Callable
 import difflib
 from functools import partial
 
 import numpy as np
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
-from rclpy.subscription import Subscription
 
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.health import Health
+from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
 from odocal_ros.outside.names import said_by
@@ -36,30 +33,14 @@ from odocal_ros.settings.config import Config
 
 TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
           'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
-# five seconds of the highest rate believed: a queue that runs over is what loses messages
-DEPTH = {'imu': 5000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
+# messages in five seconds of the highest rate believed, 4 kHz, 1 kHz and 100 Hz: a queue that runs
+# over is what loses them
+DEPTH = {'imu': 20_000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
          'fix': 500, 'fix_velocity': 500}
 LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
           'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
 MOST_MEANT, ALIKE = 2, 0.4
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
-
-
-class Gate(MutuallyExclusiveCallbackGroup):
-    """
-    A callback group that the executor leaves alone while it is shut.
-
-    Waking the executor for every message is nine tenths of what a node costs at 1 kHz: messages
-    wait in the middleware's queue instead, and ``Input.take`` fetches them twenty times a second.
-    """
-
-    def __init__(self, is_open: bool) -> None:
-        super().__init__()
-        self.is_open = is_open
-
-    def can_execute(self, entity) -> bool:
-        """Return whether the executor may wait for the entity."""
-        return self.is_open and super().can_execute(entity)
 
 
 class Input:
@@ -83,12 +64,9 @@ class Input:
         self.meant: list[str] = []     # topics that others publish, where nobody does this one
         self._failed = 0
         self._node = node
-        self._pending: deque = deque()
         self._deserialize: Callable | None = None
-        self._subscription: Subscription | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        # in sim time a message is stamped with the node clock as it arrives
-        self.gate = Gate(node.get_clock().ros_time_is_active)  # type: ignore[attr-defined]
+        self.waiting = WaitingMessages(node)
 
     def check(self, config: Config) -> None:
         """Raise OdocalError where the type the operator wrote cannot be read, at start-up."""
@@ -97,7 +75,8 @@ class Input:
             make_reader(self.slot, self.allowed[0], config)
 
     def look(self) -> None:
-        """Look at who publishes the topic, and where nobody does, at what may be meant."""
+        """Look at the clock, at who publishes the topic, else at what may be meant."""
+        self.waiting.follow_clock()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
         self.meant = [] if self.publishers else self._alike()
 
@@ -153,12 +132,7 @@ class Input:
             history=HistoryPolicy.KEEP_LAST, depth=DEPTH[self.slot],
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
         self._deserialize = partial(deserialize_message, message_type=kind)
-        self._subscription = self._node.create_subscription(
-            kind, self.name, self._receive,  # type: ignore[arg-type]
-            qos, raw=True, callback_group=self.gate,
-            # each event handler costs time in every turn of the executor; find() sees as much
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self.waiting.subscribe(kind, self.name, qos)
         self.reader, self.msgtype, self.trouble = reader, msgtype, ''
         self._node.get_logger().info(
             f'{self.slot}: {msgtype} on {self.topic}, '
@@ -169,31 +143,9 @@ class Input:
         # a lost increment is travel lost for good, so such a sender is asked to repeat itself
         return reader.form is not None and reader.form.quantity == 'increment'
 
-    def _receive(self, raw: bytes, info: dict) -> None:
-        """Remember one message."""
-        if self.gate.is_open:
-            info['source_timestamp'] = self._node.get_clock().now().nanoseconds
-        self._pending.append((raw, info))
-
-    def _fetch(self, subscription: Subscription) -> None:
-        """
-        Take what waits in the middleware's queue, as the executor would.
-
-        The executor takes one at a time of each topic, so that where it lags the Imu lags most.
-        """
-        handle, kind = subscription.handle, subscription.msg_type
-        with handle:
-            for _ in range(DEPTH[self.slot]):
-                message_and_info = handle.take_message(kind, True)
-                if message_and_info is None:
-                    return
-                self._receive(*message_and_info)
-
     def take(self) -> tuple[list[bytes], list[int]]:
         """Return the messages that came since the last call, and when they were sent, ns."""
-        if self._subscription is not None:
-            self._fetch(self._subscription)
-        pending, self._pending = self._pending, deque()
+        pending = self.waiting.take()
         if pending:
             self.health.arrived([i['publication_sequence_number'] for _, i in pending],
                                 self._steady_ns())

@@ -15,6 +15,7 @@ No state, no clock, no files: the live node and the replay call these and nothin
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,9 +35,17 @@ from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
 from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
 
-__all__ = ['calibrate', 'combine', 'faults']
+__all__ = ['calibrate', 'combine', 'faults', 'Screened', 'screened']
 # of a leg that is not over
 NOT_YET = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW, Code.NO_ODOMETER, Code.NO_FIX}
+
+
+class Screened(NamedTuple):
+    """Inputs, what is said of them, and whether a leg can be made of them."""
+
+    inputs: Inputs
+    reasons: tuple[Reason, ...]
+    usable: bool
 
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
@@ -67,50 +76,51 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
 
     """
     progress = progress or (lambda share, stage: None)
-    inputs, reasons, usable = _screened(leg, config, notes)
+    seen = screened(leg, config, notes)
+    inputs = seen.inputs
 
     def result_of(inputs: Inputs, reasons: Sequence[Reason]) -> LegResult:
         prepared, found = prepare(leg, inputs, config, reasons, alignment, holdout)
         return leg_result(leg, inputs, found) if prepared is None else run_leg(prepared, progress)
 
-    if not usable:
-        return leg_result(leg, inputs, reasons)
-    result = result_of(inputs, reasons)
+    if not seen.usable:
+        return leg_result(leg, inputs, seen.reasons)
+    result = result_of(inputs, seen.reasons)
     back, scale = _reversed(result, inputs)
     if not len(back):
         return result
     return result_of(inputs.mirrored(back), (
-        *reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
+        *seen.reasons, *said_of(back, inputs.travel, scale, BY_FIT, config.odometer.signed)))
 
 
-def faults(leg: Leg, config: Config) -> tuple[Reason, ...]:
+def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
     Return what lowers the verdict of a leg, as ``calibrate`` has it, but for what methods say.
 
-    A leg that is not over may be given: what more of a drive cures is left out.
+    A leg that is not over may be given, as ``screened`` has it: what more of a drive cures is left
+    out.
     """
-    inputs, reasons, usable = _screened(leg, config)
-    if usable:
-        _, reasons = prepare(leg, inputs, config, reasons)
+    reasons = seen.reasons
+    if seen.usable:
+        _, reasons = prepare(leg, seen.inputs, config, reasons)
     return tuple(r for r in reasons
                  if r.code.gravity is not Verdict.ACCEPTED and r.code not in NOT_YET)
 
 
-def _screened(leg: Leg, config: Config,
-              notes: Sequence[Reason] = ()) -> tuple[Inputs, tuple[Reason, ...], bool]:
-    """Return inputs, what is said of them, and whether a leg can be made of them."""
+def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
+    """Return what a leg is made of, facing up."""
     inputs, found = screen(leg, config)
     reasons = (*notes, *found)
     missing = _missing(leg, inputs)
     if missing or not len(inputs.t_fix):
         seen = {r.code for r in reasons}
-        return inputs, (*reasons, *(r for r in missing if r.code not in seen)), False
+        return Screened(inputs, (*reasons, *(r for r in missing if r.code not in seen)), False)
     sanity, z_down = imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)
     reasons += tuple(with_axes(sanity, inputs))
     let_go()
     if z_down:
-        inputs = turned_over(inputs)
-    return inputs, reasons, not UNUSABLE & {r.code for r in sanity}
+        inputs = _turned_over(inputs)
+    return Screened(inputs, reasons, not UNUSABLE & {r.code for r in sanity})
 
 
 def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
@@ -137,7 +147,7 @@ def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
     return missing
 
 
-def turned_over(inputs: Inputs) -> Inputs:
+def _turned_over(inputs: Inputs) -> Inputs:
     """Return inputs with a forward-right-down Imu read as what it is."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)

@@ -12,18 +12,17 @@
 import numpy as np
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 from odocal_ros.screening.placed import place, Placed
-from odocal_ros.screening.screen import Inputs, screen
+from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
 PROFILE_WINDOW = 0.5    # s each side that a speed is taken over
 
 
-def profile_of(leg: Leg, config: Config) -> PlannedDrive:
+def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     """
     Return a leg as a drive: speed by the odometer, direction by the gyro, first course by fixes.
 
@@ -35,7 +34,6 @@ def profile_of(leg: Leg, config: Config) -> PlannedDrive:
         The vehicle did not move.
 
     """
-    inputs, _ = screen(leg, config)
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         raise BadData('a profile needs Imu, odometer and fixes between the marks; see odocal '
                       'inspect for what is there')
@@ -65,7 +63,7 @@ def _placed(inputs: Inputs, config: Config) -> Placed:
     return placed
 
 
-def count_size(leg: Leg, config: Config) -> float:
+def count_size(inputs: Inputs, config: Config) -> float:
     """
     Return the metres of one count of the odometer, 0 for speeds.
 
@@ -75,7 +73,6 @@ def count_size(leg: Leg, config: Config) -> float:
         The scale is not known.
 
     """
-    inputs, _ = screen(leg, config)
     return inputs.travel.quantum * _placed(inputs, config).rough
 
 
@@ -102,9 +99,8 @@ def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n:
     return float(np.angle(np.sum((fixed - fixed.mean()) * np.conj(at - at.mean()))))
 
 
-def fix_figures(leg: Leg, config: Config) -> dict[str, float]:
+def fix_figures(inputs: Inputs) -> dict[str, float]:
     """Return sigma of one fix, east or north and up, m, and fixes a second, as in ``Sigmas``."""
-    inputs, _ = screen(leg, config)
     inside = (inputs.t_fix >= 0) & (inputs.t_fix <= inputs.t_stop)
     if inside.sum() < 2:
         raise BadData('fewer than two usable fixes between the marks')

@@ -18,7 +18,7 @@ import pytest
 from odocal_ros.data.samples import take
 from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
-from odocal_ros.pipeline.calibrate import calibrate, faults
+from odocal_ros.pipeline.calibrate import calibrate, faults, screened
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.screening.screen import screen
 
@@ -75,7 +75,7 @@ def test_the_faults_so_far_are_those_of_the_result(made, wrong):
     # a slip is what a method makes of the hole
     lowering = {r.code for r in result.reasons
                 if r.code.gravity is not Verdict.ACCEPTED} - {Code.WHEEL_SLIP}
-    assert {r.code for r in faults(leg, config)} == lowering
+    assert {r.code for r in faults(leg, screened(leg, config), config)} == lowering
     assert {r.code for r in faults_in_cells(sketched(leg), config)} == lowering
     assert (lowering == set()) == (wrong is sound)
 

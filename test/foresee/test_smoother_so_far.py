@@ -18,15 +18,16 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.smoother import growing
+from odocal_ros.calib.smoother.growing import LOOK_PASSES
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.warm_start import carried, rows_of
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
-from odocal_ros.foresee import smoother_so_far
 from odocal_ros.foresee.forecast import Abandoned, as_keys, Forecast, Prospect
 from odocal_ros.foresee.foresight import forecast_of
 from odocal_ros.foresee.smoother_forecast import look, with_running
-from odocal_ros.foresee.smoother_so_far import LOOK_PASSES, SmootherSoFar
+from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.session import Session
@@ -125,7 +126,7 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, look
         return np.exp(np.full(3, 1e3))
     with monkeypatch.context() as broken, warnings.catch_warnings():
         warnings.simplefilter('error')       # a node has no place for warnings
-        broken.setattr(smoother_so_far, 'best_fit', wild)
+        broken.setattr(growing, 'best_fit', wild)
         with pytest.raises(BadData, match='cannot solve the way so far: overflow'):
             so_far.look(looks[-1].leg, config)
     assert so_far.look(looks[-1].leg, config).method.estimates['scale_factor'].value is not None
@@ -140,20 +141,20 @@ def test_keyframes_stay_where_they_are(config, looks):
     assert np.diff(times[1])[1:-1] == pytest.approx(1.0, abs=0.11)     # cells are 0.1 s wide
     assert 0.45 < np.diff(times[1])[-1] < 1.6
     so_far.look(looks[-2].leg, config)
-    going_on = carried(so_far._last, Problem.of(views[1], config, second))
+    going_on = carried(so_far._growing._last, Problem.of(views[1], config, second))
     assert len(going_on.state.t) == len(going_on.spread) + 1 == len(times[1])
     other = Problem.of(views[1], config, rows_of(views[1], 0.7))
-    assert carried(so_far._last, other) is None
+    assert carried(so_far._growing._last, other) is None
 
 
 def test_the_state_is_reckoned_on_to_where_the_vehicle_is(drive, config, looks):
     so_far = SmootherSoFar()
     so_far.look(looks[-3].leg, config)      # 7 s are to be reckoned on, at speed
     view = so_far._view(looks[-2].leg, config)
-    state = carried(so_far._last, Problem.of(view, config, rows_of(view, 1.0))).state
+    state = carried(so_far._growing._last, Problem.of(view, config, rows_of(view, 1.0))).state
     later = SmootherSoFar()
     later.look(looks[-2].leg, config)
-    last = later._last.state
+    last = later._growing._last.state
     assert np.linalg.norm(last.v_n[-1]) > 5.0
     # a way of 70 m to a part in a thousand; the place itself was good to 1.5 m / sqrt(fixes)
     assert state.p_n[-1, :2] == pytest.approx(last.p_n[-1, :2], abs=0.5)

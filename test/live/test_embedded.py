@@ -69,10 +69,11 @@ def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
     node, client = embedded
     client.until(state='waiting')
     imu = Input(node, 'imu', ('sensor_msgs/msg/Imu',))
-    assert not imu.gate.can_execute(imu)   # the executor is not woken for each message
+    waiting = imu.waiting
+    assert not waiting.gate.can_execute(imu)   # the executor is not woken for each message
     info = {'received_timestamp': 9, 'publication_sequence_number': 1}
-    imu._receive(b'first', info | {'source_timestamp': 5})
-    imu._receive(b'second', info | {'source_timestamp': 0})   # a middleware that does not tell
+    waiting._receive(b'first', info | {'source_timestamp': 5})
+    waiting._receive(b'second', info | {'source_timestamp': 0})  # a middleware that does not tell
     assert imu.take() == ([b'first', b'second'], [5, 9])
     assert imu.take() == ([], [])
 

@@ -24,6 +24,7 @@ from odocal_ros.planning.drive import from_rates, PlannedDrive
 from odocal_ros.planning.leg_profile import fix_figures, profile_of
 from odocal_ros.planning.predict import metres_to_go, predict, Sigmas
 from odocal_ros.reasons import Code
+from odocal_ros.screening.screen import screen
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import motion_of, resolved, SimOptions, simulate
@@ -215,8 +216,9 @@ def test_a_recorded_leg_predicts_itself():
         'alignment.heading': drive.truth.heading, 'alignment.heading_sigma': HEADING})
     leg = drive.leg()
     result = calibrate(leg, settled).methods['two_point'].estimates
-    predicted = predict(profile_of(leg, settled), Sigmas(
-        config=settled, quantum=0.0213, **fix_figures(leg, settled)))
+    inputs, _ = screen(leg, settled)
+    predicted = predict(profile_of(inputs, settled), Sigmas(
+        config=settled, quantum=0.0213, **fix_figures(inputs)))
     # the rough scale is good to a per cent: noise of the fixes lengthens chords of 20 m
     assert predicted.distance == pytest.approx(drive.truth.distance, rel=0.01)
     # as above, and speeds smoothed over a second
@@ -307,7 +309,8 @@ def test_a_recorded_leg_turns_as_it_was_driven_whatever_the_gyro_reads_at_rest()
     drive = simulate(SimOptions(scenario='town', imu_grade='consumer', imu_rate=50.0, seed=4))
     assert abs(drive.truth.gyro_bias[2]) * 500.0 > 0.1         # rad: there is a bias to take out
     leg = drive.leg()
-    profile = profile_of(leg, with_settings(Config(), {'imu.grade': 'consumer'}))
+    config = with_settings(Config(), {'imu.grade': 'consumer'})
+    profile = profile_of(screen(leg, config)[0], config)
     t = (leg.start_ns - drive.options.start_ns) * 1e-9 + profile.t
     true = drive.motion.at(t).yaw
     turned, truly = profile.yaw - profile.yaw[0], true - true[0]

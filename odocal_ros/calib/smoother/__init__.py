@@ -7,9 +7,16 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The GNSS / Imu / odometer smoother: a batch maximum likelihood over all samples of a leg."""
+"""
+The GNSS / Imu / odometer smoother: a batch maximum likelihood over all samples of a leg.
 
+``smooth`` takes a leg that is over, ``GrowingFit`` one that grows; ``smoother_leg`` makes either
+of screened samples, where ``too_little`` says no. ``bound`` is the covariance without a fit.
+"""
+
+from odocal_ros.calib.smoother.growing import GrowingFit, SoFar
 from odocal_ros.calib.smoother.leg import smoother_leg, SmootherLeg
-from odocal_ros.calib.smoother.smoother import bound, keyframe_times, smooth
+from odocal_ros.calib.smoother.smoother import bound, keyframe_times, smooth, too_little
 
-__all__ = ['SmootherLeg', 'bound', 'keyframe_times', 'smooth', 'smoother_leg']
+__all__ = ['GrowingFit', 'SmootherLeg', 'SoFar', 'bound', 'keyframe_times', 'smooth',
+           'smoother_leg', 'too_little']

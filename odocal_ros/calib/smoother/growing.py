@@ -1,0 +1,192 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The fit of a leg that grows: each starts from the one before.
+
+It takes over state, noise levels, priors and slips, is reckoned on over what is new, and is there
+after two passes. The accelerometer's scale error is judged on the way. What is decided once for a
+leg, the sort of fix errors and where the Imu faces, is decided anew from nothing whenever the leg
+has grown by half.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import time
+
+import numpy as np
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.failed import told_if_wild
+from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.chain import NotPositive
+from odocal_ros.calib.smoother.estimate import Fit, fit, WarmStart
+from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
+from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.outcome import floored, outcome
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.remarks import model_floor
+from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit
+from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, State, YAW
+from odocal_ros.calib.smoother.warm_start import carried, rows_of
+from odocal_ros.data.arrays import Floats
+from odocal_ros.errors import BadData
+from odocal_ros.settings.config import Config
+
+Trace = Callable[..., None]
+
+# s between keyframes of a leg up to LONG_LEG and beyond: tuned, docs/decisions/0005: 2 s for 1 s
+# cost a tenth in sigma and save a fifth of the time
+FINE_SPACING, COARSE_SPACING = 1.0, 2.0
+LONG_LEG = 660.0        # s
+# keyframes of a fit from nothing, which takes ten times the passes (benchmarks/live_looks.py)
+FEW_KEYS = 150
+LOOK_PASSES, MORE_PASSES = 2, 6    # from the last fit, and where that was not enough
+ANEW_GROWTH = 1.5       # of the leg, until what is decided once is decided anew
+BEARS_OUT_SIGMAS = 3.0  # statistical: one leg in 120 is fit anew for nothing
+
+
+@dataclass(frozen=True, eq=False)
+class SoFar:
+    """
+    What a fit tells of a leg as if it ended here.
+
+    method : as the leg would come out.   sigmas : (3,) of ln scale, yaw, pitch, rad, of what is
+    not determined too.   state : at the keyframes.
+    """
+
+    method: MethodResult
+    sigmas: Floats
+    state: State
+
+
+class GrowingFit:
+    """
+    The fit of one leg while it grows.
+
+    ``once_s``: seconds of CPU in the last one for what is done ever less often as a leg grows.
+    """
+
+    def __init__(self) -> None:
+        self.once_s = 0.0
+        self._last: WarmStart | None = None
+        self._per_effective: dict[str, float] = {}
+        self._judged = 0.0       # s of the leg when it was last fit from nothing
+
+    def forget(self) -> None:
+        """Start the next one from nothing."""
+        self._last = None
+
+    def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> SoFar:
+        """
+        Return what the leg so far tells.
+
+        view : the leg, what came before in the same frame and more.   trace : called between
+        passes; what it raises goes through.   BadData is raised where no fit is found; the next
+        one starts from nothing then.
+        """
+        self.once_s = 0.0
+        last, self._last = self._last, None
+        try:
+            with told_if_wild():
+                best, problem = self._fit(last, view, config, trace)
+                if not best.settled:
+                    raise BadData('the smoother has not settled on the way so far')
+                so_far = _so_far(view, problem, best, config)
+        except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
+            raise BadData(f'the smoother cannot solve the way so far: {error}') from None
+        self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
+        self._per_effective = problem.per_effective
+        return so_far
+
+    def _fit(self, last: WarmStart | None, view: SmootherLeg, config: Config,
+             trace: Trace) -> tuple[Fit, Problem]:
+        duration = view.t_stop - view.t_begin
+        spacing = FINE_SPACING if duration < LONG_LEG else COARSE_SPACING
+        problem = Problem.of(view, config, rows_of(view, spacing))
+        problem.per_effective = self._per_effective
+        begun = None if last is None else carried(last, problem)
+        if begun is None:
+            begin = time.thread_time()
+            best = best_fit(problem, config, trace)
+            self._judged = duration
+            if last is not None:      # other cells, as a leg has them each time it doubles
+                self.once_s += time.thread_time() - begin
+            return best, problem
+        # the levels are let alone until the state is on the new stretch too
+        best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
+        best = judge_running(best, problem.grade).outline()     # more of a drive tells more of it
+        best = fit(problem, best.state, best.levels, LOOK_PASSES, about=best, trace=trace)
+        if not best.settled:
+            best = fit(problem, best.state, best.levels, MORE_PASSES, about=best, trace=trace)
+        if duration > ANEW_GROWTH * self._judged:
+            best = self._borne_out(best, problem, config, trace)
+        return best, problem
+
+    def _borne_out(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
+        """Return the fit as a coarse one from nothing bears it out, else one from nothing."""
+        begin = time.thread_time()
+        view = problem.leg
+        duration = view.t_stop - view.t_begin
+        other = Problem.of(view, config, rows_of(view, max(FINE_SPACING, duration / FEW_KEYS)))
+        anew = likeliest_fit(other, config, trace)
+        self._judged = duration
+        if anew.settled:
+            problem.per_effective = other.per_effective
+            best = _decided_anew(best, anew, problem, config, trace)
+        self.once_s += time.thread_time() - begin
+        return best
+
+
+def _decided_anew(best: Fit, anew: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
+    """Return a fit with the fix errors of another, and judged as one from nothing is."""
+    slow = anew.levels.correlation_time or best.levels.correlation_time
+    none = with_imperfect(best.first, problem.priors.constants[IMPERFECT])
+    unjudged = (none.constants == best.first.constants).all()
+    state, levels = best.state, best.levels
+    if slow:
+        fixes = {name: anew.levels[name] for name in ('fix', 'fix_up', 'slow', 'slow_up')}
+        levels = levels.but(correlation_time=anew.levels.correlation_time, **fixes)
+    if not levels.correlation_time:
+        state = replace(state, slow_n=np.zeros_like(state.slow_n))
+    if slow or not unjudged:
+        about = replace(best, first=none, priors=with_imperfect(
+            best.priors, problem.priors.constants[IMPERFECT]))
+        best = fit(problem, state, levels, MORE_PASSES, about=about, trace=trace)
+    sigma = np.sqrt(np.diag(anew.solved.covariance))
+    apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
+    if apart.max() > BEARS_OUT_SIGMAS:
+        return best_fit(problem, config, trace)
+    return judge_imperfect(problem, best, trace)
+
+
+def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> SoFar:
+    method = outcome(view, problem, best, config)
+    covariance = floored(best.solved.covariance * method.details['widened']**2,
+                         model_floor(best.state.constants, best.priors.constants))
+    sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
+    sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
+    found = dict(method.estimates)
+    for name, sigma in zip(PARAMETERS, sigmas, strict=True):
+        e = found[name]
+        if e.value is not None:
+            factor = abs(e.value) if name == PARAMETERS[0] else 1.0
+            found[name] = replace(e, sigma=float(sigma * factor))
+    return SoFar(replace(method, estimates=found), sigmas, best.state)
+
+
+def _of_cells(view: SmootherLeg, imu: ImuRows) -> float:
+    """
+    Return the relative error of the way that chords for arcs can make, cells being as wide.
+
+    A turn by theta within a step shortens the chord of its middle by theta^2 / 12.
+    """
+    way = np.abs(np.diff(view.travel.at(imu.t)))
+    return float(way @ (imu.turns()**2).sum(axis=1) / (12 * max(way.sum(), 1e-9)))
