@@ -11,6 +11,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+import time
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class SmootherSoFar:
     """The smoother on one leg while it grows."""
 
     def __init__(self) -> None:
-        self._growing = GrowingFit()
+        self._growing = GrowingFit(time.thread_time)
         self._origin: Origin | None = None
 
     @property

@@ -26,7 +26,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
-SHARE = 1 / 20             # of one core is what looking may cost in the long run
+SHARE = 1 / 60             # of one core is what looking may cost in the long run
 
 
 class RunningEstimate:

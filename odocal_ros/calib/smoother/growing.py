@@ -18,7 +18,6 @@ has grown by half.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-import time
 
 import numpy as np
 
@@ -71,10 +70,12 @@ class GrowingFit:
     """
     The fit of one leg while it grows.
 
-    ``once_s``: seconds of CPU in the last one for what is done ever less often as a leg grows.
+    cpu_s : tells the seconds of CPU used so far.   ``once_s``: those in the last one for what is
+    done ever less often as a leg grows.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cpu_s: Callable[[], float]) -> None:
+        self._cpu_s = cpu_s
         self.once_s = 0.0
         self._last: WarmStart | None = None
         self._per_effective: dict[str, float] = {}
@@ -82,7 +83,7 @@ class GrowingFit:
 
     def forget(self) -> None:
         """Start the next one from nothing."""
-        self._last = None
+        self._last, self.once_s = None, 0.0
 
     def fit(self, view: SmootherLeg, config: Config, trace: Trace) -> SoFar:
         """
@@ -114,11 +115,11 @@ class GrowingFit:
         problem.per_effective = self._per_effective
         begun = None if last is None else carried(last, problem)
         if begun is None:
-            begin = time.thread_time()
+            begin = self._cpu_s()
             best = best_fit(problem, config, trace)
             self._judged = duration
             if last is not None:      # other cells, as a leg has them each time it doubles
-                self.once_s += time.thread_time() - begin
+                self.once_s += self._cpu_s() - begin
             return best, problem
         # the levels are let alone until the state is on the new stretch too
         best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
@@ -132,7 +133,7 @@ class GrowingFit:
 
     def _borne_out(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
         """Return the fit as a coarse one from nothing bears it out, else one from nothing."""
-        begin = time.thread_time()
+        begin = self._cpu_s()
         view = problem.leg
         duration = view.t_stop - view.t_begin
         other = Problem.of(view, config, rows_of(view, max(FINE_SPACING, duration / FEW_KEYS)))
@@ -141,7 +142,7 @@ class GrowingFit:
         if anew.settled:
             problem.per_effective = other.per_effective
             best = _decided_anew(best, anew, problem, config, trace)
-        self.once_s += time.thread_time() - begin
+        self.once_s += self._cpu_s() - begin
         return best
 
 
