@@ -17,7 +17,10 @@ scale are considered, never corrected: the pose does not jump, the calibration s
 
 import numpy as np
 
+from odocal_ros.apply.vehicle import Vehicle
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import skew
+from odocal_ros.settings.grades import Grade
 
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
@@ -37,10 +40,12 @@ class Errors:
     """
     The errors' covariance, (16, 16), and what stops and gravity say of them.
 
-    grade : Grade of the Imu.   vehicle : Vehicle.
+    grade : of the Imu.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
+    Earth's turn is in the gyro's bias.
     """
 
-    def __init__(self, grade, vehicle, tilt, bias_sigma, earth_left=True) -> None:
+    def __init__(self, grade: Grade, vehicle: Vehicle, tilt: float, bias_sigma: float | Floats,
+                 earth_left: bool = True) -> None:
         self.grade, self._earth_left = grade, EARTH_LEFT * earth_left
         self.cov = np.zeros((N, N))
         sigma = np.concatenate([
@@ -52,7 +57,8 @@ class Errors:
         self.cov[5, 5] = vehicle.yaw_sigma**2
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
 
-    def grow(self, T, C_nb, way_n, turn_n, axes_n, doubt=0.0, hidden=0.0) -> None:
+    def grow(self, T: float, C_nb: Floats, way_n: Floats, turn_n: Floats, axes_n: Floats,
+             doubt: float = 0.0, hidden: float = 0.0) -> None:
         """
         Carry the errors over an interval.
 
@@ -66,7 +72,7 @@ class Errors:
         F[PHI, BG], F[PHI, G] = -C_nb * T, -turn_n
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
         cov = F @ self.cov @ F.T
-        road = self.road(np.linalg.norm(way_n)) + [doubt, 0.0, 0.0]
+        road = self.road(float(np.linalg.norm(way_n))) + [doubt, 0.0, 0.0]
         cov[P, P] += axes_n * road @ axes_n.T
         diagonal = np.zeros(N)
         diagonal[PHI] = self.grade.gyro_noise**2 * T + (HIDDEN_IN_GAP * hidden)**2
@@ -77,15 +83,16 @@ class Errors:
         self.cov = cov
 
     @staticmethod
-    def road(way):
+    def road(way: float) -> Floats:
         """Return what slip and slide vary a way by, along, left and up, m^2."""
-        return ROAD_PER_METRE**2 * abs(way)
+        variance: Floats = ROAD_PER_METRE**2 * abs(way)
+        return variance
 
-    def lost(self, way) -> None:
+    def lost(self, way: float) -> None:
         """Take in a way, m, of which nobody knows where it led."""
         self.cov[range(3), range(3)] += way**2
 
-    def by_gravity(self, C_nb, off_n, T, sigma):
+    def by_gravity(self, C_nb: Floats, off_n: Floats, T: float, sigma: float) -> Floats:
         """
         Return the correction, (16,), by the level part of force less acceleration, m/s^2.
 
@@ -97,22 +104,23 @@ class Errors:
         return self._correction(H, off_n[:2], np.eye(2) * (
             self.grade.accel_noise**2 / T + sigma**2), BY_GRAVITY)
 
-    def by_rest(self, rate_b, variance):
+    def by_rest(self, rate_b: Floats, variance: Floats) -> Floats:
         """Return the correction by a mean turn rate at rest, rad/s, bias taken out."""
         H = np.zeros((3, N))
         H[:, BG] = np.eye(3)
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
-    def _correction(self, H, z, R, told):
+    def _correction(self, H: Floats, z: Floats, R: Floats, told: list[int] | Ints) -> Floats:
         cov = self.cov
         S = H @ cov @ H.T + R
         gain = np.zeros((N, len(z)))
         gain[told] = np.linalg.solve(S, H @ cov)[:, told].T
         keep = np.eye(N) - gain @ H
         self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
-        return gain @ z
+        by: Floats = gain @ z
+        return by
 
-    def pose(self, C_nb, arm_n):
+    def pose(self, C_nb: Floats, arm_n: Floats) -> Floats:
         """
         Return the covariance of position, m, and rotation of the vehicle, rad, in n: (6, 6).
 
@@ -121,4 +129,5 @@ class Errors:
         J = np.zeros((6, N))
         J[:3, P], J[3:, PHI], J[3:, M] = np.eye(3), np.eye(3), C_nb[:, 1:]
         J[:3] -= skew(arm_n) @ J[3:]
-        return J @ self.cov @ J.T
+        cov: Floats = J @ self.cov @ J.T
+        return cov

@@ -25,6 +25,9 @@ from odocal_ros.apply.start import begin, Start
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.leg import COUNTER
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.nav.rotations import (
     matrix_from_quat,
     quat_from_matrix,
@@ -33,6 +36,7 @@ from odocal_ros.nav.rotations import (
 )
 from odocal_ros.nav.standstill import REST_TURN
 from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FASTEST
 
@@ -50,7 +54,7 @@ class Odometry:
     odometer and the Imu but for its newest sample have reached.
     """
 
-    def __init__(self, vehicle: Vehicle, config) -> None:
+    def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
         self.vehicle, self.config = vehicle, config
         self.grade = grade_of(config.imu)
         self._told: list[str] = []
@@ -72,15 +76,16 @@ class Odometry:
         self._told.append('time went back: odometry begins anew, at its origin')
         self._anew()
 
-    def _anew(self):
+    def _anew(self) -> None:
         self.wheels = Wheels(self.vehicle, self.config, self._told)
         self.imu = ImuStream(self.config)
         self._start: Start | None = None
 
-    def feed(self, slot: str, block, form=None) -> None:
+    def feed(self, slot: str, block: ImuSamples | OdometerSamples,
+             form: OdometerForm | None = None) -> None:
         """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
-        if slot != 'imu':
-            self.wheels.feed(slot, block, form)
+        if isinstance(block, OdometerSamples):
+            self.wheels.feed(slot, block, form or COUNTER)
         elif not self.imu.feed(block):
             self.begin_anew()
             self.imu.feed(block)
@@ -103,20 +108,21 @@ class Odometry:
             self._leave_behind(last)
         return out
 
-    def _take_start(self, start):
+    def _take_start(self, start: Start) -> None:
         self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
         self.accel_bias = np.zeros(3)
         self.position = np.zeros(3)      # of the odometer's point, from where it began
         self.imu.drop(start.row)
+        self._earth_n = start.earth_n
         self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
         self._s = self._s_pose = float(self.wheels.at(self._t))
         self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
-        self._w_look: list = []
+        self._w_look: list[Floats] = []
         self._rested = False
         self._v_look = self._velocity_n(self._t)
         self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
 
-    def _next(self):
+    def _next(self) -> int | None:
         """Return the row to advance to: a pose is due and all it needs has come; else None."""
         t, at = self.imu.t, self.imu.at
         period = 1 / self.config.publish.rate
@@ -128,7 +134,7 @@ class Odometry:
             return None
         return last
 
-    def _advance(self, last):
+    def _advance(self, last: int) -> None:
         """Go to a row of the Imu."""
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)
@@ -137,8 +143,8 @@ class Odometry:
         phi = phi[:, at - low:last - low]
         t = imu.t[at:last + 1]
         q = prefix_product(np.concatenate([self.q[None], quat_from_rotvec(phi.T)]))
-        if self._start.earth_n.any():
-            turned = np.multiply.outer(self._t - t, self._start.earth_n)
+        if self._earth_n.any():
+            turned = np.multiply.outer(self._t - t, self._earth_n)
             q = quat_multiply(quat_from_rotvec(turned), q)
         C = matrix_from_quat(q)
         s = self.wheels.at(t)
@@ -162,15 +168,17 @@ class Odometry:
         self.q, self._t = q[-1] / np.linalg.norm(q[-1]), float(t[-1])
         imu.at = last
 
-    def _velocity_n(self, t):
+    def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the Imu in n, by the odometer's last rows."""
         v, C_nb = self.vehicle, matrix_from_quat(self.q)
         now, before = self.wheels.at(np.array([t, t - SPEED_OVER]))
         arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
         rate = self.imu.w_b[self.imu.at] - self.bias
-        return C_nb @ (v.forward_b * (now - before) / SPEED_OVER + np.cross(rate, arm_b))
+        velocity: Floats = C_nb @ (
+            v.forward_b * (now - before) / SPEED_OVER + np.cross(rate, arm_b))
+        return velocity
 
-    def _look(self):
+    def _look(self) -> None:
         """Correct tilt and gyro bias, a second after the last time."""
         T = self._t - self._t_look
         if T < LOOK - 1e-6:
@@ -189,23 +197,23 @@ class Odometry:
                 matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise)))
         if self.config.levelling and standing:
             variance = np.maximum(self.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
-            earth_b = matrix_from_quat(self.q).T @ self._start.earth_n
+            earth_b = matrix_from_quat(self.q).T @ self._earth_n
             self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
         self._rested = resting
         self._t_look, self._v_look = self._t, self._velocity_n(self._t)
         self._felt_n, self._felt, self._w_look = np.zeros(3), True, []
 
-    def _correct(self, by):
+    def _correct(self, by: Floats) -> None:
         self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
         self.bias = self.bias + by[BG]
         self.accel_bias = self.accel_bias + by[BA]
 
-    def _pose(self):
+    def _pose(self) -> Pose:
         """Return the pose at the row reached."""
         v, T = self.vehicle, self._t - self._t_pose
         C_nb, C_vb = matrix_from_quat(self.q), v.C_vb
         arm_n = -C_nb @ C_vb.T @ v.lever_arm
-        earth_b = C_nb.T @ self._start.earth_n
+        earth_b = C_nb.T @ self._earth_n
         rate = C_vb @ (self._turn_b / T - earth_b)
         speed = (self._s - self._s_pose) / T
         velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
@@ -219,7 +227,7 @@ class Odometry:
         self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
         return pose
 
-    def _leave_behind(self, last):
+    def _leave_behind(self, last: int) -> None:
         """Forget what lies behind."""
         if last > 2000:
             self.imu.drop(last - 2)

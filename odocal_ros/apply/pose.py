@@ -12,9 +12,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from odocal_ros.apply.errors import BG
+from odocal_ros.apply.errors import BG, Errors
+from odocal_ros.apply.vehicle import Vehicle
+from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import SWAY
 
 
@@ -29,15 +30,16 @@ class Pose:
     """
 
     stamp_ns: int
-    position: NDArray[np.float64]
-    q: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    pose_cov: NDArray[np.float64]
-    twist_cov: NDArray[np.float64]
+    position: Floats
+    q: Floats
+    velocity: Floats
+    rate: Floats
+    pose_cov: Floats
+    twist_cov: Floats
 
 
-def pose_covariance(vehicle, errors, C_nb, arm_n, quantum):
+def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Floats,
+                    quantum: float) -> Floats:
     """
     Return the covariance of position and rotation, with what a count hides along the way: (6, 6).
 
@@ -49,7 +51,8 @@ def pose_covariance(vehicle, errors, C_nb, arm_n, quantum):
     return cov
 
 
-def twist_covariance(vehicle, errors, speed, rate, T, variance):
+def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, rate: Floats, T: float,
+                     variance: float) -> Floats:
     """
     Return the covariance of a mean twist over T s, of base_link: (6, 6).
 

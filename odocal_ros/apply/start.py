@@ -12,13 +12,18 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.apply.errors import Errors
+from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.vehicle import Vehicle
+from odocal_ros.apply.wheels import Wheels
+from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.earth import earth_rate_n
 from odocal_ros.nav.rotations import quat_from_matrix
 from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.grades import Grade
 
 LOOKED_AT = 2.0      # s of samples that a start is taken from
 TILT_GIVEN = 0.01    # rad of an attitude from outside
@@ -35,13 +40,14 @@ class Start:
     """
 
     row: int
-    q_nb: NDArray[np.float64]
-    gyro_bias: NDArray[np.float64]
-    earth_n: NDArray[np.float64]
+    q_nb: Floats
+    gyro_bias: Floats
+    earth_n: Floats
     errors: Errors
 
 
-def begin(imu, wheels, vehicle, config, grade) -> Start | None:
+def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
+          grade: Grade) -> Start | None:
     """Return the start, None while too little has come."""
     if not wheels.ready() or not len(imu.t):
         return None
@@ -54,10 +60,10 @@ def begin(imu, wheels, vehicle, config, grade) -> Start | None:
     t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
     resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
-    return _levelled(end, t[-1] - t[0], w, f, resting, vehicle, grade)
+    return _levelled(end, float(t[-1] - t[0]), w, f, resting, vehicle, grade)
 
 
-def _given(row, vehicle, config, grade):
+def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
     """Return the start that the settings tell."""
     start = config.start
     q = np.asarray(start.attitude)
@@ -66,7 +72,8 @@ def _given(row, vehicle, config, grade):
     return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
 
 
-def _levelled(row, length, w, f, resting, vehicle, grade):
+def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehicle: Vehicle,
+              grade: Grade) -> Start:
     """Return the start by gravity, x along the vehicle; the bias by a rest, else as calibrated."""
     felt = bool(np.isfinite(f).all())
     C_Lb = level_frame(f.mean(axis=0)) if felt else vehicle.C_vb

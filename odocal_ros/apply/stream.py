@@ -10,10 +10,11 @@
 """The Imu's samples that odometry has not left behind."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.samples import ImuSamples
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.settings.apply_config import ApplyConfig
 
 WILD_RATE = 100.0    # rad/s: no turn rate
 BACK_NS = 10**9      # stamps that step back by more,
@@ -28,7 +29,7 @@ class ImuStream:
     stamp_ns : (n,).              at : the row that is reached.     zero_ns : stamp of t = 0.
     """
 
-    def __init__(self, config) -> None:
+    def __init__(self, config: ApplyConfig) -> None:
         self._C = matrix_from_rpy(config.imu.mounting_rpy)
         self._scales = config.imu.gyro_scale, config.imu.accel_scale
         self._offset_ns = round(config.imu.time_offset * 1e9)
@@ -36,11 +37,11 @@ class ImuStream:
         self.at = 0
         self._stale = 0
         self.stamp_ns: Ints = np.empty(0, np.int64)
-        self.t: NDArray[np.floating] = np.empty(0)
+        self.t: Floats = np.empty(0)
         self.w_b: Floats = np.empty((0, 3))
         self.f_b: Floats = np.empty((0, 3))
 
-    def feed(self, block) -> bool:
+    def feed(self, block: ImuSamples) -> bool:
         """Take rows; return False, nothing taken, where their time has begun anew."""
         stamp = block.stamp_ns + self._offset_ns
         good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD_RATE).all(axis=1)
@@ -59,13 +60,13 @@ class ImuStream:
         f_i = block.f_i[good]
         f_i = np.where((f_i == 0).all(axis=1, keepdims=True), np.nan, f_i)
         self.stamp_ns = np.append(self.stamp_ns, stamp[good])
-        self.t = (self.stamp_ns - self.zero_ns) * 1e-9
+        self.t = np.asarray((self.stamp_ns - self.zero_ns) * 1e-9, float)
         gyro, accel = self._scales
         self.w_b = np.concatenate([self.w_b, gyro * block.w_i[good] @ self._C.T])
         self.f_b = np.concatenate([self.f_b, accel * f_i @ self._C.T])
         return True
 
-    def drop(self, row) -> None:
+    def drop(self, row: int) -> None:
         """Forget the rows before one; what is reached must not be among them."""
         for name in ('stamp_ns', 't', 'w_b', 'f_b'):
             setattr(self, name, getattr(self, name)[row:])

@@ -14,12 +14,13 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from odocal_ros.calib.result import Estimate
+from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadConfig
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.settings.apply_config import ApplyConfig
 
 UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05    # rad, 1 sigma of what no calibration determined
 SIDES = ('scale_factor_left', 'scale_factor_right')
@@ -45,22 +46,22 @@ class Vehicle:
     pitch: float
     yaw_sigma: float
     pitch_sigma: float
-    lever_arm: NDArray[np.float64]
-    gyro_bias: NDArray[np.float64] | None
+    lever_arm: Floats
+    gyro_bias: Floats | None
     guessed: tuple[str, ...] = ()
 
     @cached_property
-    def forward_b(self) -> NDArray[np.float64]:
+    def forward_b(self) -> Floats:
         """Return the vehicle's forward axis in b."""
         return forward_b(self.yaw, self.pitch)
 
     @cached_property
-    def C_vb(self) -> NDArray[np.float64]:
+    def C_vb(self) -> Floats:
         """Return the rotation that takes b to the vehicle's axes."""
         return matrix_from_rpy([0.0, self.pitch, self.yaw])
 
 
-def vehicle_of(estimates: dict[str, Estimate], config) -> Vehicle:
+def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     """
     Return the vehicle of a calibration's estimates.
 
@@ -70,14 +71,14 @@ def vehicle_of(estimates: dict[str, Estimate], config) -> Vehicle:
         They hold no scale factor.
 
     """
-    def told(name, otherwise, sigma=0.0):
+    def told(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)
         if e is None or e.value is None:
             return otherwise, sigma
         return e.value, sigma if e.sigma is None else e.sigma
 
     scale, sigma = told('scale_factor', math.nan)
-    wheels = tuple(told(name, math.nan)[0] for name in SIDES)
+    left, right = (told(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):
         raise BadConfig('the calibration holds no result.scale_factor: give the calibration.yaml '
                         'that odocal replay or the calibrator wrote, --params-file FILE')
@@ -90,8 +91,8 @@ def vehicle_of(estimates: dict[str, Estimate], config) -> Vehicle:
                     if name not in estimates or estimates[name].value is None)
     bias = np.array([told(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
     return Vehicle(
-        scale, sigma / scale, None if np.isnan(wheels).any() else wheels, yaw[0], pitch[0],
-        yaw[1], pitch[1],
+        scale, sigma / scale, None if math.isnan(left + right) else (left, right),
+        yaw[0], pitch[0], yaw[1], pitch[1],
         np.array([told(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
             'xyz', config.odometer.lever_arm, strict=True)]),
         None if np.isnan(bias).any() else bias, guessed)

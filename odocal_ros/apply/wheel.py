@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from odocal_ros.data.arrays import FloatOrFloats, Floats, Values
 from odocal_ros.data.samples import OdometerForm
 
 SPEED_TIME = 0.5                       # s over which the speed beside a row is taken
@@ -42,9 +43,9 @@ class Wheel:
         self.speed = 0.0               # m/s, over the last rows
         self.usual = 0.0               # s between rows
         self.told: list[str] = []
-        self.t: deque = deque()
-        self.s: deque = deque()
-        self.doubts: deque = deque()     # (t, m^2) of travel that is not certain
+        self.t: deque[float] = deque()
+        self.s: deque[float] = deque()
+        self.doubts: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
         self._value: int | float | None = None
         self._rows = self._refused = 0
 
@@ -54,7 +55,7 @@ class Wheel:
         whole = isinstance(self._value, int) and self.form.quantity != 'rate'
         return abs(self.scale) if whole else 0.0
 
-    def feed(self, t, value) -> None:
+    def feed(self, t: Floats, value: Values) -> None:
         """Take rows: times, s, and values as sent; what has no time or value is passed over."""
         for row in zip(t.tolist(), value.tolist(), strict=True):
             if math.isfinite(row[1]) and (not self.t or row[0] > self.t[-1]):
@@ -67,13 +68,14 @@ class Wheel:
         self.speed *= factor
         self.s = deque(s * factor for s in self.s)
 
-    def at(self, t):
+    def at(self, t: FloatOrFloats) -> FloatOrFloats:
         """Return the travel at times, linear between rows, constant outside."""
-        return np.interp(t, self.t, self.s)
+        travel: FloatOrFloats = np.interp(t, self.t, self.s)
+        return travel
 
     def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, each doubt once."""
-        return sum(variance for t, variance in self.doubts if t_from < t <= t_to)
+        return sum((variance for t, variance in self.doubts if t_from < t <= t_to), 0.0)
 
     def forget(self, t: float) -> None:
         """Drop rows that nobody asks for again."""
@@ -83,7 +85,7 @@ class Wheel:
         while self.doubts and self.doubts[0][0] < t:
             self.doubts.popleft()
 
-    def _take(self, t, value):
+    def _take(self, t: float, value: float) -> None:
         if self._value is None:
             self._value = value
             self._add(t, 0.0)
@@ -110,11 +112,11 @@ class Wheel:
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
 
-    def _add(self, t, s):
+    def _add(self, t: float, s: float) -> None:
         self.t.append(t)
         self.s.append(s)
 
-    def _step(self, value, before, dt):
+    def _step(self, value: float, before: float, dt: float) -> float:
         """Return the units rolled between two rows."""
         if self.form.quantity == 'rate':
             return (before + value) / 2 * dt
@@ -125,7 +127,7 @@ class Wheel:
             step = (step + modulus // 2) % modulus - modulus // 2
         return step
 
-    def _bridged(self, t, dt, step):
+    def _bridged(self, t: float, dt: float, step: float) -> float:
         """Return what to add to the travel of a gap in speeds or increments, m; doubt it."""
         missing = dt - self.usual
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0

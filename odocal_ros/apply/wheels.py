@@ -11,11 +11,16 @@
 
 import numpy as np
 
+from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheel import Wheel
+from odocal_ros.data.arrays import FloatOrFloats
+from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.standstill import REST_TRAVEL
+from odocal_ros.settings.apply_config import ApplyConfig
 
 STILL_COUNTS = 1.5    # counts that a wheel at rest may still show
 SIDES = ('odometer', 'odometer_right')
+Rows = tuple[str, OdometerSamples, OdometerForm]
 
 
 class Wheels:
@@ -25,16 +30,16 @@ class Wheels:
     Of two wheels each has its own factor where the calibration gives both.
     """
 
-    def __init__(self, vehicle, config, told) -> None:
+    def __init__(self, vehicle: Vehicle, config: ApplyConfig, told: list[str]) -> None:
         self._vehicle, self._told = vehicle, told
         self._reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
         self._two = config.odometer.right == 'topic'
-        self._waiting: list = []       # blocks from before the first Imu message
+        self._waiting: list[Rows] = []       # blocks from before the first Imu message
         self._wheels: dict[str, Wheel] = {}
         self.zero_ns = 0
 
-    def feed(self, slot, block, form) -> None:
+    def feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
         """Take rows of a slot."""
         self._waiting.append((slot, block, form))
         if not self.zero_ns:
@@ -44,18 +49,18 @@ class Wheels:
             self._feed(slot, block, form)
         self._waiting = []
 
-    def _feed(self, slot, block, form):
+    def _feed(self, slot: str, block: OdometerSamples, form: OdometerForm) -> None:
         if slot not in self._wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._scale(form)
         wheel = self._wheels[slot]
         good = block.stamp_ns > 0
         stamp = block.stamp_ns[good] + self._offset_ns
-        wheel.feed((stamp - self.zero_ns) * 1e-9, block.value[good])
+        wheel.feed(np.asarray((stamp - self.zero_ns) * 1e-9, float), block.value[good])
         self._told += wheel.told
         wheel.told.clear()
 
-    def _scale(self, form):
+    def _scale(self, form: OdometerForm) -> None:
         """Give each of two wheels its own factor."""
         scales = self._vehicle.wheel_scales
         if len(self._wheels) == 2 and scales is not None and form.sides:
@@ -75,11 +80,14 @@ class Wheels:
         """Return the first time that every wheel has, s."""
         return max(w.t[0] for w in self._wheels.values())
 
-    def at(self, t):
+    def at(self, t: FloatOrFloats) -> FloatOrFloats:
         """Return the travel at times, m."""
-        return sum(w.at(t) for w in self._wheels.values()) / len(self._wheels)
+        total = t * 0.0
+        for wheel in self._wheels.values():
+            total = total + wheel.at(t)
+        return total / len(self._wheels)
 
-    def doubt(self, t_from, t_to) -> float:
+    def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, beside that of the scale."""
         return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
 
@@ -89,12 +97,12 @@ class Wheels:
         return float(np.linalg.norm([w.quantum for w in self._wheels.values()])
                      / len(self._wheels))
 
-    def still(self, t_from, t_to) -> bool:
+    def still(self, t_from: float, t_to: float) -> bool:
         """Return whether no wheel turned between two times."""
         return all(abs(w.at(t_to) - w.at(t_from)) <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum
                    for w in self._wheels.values())
 
-    def forget(self, t) -> None:
+    def forget(self, t: float) -> None:
         """Drop rows before a time."""
         for wheel in self._wheels.values():
             wheel.forget(t)

@@ -13,13 +13,14 @@ What a drive can tell as things are configured and heard, and what it cannot, be
 Asked of the code that will judge the leg: the alignment it will have, the methods that run.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 
 from odocal_ros.calib.choice import deciding
-from odocal_ros.nav.alignment import HEADING_LIMIT
+from odocal_ros.nav.alignment import Alignment, HEADING_LIMIT
 from odocal_ros.pipeline.methods import METHODS
 from odocal_ros.planning.alignment import plan_alignment
 from odocal_ros.planning.drive import from_rates
@@ -86,7 +87,7 @@ def ability(config: Config, heard: Heard) -> Ability:
                    tuple(text for can, text in told if not can), weak)
 
 
-def _yaw(config, heard, methods):
+def _yaw(config: Config, heard: Heard, methods: Sequence[str]) -> tuple[bool, str]:
     if ALL_SAMPLES in methods:
         return True, 'the yaw (by stops, starts and turns)'
     alignment = _alignment(config, heard)
@@ -100,14 +101,14 @@ def _yaw(config, heard, methods):
     return True, f'the yaw (by {source}, {sigma:.2g} deg)'
 
 
-def _of_two_wheels(config, methods):
+def _of_two_wheels(config: Config, methods: Sequence[str]) -> list[tuple[bool, str]]:
     if 'wheels' not in methods:
         return [(False, f'left from right wheel, since method {config.method} takes their mean')]
     width = config.odometer.track_width
     return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
 
 
-def _alignment(config, heard):
+def _alignment(config: Config, heard: Heard) -> Alignment:
     """Return the alignment that a drive straight on from here will have."""
     rest = heard.rested_s if heard.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)

@@ -13,10 +13,13 @@ from collections import deque
 
 import numpy as np
 
+from odocal_ros.data.arrays import Ints
+from odocal_ros.data.samples import Samples
 from odocal_ros.screening.clocks import CLOCK_APART, remedy
 from odocal_ros.settings.config import Config
 
-CLOCK_ROWS = 10
+IMU_BLOCKS = 40       # newest, that rows of others are laid beside: some seconds
+CLOCK_ROWS = 10       # newest of a topic that its clock is told by
 DAY_S = 86400.0
 
 
@@ -29,11 +32,11 @@ class Clocks:
 
     def __init__(self, simulated: bool = False) -> None:
         self._simulated = simulated
-        self._imu: deque = deque(maxlen=40)
+        self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
         self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
-        self._ahead_s: dict[str, deque] = {}
+        self._ahead_s: dict[str, deque[float]] = {}
 
-    def feed(self, slot: str, block) -> None:
+    def feed(self, slot: str, block: Samples) -> None:
         """Take a block."""
         if slot != 'imu':
             self._waiting[slot] = int(block.received_ns[-1]), int(block.stamp_ns[-1])

@@ -103,9 +103,9 @@ class Forecast:
 
     def sigma(self, quantity: str) -> float | None:
         """Return the sigma of a quantity (scale, yaw, pitch, left_right, track_width)."""
-        if quantity in ('scale', 'yaw'):
-            return getattr(self, quantity).sigma
-        return self.pitch if quantity == 'pitch' else getattr(self.wheels, quantity, None)
+        of_wheels = self.wheels or WheelsForecast(None, None)
+        return {'scale': self.scale.sigma, 'yaw': self.yaw.sigma, 'pitch': self.pitch,
+                'left_right': of_wheels.left_right, 'track_width': of_wheels.track_width}[quantity]
 
     def words(self) -> str:
         """Return it as a sentence: what is enough, what more makes it so, what never will be."""
@@ -153,7 +153,7 @@ def _better(earlier: Prospect, newest: Prospect) -> Prospect:
     return replace(earlier, metres=newest.metres, why=newest.why, lack=newest.lack)
 
 
-def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict:
+def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str | float]:
     """
     Return the keys of ``~/status``; what is not foreseen is empty.
 
@@ -171,11 +171,11 @@ def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict:
     return keys
 
 
-def _running(forecast, age_s) -> dict:
+def _running(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
     """Return the keys of the running estimate, NaN where it tells nothing."""
     found = {} if forecast is None else forecast.estimates
     told = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
-    keys: dict = {}
+    keys: dict[str, str | float] = {}
     for (name, unit), e in zip(RUNNING.items(), told.values(), strict=True):
         for end, value in (('', e.value), ('_sigma', e.sigma if e.value is not None else None)):
             keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
@@ -186,7 +186,7 @@ def _running(forecast, age_s) -> dict:
 
 def _rounded_up(metres: float) -> int:
     """Return metres in two digits, not fewer than they are."""
-    step = 10 ** max(0, math.floor(math.log10(max(metres, 1.0))) - 1)
+    step: int = 10 ** max(0, math.floor(math.log10(max(metres, 1.0))) - 1)
     return math.ceil(metres / step) * step
 
 

@@ -116,7 +116,8 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
     return replace(forecast, estimates=estimates, until_ns=leg.stop_ns)
 
 
-def _by_ends(leg, fix_rate, config, wanted) -> Forecast:
+def _by_ends(leg: Leg, fix_rate: float, config: Config,
+             wanted: Callable[[], bool]) -> Forecast:
     """Return what two_point would make of the leg, its end points being what they are."""
     inputs = screened_in_cells(leg, config).inputs
     driven = profile_of(inputs, config)
@@ -125,7 +126,7 @@ def _by_ends(leg, fix_rate, config, wanted) -> Forecast:
     drive = _at_rest(_thinned(driven), wanted)
     now = predict(drive, sigmas)
 
-    def prospect(parameter, asked, why=''):
+    def prospect(parameter: str, asked: float, why: str = '') -> Prospect:
         sigma = now.sigma(parameter)
         metres = 0.0 if sigma is not None and sigma <= asked else None
         if metres is None and not why:
@@ -188,7 +189,7 @@ def _thinned(drive: PlannedDrive) -> PlannedDrive:
                              for name in ('t', 'speed', 'yaw', 'slope')})
 
 
-def _at_rest(drive: PlannedDrive, wanted) -> DriveSoFar:
+def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
     """Return the drive with as much rest at its end as makes REST_FORESEEN seconds."""
     moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0

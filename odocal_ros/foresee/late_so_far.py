@@ -39,11 +39,12 @@ class LateSoFar:
         return out
 
     def rest(self) -> OdometerSamples:
-        """Return the rows that are not given away, where they seem to belong."""
+        """Return the rows that are not given away, where they seem to belong; some were fed."""
+        assert self._rows is not None
         return take(_on_time(self._rows), slice(self._given, None))
 
 
-def _on_time(rows):
+def _on_time(rows: OdometerSamples) -> OdometerSamples:
     since_s = (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
     true_ns = rows.stamp_ns[0] + np.rint(on_time(rows, since_s, COUNT, []) * 1e9).astype(np.int64)
     return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

@@ -19,6 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.samples import ImuSamples
 from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.screen import imu_gap
@@ -36,7 +37,7 @@ class ImuGaps:
         self._newest_ns = start_ns
         self._edges_ns: list[int] = []      # on both sides of a gap
 
-    def feed(self, block) -> int:
+    def feed(self, block: ImuSamples) -> int:
         """Take Imu rows; return where they go on after a gap, 0 without one."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):

@@ -14,10 +14,11 @@ Light estimates from the blocks as they come; nothing here enters a result.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from odocal_ros.data.samples import OdometerForm
+from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
 from odocal_ros.foresee.ability import Heard, stated_variance
 from odocal_ros.foresee.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
@@ -55,7 +56,7 @@ class Travel:
         self.top = 0.0           # highest speed, units/s
         self._since = 0.0, 0     # total and stamp that the speed is taken from
 
-    def feed(self, block, scale: float) -> None:
+    def feed(self, block: OdometerSamples, scale: float) -> None:
         """Take a block; scale: m per unit, 0 unknown."""
         steps, stamps, seconds = self._rows.of(block)
         if not len(steps):
@@ -93,9 +94,9 @@ class FixPath:
 
     def __init__(self) -> None:
         self.total = self.top = 0.0      # m, m/s
-        self._anchor: tuple | None = None
+        self._anchor: tuple[float, float, int] | None = None      # rad, rad, stamp
 
-    def feed(self, block, min_status: int, moving: bool) -> None:
+    def feed(self, block: FixSamples, min_status: int, moving: bool) -> None:
         """Take a block of fixes; moving: as the counter has it."""
         for lat, lon, stamp, variance, status in zip(
                 block.latitude, block.longitude, block.stamp_ns,
@@ -125,9 +126,10 @@ class Progress:
         self._path = FixPath()
         self._zero = 0.0
         self._scale = 0.0
-        self._last: dict = {}        # slot -> newest block
+        self._last: dict[str, Any] = {}        # slot -> newest block
 
-    def feed(self, slot: str, block, config: Config, form, found_scale: float) -> None:
+    def feed(self, slot: str, block: Any, config: Config, form: OdometerForm | None,
+             found_scale: float) -> None:
         """Take a block as it went into the recorder."""
         if not len(block.stamp_ns):
             return

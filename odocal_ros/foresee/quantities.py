@@ -9,6 +9,7 @@
 
 """Which quantities are good enough: yes, no or unknown, while a leg is recorded and after it."""
 
+from collections.abc import Set
 from dataclasses import dataclass
 import math
 
@@ -84,7 +85,7 @@ def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -
 
 
 def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
-                 doubted=frozenset()) -> dict[str, str]:
+                 doubted: Set[str] = frozenset()) -> dict[str, str]:
     """
     Return what is good enough of estimates.
 
@@ -122,11 +123,11 @@ def words(ok: dict[str, str]) -> str:
     return '; '.join(parts)
 
 
-def _given(name, config):
+def _given(name: str, config: Config) -> bool:
     return name == 'track_width' and config.odometer.track_width > 0
 
 
-def _share(estimate, relative):
+def _share(estimate: Estimate | None, relative: bool) -> float:
     """Return the sigma of an estimate against its limit's unit, infinite where it has none."""
     if estimate is None or estimate.value is None or estimate.sigma is None:
         return math.inf
@@ -135,5 +136,5 @@ def _share(estimate, relative):
     return estimate.sigma
 
 
-def _within(sigma, limit):
+def _within(sigma: float | None, limit: float) -> str:
     return YES if sigma is not None and sigma <= limit else NO

@@ -9,6 +9,7 @@
 
 """What the running estimate makes foreseen: which sigma counts, how far to drive, and what."""
 
+from collections.abc import Callable
 from dataclasses import replace
 import math
 
@@ -31,7 +32,8 @@ BY_WAY, BY_WAY_SLOW = 1.0, 2.0
 FAR_TOO_FEW = 50    # stops and starts: nobody does so many
 
 
-def look(leg: Leg, config: Config, smoother: SmootherSoFar | None, wanted) -> Running | None:
+def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
+         wanted: Callable[[], bool]) -> Running | None:
     """
     Return the smoother's running estimate, None where it says nothing yet or is not asked.
 
@@ -114,7 +116,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
                     sources_of(running.method, YAW), '', now, lack)
 
 
-def _metres(running, ratio, power) -> float | None:
+def _metres(running: Running, ratio: float, power: float) -> float | None:
     """Return the metres more that make a sigma so many times better, driven as so far."""
     metres = running.distance * (max(ratio, 1.0)**power - 1)
     return metres if metres <= FARTHEST else None

@@ -16,11 +16,21 @@ become too many they are made twice as wide, so that neither memory nor work gro
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from odocal_ros.data.arrays import Floats, Ints, Values
 from odocal_ros.data.leg import COUNTER, Leg
-from odocal_ros.data.samples import ImuSamples, join, OdometerForm, OdometerSamples, take
+from odocal_ros.data.samples import (
+    ImuSamples,
+    join,
+    OdometerForm,
+    OdometerSamples,
+    Samples,
+    SomeSamples,
+    take,
+)
 from odocal_ros.foresee.late_so_far import LateSoFar
 
 CELL_NS = 100_000_000
@@ -33,14 +43,15 @@ class ThinnedLeg:
 
     def __init__(self, form: OdometerForm | None = None) -> None:
         self.form = form or COUNTER
-        self._cells: dict = {}       # slot -> rows, one a cell
-        self._open: dict = {}        # slot -> rows of the cell that is not over
-        self._width_ns: dict = {}
-        self._late: dict = {}        # slot -> the newest counts
-        self._last: dict = {}        # slot -> last count as sent, and as unrolled
-        self._fix_steps: list = []
+        self._cells: dict[str, Any] = {}       # slot -> rows, one a cell
+        self._open: dict[str, Any] = {}        # slot -> rows of the cell that is not over
+        self._width_ns: dict[str, int] = {}
+        self._late: dict[str, LateSoFar] = {}        # slot -> the newest counts
+        # slot -> last count as sent, (1,), and as unrolled
+        self._last: dict[str, tuple[Values, int | float]] = {}
+        self._fix_steps: list[Ints] = []
 
-    def feed(self, slot: str, samples) -> None:
+    def feed(self, slot: str, samples: Samples) -> None:
         """Take rows as they were recorded."""
         samples = _usable(samples)
         if not len(samples.stamp_ns):
@@ -48,7 +59,7 @@ class ThinnedLeg:
         if slot == 'fix':
             before = self._open.get('fix', take(samples, slice(0, 0))).stamp_ns[-1:]
             self._fix_steps.append(np.diff(np.append(before, samples.stamp_ns)))
-        if slot.startswith('odometer') and self.form.quantity != 'rate':
+        if isinstance(samples, OdometerSamples) and self.form.quantity != 'rate':
             samples = self._late.setdefault(slot, LateSoFar()).feed(self._unrolled(slot, samples))
             if not len(samples.stamp_ns):
                 return
@@ -77,14 +88,15 @@ class ThinnedLeg:
         stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
 
-    def _newest(self, slot) -> OdometerSamples:
+    def _newest(self, slot: str) -> OdometerSamples:
         """Return the cells of a counter with rows that those to come may still move."""
         rows = self._late[slot].rest()
         if slot in self._open:
             rows = join([self._open[slot], rows])
         width_ns = self._width_ns.get(slot, CELL_NS)
         cells = _gathered(rows, rows.stamp_ns // width_ns, ())
-        return join([self._cells[slot], cells]) if slot in self._cells else cells
+        before: OdometerSamples | None = self._cells.get(slot)
+        return cells if before is None else join([before, cells])
 
     def fix_rate(self) -> float:
         """Return fixes a second by the median of their intervals, NaN where there are too few."""
@@ -93,11 +105,11 @@ class ThinnedLeg:
         rising = steps[steps > 0]
         return 1e9 / float(np.median(rising)) if len(rising) else float('nan')
 
-    def _averaged(self, slot) -> tuple[str, ...]:
+    def _averaged(self, slot: str) -> tuple[str, ...]:
         rates = ('value',) if self.form.quantity == 'rate' else ()
         return {'imu': ('w_i', 'f_i'), 'odometer': rates, 'odometer_right': rates}.get(slot, ())
 
-    def _unrolled(self, slot, samples) -> OdometerSamples:
+    def _unrolled(self, slot: str, samples: OdometerSamples) -> OdometerSamples:
         """Return counts or increments as a running count that never rolls over."""
         sent, count = self._last.get(slot, (None, 0))
         value = samples.value
@@ -108,12 +120,12 @@ class ThinnedLeg:
             if 0 < self.form.modulus < 2**63:
                 half = self.form.modulus // 2
                 step = (step + half) % self.form.modulus - half
-        total = count + np.cumsum(step)
+        total: Values = count + np.cumsum(step)  # type: ignore[assignment]
         self._last[slot] = value[-1:], total[-1]
         return replace(samples, value=total)
 
 
-def _usable(samples):
+def _usable(samples: SomeSamples) -> SomeSamples:
     """Return the rows that have a stamp and finite figures where a mean is taken."""
     keep = samples.stamp_ns > 0
     if isinstance(samples, ImuSamples):
@@ -123,7 +135,7 @@ def _usable(samples):
     return samples if keep.all() else take(samples, keep)
 
 
-def _gathered(rows, cell, averaged):
+def _gathered(rows: SomeSamples, cell: Ints, averaged: tuple[str, ...]) -> SomeSamples:
     """Return one row for each run of equal ``cell``: its last, but the mean of ``averaged``."""
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
     count = np.diff(np.append(first, len(cell)))
@@ -131,9 +143,11 @@ def _gathered(rows, cell, averaged):
     if not averaged:
         return last
 
-    def mean(values):
-        return (np.add.reduceat(values, first).T / count).T
+    def mean(values: Floats | Ints) -> Floats:
+        means: Floats = (np.add.reduceat(values, first).T / count).T
+        return means
 
+    columns: dict[str, Any] = {name: mean(getattr(rows, name)) for name in averaged}
     since_ns = rows.stamp_ns - np.repeat(rows.stamp_ns[first], count)
     return replace(last, stamp_ns=rows.stamp_ns[first] + mean(since_ns).astype(np.int64),
-                   **{name: mean(getattr(rows, name)) for name in averaged})
+                   **columns)

@@ -44,7 +44,7 @@ def with_wheels(forecast: Forecast, leg: Leg, config: Config) -> Forecast:
     apart = None if left is None or right is None else max(left, right)
     scale = _better(forecast.scale, method, 'scale_factor',
                     _relative(method.estimates['scale_factor']))
-    if scale is not forecast.scale and scale.metres:
+    if scale is not forecast.scale and scale.sigma and scale.metres:
         # as all the fixes along the way count, no less is gained than by the length of the way
         more = result.distance * (scale.sigma / scale.asked - 1)
         scale = replace(scale, metres=min(scale.metres, more))
@@ -63,7 +63,8 @@ def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float],
                         key=lambda source: -source[1]))
 
 
-def _better(prospect: Prospect, method, parameter, sigma):
+def _better(prospect: Prospect, method: MethodResult, parameter: str,
+            sigma: float | None) -> Prospect:
     """Return a prospect by the method, which is the one that gives the result, if it is better."""
     if sigma is None or prospect.sigma is not None and prospect.sigma <= sigma:
         return prospect

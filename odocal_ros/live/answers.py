@@ -9,14 +9,14 @@
 
 """What a service answers, in one line."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
 from odocal_ros.output.summary import sentence
 from odocal_ros.outside.names import said_by
-from odocal_ros.reasons import Verdict
+from odocal_ros.reasons import Reason, Verdict
 
 MOST_REASONS = 3
 
@@ -49,13 +49,13 @@ def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:
                                      'Next: drive a leg to renew it'])
 
 
-def _sentences(parts) -> str:
+def _sentences(parts: Iterable[str]) -> str:
     """Return sentences one after the other, each ended once."""
     *before, last = filter(None, parts)
     return ' '.join([*(f'{part.rstrip(".")}.' for part in before), last])
 
 
-def _worth_telling(calibration: Calibration) -> list:
+def _worth_telling(calibration: Calibration) -> list[Reason]:
     """Return the reasons that lowered the verdict, the gravest first."""
     order = list(Verdict)
     grave = [r for r in calibration.reasons if r.code.gravity is not Verdict.ACCEPTED]

@@ -9,6 +9,9 @@
 
 """Legs that begin and end by themselves in the node, where ``leg.automatic`` asks for it."""
 
+from typing import Any
+
+from odocal_ros.data.samples import Samples
 from odocal_ros.live.filing import latest_of
 from odocal_ros.live.jobs import Computed, LeftOut
 from odocal_ros.live.leg_completion import LegCompletion
@@ -17,7 +20,7 @@ from odocal_ros.live.session import State
 from odocal_ros.output.stored import Stored
 from odocal_ros.pipeline.automatic import LegSearch
 from odocal_ros.reasons import Code
-from odocal_ros.settings.config import LegConfig
+from odocal_ros.settings.config import Config, LegConfig
 
 
 class AutomaticWay(LegCompletion):
@@ -27,7 +30,7 @@ class AutomaticWay(LegCompletion):
     A leg of the operator's goes before; the search goes on where it ended.
     """
 
-    def __init__(self, *args) -> None:
+    def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._search: LegSearch | None = None
         self._searched: LegConfig | None = None      # the settings it was made with
@@ -42,7 +45,7 @@ class AutomaticWay(LegCompletion):
         if self._search is not None and self._search.spans:
             self._by_itself(self._search)
 
-    def _hear(self, slot: str, block) -> None:
+    def _hear(self, slot: str, block: Samples) -> None:
         self._watch.feed(slot, block)
         if self._search is not None:
             self._search.feed(slot, block, self._recording.inputs.form)
@@ -114,7 +117,7 @@ class AutomaticWay(LegCompletion):
                 self._log.warning(f'{reason.code.name}: {reason.text}. {reason.code.remedy}')
 
 
-def _not_ours(found: Stored, config) -> str:
+def _not_ours(found: Stored, config: Config) -> str:
     """Return why a result is of another vehicle or mounting, empty where it is not."""
     if found.vehicle != config.vehicle:
         return f'it is of vehicle {found.vehicle!r}'

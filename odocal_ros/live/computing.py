@@ -10,12 +10,13 @@
 """The computation under way, and those who wait for what it brings."""
 
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.task import Future
 
 from odocal_ros.live import answers
 from odocal_ros.live.memory import give_back
-from odocal_ros.live.worker import Worker
+from odocal_ros.live.worker import Job, Worker
 
 
 class Computing:
@@ -39,12 +40,12 @@ class Computing:
         self.at = share, stage
         give_back()      # what the pass before needed
 
-    def submit(self, job, take) -> None:
+    def submit(self, job: Job, take: Callable[[Any], object]) -> None:
         """Run a job in the worker and hand its result to ``take``."""
         self._job = token = object()
         self.at = 0.0, ''
 
-        def then(result, error):
+        def then(result: Any, error: Exception | None) -> None:
             if token is not self._job:
                 return
             self._job = None

@@ -9,7 +9,9 @@
 
 """What the node says on its console by itself: what it waits for, that it is ready, what fails."""
 
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session_view import SessionView
+from odocal_ros.reasons import Code
 
 FIRST_NS = 5_000_000_000       # of waiting, before it is said
 SELDOM_NS = 60_000_000_000     # and then
@@ -22,14 +24,15 @@ class Console:
     ``tell`` is given every view, with the time of a clock that never stands.
     """
 
-    def __init__(self, log) -> None:
+    def __init__(self, log: PlainLog) -> None:
         self._log = log
         self._ready = False          # has been said
         self._doubled: set[str] = set()      # said
         self._silence = False        # has been said
         self._due_ns = 0             # when the next word about what is missing is due
         self._pause_ns = FIRST_NS
-        self._leg: tuple = ()        # the leg whose faults are said, and which
+        self._leg_id = 0             # the leg whose faults are said
+        self._told: set[Code] = set()      # of them
 
     def tell(self, now: SessionView, steady_ns: int) -> None:
         """Say what is new."""
@@ -65,10 +68,10 @@ class Console:
     def _faults(self, now: SessionView) -> None:
         """Say what is wrong with the leg that is recorded, each once."""
         leg_id = now.session.leg_id
-        if not self._leg or self._leg[0] != leg_id:
-            self._leg = leg_id, set()
+        if self._leg_id != leg_id:
+            self._leg_id, self._told = leg_id, set()
         for fault in now.faults:
-            if fault.code not in self._leg[1]:
-                self._leg[1].add(fault.code)
+            if fault.code not in self._told:
+                self._told.add(fault.code)
                 self._log.warning(f'leg {leg_id}: {fault.code.name}: {fault.text}. '
                                   f'{fault.remedy}')

@@ -13,6 +13,7 @@ import importlib
 from importlib.machinery import PathFinder
 from pathlib import Path
 import re
+from typing import Any
 
 from odocal_ros.errors import BadConfig
 
@@ -21,7 +22,7 @@ NAMES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'floa
 KIND = re.compile(r'(sequence<)?([\w/]+)(<\d+>)?(?:, (\d+))?(>)?(\[\d+\])?')
 
 
-def message_class(msgtype: str):
+def message_class(msgtype: str) -> Any:
     """Return the class of 'pkg/msg/Type', or raise BadConfig with what to do."""
     match = MESSAGE_TYPE.fullmatch(msgtype)     # somebody on the net may have chosen it
     try:
@@ -55,7 +56,7 @@ def definition_of(kind: type) -> str:
     return first[1] + ''.join(f'{"=" * 80}\nMSG: {name}\n{text}' for name, text in others)
 
 
-def _collect(kind, name: str, texts: dict[str, str]) -> None:
+def _collect(kind: Any, name: str, texts: dict[str, str]) -> None:
     """Add the text of a class and of all that it uses."""
     lines, used = [], []
     for field, about in kind.get_fields_and_field_types().items():

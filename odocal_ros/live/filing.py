@@ -9,14 +9,16 @@
 
 """Result files on their way to the disk: written by the worker, answered by a future."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rclpy.task import Future
 
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.live import answers, result_files as outputs
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.result_folders import LATEST, ResultFolders
 from odocal_ros.live.worker import Worker
 from odocal_ros.output.stored import Stored
@@ -31,7 +33,7 @@ class Filing:
     saved : the newest folder that still stands.   trouble : why the newest result has none.
     """
 
-    def __init__(self, worker: Worker, log, show: Callable[[], None], node: str) -> None:
+    def __init__(self, worker: Worker, log: PlainLog, show: Callable[[], None], node: str) -> None:
         self.saved = self.trouble = ''
         self._node = node
         self._worker, self._log, self._show = worker, log, show
@@ -50,7 +52,7 @@ class Filing:
         future = Future()
         self._under_way += 1
 
-        def then(outcome, error):
+        def then(outcome: Any, error: Exception | None) -> None:
             self._under_way -= 1
             if error is None:
                 folder, stays = outcome
@@ -78,14 +80,14 @@ class Filing:
         """Return whether files are being written."""
         return self._under_way > 0 or self._artist.busy
 
-    def _write(self, *values) -> tuple[Path, str]:
+    def _write(self, *values: Any) -> tuple[Path, str]:
         """Write the numbers; for the worker."""
         folder, stays, draw = outputs.save(*values)
         if draw is not None:
             self._artist.submit(draw, self._drawn)
         return folder, stays
 
-    def _drawn(self, why, error) -> None:
+    def _drawn(self, why: str, error: Exception | None) -> None:
         if error is not None or why:
             self._log.warning('the report is not drawn: '
                               f'{answers.one_line(error) if error else why}')
@@ -98,11 +100,11 @@ class Filing:
         """Let the report be drawn, waiting a moment for it; return whether it is."""
         return self._artist.close(grace_s)
 
-    def withdraw(self, left) -> None:
+    def withdraw(self, left: Iterable[LegResult]) -> None:
         """Let ``latest`` and ``saved`` go back to what holds only the legs left."""
         self.trouble = ''
 
-        def then(folder, error):
+        def then(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)
             if error is not None:
                 self._log.warning(f'latest still shows a dropped leg: {answers.one_line(error)}')

@@ -9,12 +9,14 @@
 
 """What to do next, in metres, seconds and manoeuvres: one text for status and answers."""
 
+from collections.abc import Sequence
+
 from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.foresee import quantities
 from odocal_ros.foresee.clocks_so_far import clocks_differ
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.reasons import Verdict
+from odocal_ros.reasons import Reason, Verdict
 
 REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
 KMH = 3.6
@@ -99,7 +101,7 @@ def manoeuvres(now: SessionView) -> list[str]:
     return wants + (now.forecast.lacks if now.forecast else [])
 
 
-def _of_two_wheels(now):
+def _of_two_wheels(now: SessionView) -> list[str]:
     """Return what the wheels need; before the first look only what any drive needs."""
     config = now.session.config
     wheels = None if now.forecast is None else now.forecast.wheels
@@ -179,11 +181,11 @@ def after_result(now: SessionView) -> str:
     return '; '.join([text, *notes])
 
 
-def _notes(reasons, ok):
+def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
     """Return the remedies of what is not OK and yet no reason against the result."""
     wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
-    told = {}
+    told: dict[str, None] = {}
     for r in reasons:
         if ABOUT.get(r.code) in wanted:
             told[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None

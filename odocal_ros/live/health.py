@@ -10,9 +10,12 @@
 """How well one topic arrives: counts, rate, gaps, losses. Knows nothing of ROS."""
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Bools, Ints
+from odocal_ros.data.samples import FixSamples, Samples
 
 MEMORY = 64            # blocks kept for the rate
 RATE_SPAN_NS = 3_000_000_000
@@ -43,10 +46,11 @@ class Health:
         self._ahead: list[int] = []      # stamps far ahead that nothing has confirmed yet
         self._behind = 0                 # stale rows at the end of the last block
         self._last_sequence: int | None = None
-        self._ends: deque = deque(maxlen=MEMORY)  # (count, stamp) after each block
+        # count and stamp after each block
+        self._ends: deque[tuple[int, int]] = deque(maxlen=MEMORY)
         self._interval_s = 0.0
 
-    def arrived(self, sequences, now_ns: int) -> None:
+    def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count messages as they came; sequences are the publisher's numbers, or None."""
         self.heard_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
@@ -58,14 +62,14 @@ class Health:
         if numbers:
             self._last_sequence = numbers[-1]
 
-    def decoded(self, block, max_gap_s: float | None = None) -> NDArray[np.bool_]:
+    def decoded(self, block: Samples, max_gap_s: float | None = None) -> Bools:
         """
         Take over the stamps of a block; a gap is a step beyond the limit (or 5 intervals).
 
         Returns which rows have a stamp to reckon with: none that is zero, or wild.
         """
         self.count += len(block.stamp_ns)
-        if hasattr(block, 'status') and len(block.status):
+        if isinstance(block, FixSamples) and len(block.status):
             self.fix_status = int(block.status[-1])
         sound = self._not_ahead(block.stamp_ns)
         if not sound.any():
@@ -76,9 +80,9 @@ class Health:
         sound[sound] = stamps >= np.maximum.accumulate(np.maximum(stamps, known)) - JUMP_NS
         return sound
 
-    def _not_ahead(self, stamps) -> NDArray[np.bool_]:
+    def _not_ahead(self, stamps: Ints) -> Bools:
         """Return which stamps are given and not far ahead of the last, unless enough follow."""
-        sound = stamps > 0
+        sound: Bools = stamps > 0
         given = stamps[sound]
         if not len(given) or not self._ahead and (
                 given.max() - (self.newest_ns or given[0]) < WILD_NS):
@@ -94,7 +98,7 @@ class Health:
                 last, self._ahead = stamp, []
         return sound
 
-    def _take(self, stamps, max_gap_s: float | None) -> None:
+    def _take(self, stamps: Ints, max_gap_s: float | None) -> None:
         newest = self._newest(stamps)
         steps = np.diff(stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]) * 1e-9
         rising = steps[steps > 0]
@@ -107,7 +111,7 @@ class Health:
         self.newest_ns = newest
         self._ends.append((self.count, newest))
 
-    def _newest(self, stamps) -> int:
+    def _newest(self, stamps: Ints) -> int:
         """
         Return the newest stamp with a block of them, and note whether time has started anew.
 

@@ -11,6 +11,7 @@
 
 from rclpy.node import Node
 
+from odocal_ros.data.samples import OdometerForm
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
@@ -63,13 +64,13 @@ class Inputs:
         return {slot: one.topic for slot, one in self.by_slot.items() if one.reader is not None}
 
     @property
-    def form(self):
+    def form(self) -> OdometerForm | None:
         """Return the form of the odometer's values, None until its type is known."""
         reader = self.by_slot['odometer'].reader
         return reader.form if reader else None
 
     @property
-    def form_right(self):
+    def form_right(self) -> OdometerForm | None:
         """Return the form of the right wheel's values where it has a topic of its own."""
         right = self.by_slot.get('odometer_right')
         return right.reader.form if right and right.reader else None

@@ -11,7 +11,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
+from nav_msgs.msg import Path as PathMessage
 from std_msgs.msg import Header
 
 from odocal_ros.calib.carried import Carried
@@ -25,6 +27,7 @@ from odocal_ros.pipeline.parts import calibrate_parts
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
+Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
 MOST_KEPT = 30      # legs in memory and in the report; what those before tell is carried on
 
 
@@ -38,7 +41,7 @@ class Computed:
     """
 
     results: tuple[LegResult, ...]
-    paths: tuple
+    paths: Paths
     calibration: Calibration
     carried: Carried | None
     folded: int
@@ -70,12 +73,12 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
 
 
 def recombine(kept: list[LegResult], config: Config, carried: Carried | None = None,
-              ) -> tuple[Calibration, tuple]:
+              ) -> tuple[Calibration, Paths]:
     """Return the combination of the legs left, and the paths of the last."""
     return combine(kept, config, carried, known_imu(config)), leg_paths(kept[-1], config)
 
 
-def leg_paths(result: LegResult | None, config: Config) -> tuple:
+def leg_paths(result: LegResult | None, config: Config) -> Paths:
     """Return the two paths of a leg, empty ones without a leg."""
     header = Header(frame_id=config.frames.local)
     if result is not None:

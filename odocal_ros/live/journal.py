@@ -18,6 +18,7 @@ from datetime import datetime, UTC
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
 from odocal_ros.live.definitions import message_class
@@ -44,7 +45,7 @@ class Journal:
     no message more or less, so that a replay of it gives the same result.
     """
 
-    def __init__(self, node, topic: str) -> None:
+    def __init__(self, node: Node, topic: str) -> None:
         self._log, self._clock, self._topic = node.get_logger(), node.get_clock(), topic
         self._node = node.get_fully_qualified_name()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)

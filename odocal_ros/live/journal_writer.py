@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 import queue
 import threading
+from typing import Any
 
 from odocal_ros.bagio.channels import Channel
 from odocal_ros.bagio.chunks import Chunk, pack
@@ -53,7 +54,7 @@ class PreRoll:
         while self.size > MOST_HELD:
             self._drop(max(self._held.values(), key=lambda h: sum(c.size for _, c in h)))
 
-    def _drop(self, held: deque) -> None:
+    def _drop(self, held: deque[tuple[int, Chunk]]) -> None:
         self.size -= held.popleft()[1].size
 
     def chunks(self) -> list[Chunk]:
@@ -81,11 +82,11 @@ class JournalWriter:
         self._leg: LegJournal | None = None
         self._listening = False                       # the samples of that leg go on
         self._closed: dict[int, LegJournal] = {}
-        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[Callable[..., None], Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_journal', daemon=True)
         self._thread.start()
 
-    def submit(self, job: Callable[..., None], *values) -> None:
+    def submit(self, job: Callable[..., None], *values: Any) -> None:
         """Have the thread call one of the methods below."""
         self._jobs.put((job, values))
 

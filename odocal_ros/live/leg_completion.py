@@ -9,7 +9,7 @@
 
 """A leg's way from its stop mark to the answer: closed, computed, combined, told, saved."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import nan
 import time
@@ -18,7 +18,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.task import Future
 
-from odocal_ros.calib.result import Calibration
+from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.foresee.ability import Ability, ability
 from odocal_ros.foresee.clocks_so_far import clocks_differ
@@ -32,6 +32,7 @@ from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.journal_text import replay_command
 from odocal_ros.live.params import restored_from
+from odocal_ros.live.process import SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
@@ -52,8 +53,8 @@ class LegCompletion:
     done.
     """
 
-    def __init__(self, node, recording: Recording, publishing: Publishing, journal: Journal,
-                 config: Callable[[], Config]) -> None:
+    def __init__(self, node: SettledNode, recording: Recording, publishing: Publishing,
+                 journal: Journal, config: Callable[[], Config]) -> None:
         self.session = Session()
         self.session.restored = restored_from(publishing.results())
         self._recording, self._publishing, self._config = recording, publishing, config
@@ -251,7 +252,8 @@ class LegCompletion:
         if success and self._config().output.autosave:
             self._save(done.calibration)
 
-    def _take_result(self, calibration, paths, parts=()) -> tuple[bool, str]:
+    def _take_result(self, calibration: Calibration, paths: jobs.Paths,
+                     parts: Sequence[LegResult] = ()) -> tuple[bool, str]:
         """Publish a result and answer those who wait for it."""
         self._publishing.set_results(calibration)
         self._publishing.show_paths(paths)

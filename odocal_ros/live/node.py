@@ -9,14 +9,17 @@
 
 """The live node: declares settings, records, computes on a mark, publishes."""
 
+from collections.abc import Callable
 from functools import partial
 import sys
 import threading
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -24,7 +27,6 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
-from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.process import complain, run, SettledNode
 from odocal_ros.live.publishing import Publishing
 from odocal_ros.live.recording import Recording
@@ -64,7 +66,7 @@ class Calibrator(SettledNode):
 
     at_work = False
 
-    def __init__(self, node_name: str = 'calibrator', **kwargs) -> None:
+    def __init__(self, node_name: str = 'calibrator', **kwargs: Any) -> None:
         super().__init__(node_name, **kwargs)
 
     def _build(self) -> None:
@@ -97,15 +99,11 @@ class Calibrator(SettledNode):
                 self.at_work = True
         if hasattr(self, 'operation') and (left := self.operation.left_behind()):
             complain('calibrator', left)      # a context that is shut down takes its log with it
-        super().destroy_node()
-
-    def get_logger(self) -> PlainLog:
-        """Return the node's log."""
-        return PlainLog(super().get_logger())
+        super().destroy_node()  # type: ignore[no-untyped-call]
 
     # parameters
 
-    def _check_parameters(self, parameters) -> SetParametersResult:
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse what may not be set; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
@@ -125,7 +123,7 @@ class Calibrator(SettledNode):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _take_parameters(self, parameters) -> None:
+    def _take_parameters(self, parameters: list[Parameter]) -> None:
         self.config = params.changed(self.config, parameters)
 
     # what happens five times a second
@@ -162,7 +160,8 @@ class Calibrator(SettledNode):
         self._due_ns[task] = on_time if on_time > now_ns else now_ns + period_ns
         return True
 
-    async def _serve(self, act, _request, response):
+    async def _serve(self, act: Callable[[], tuple[bool, str] | Future], _request: Trigger.Request,
+                     response: Trigger.Response) -> Trigger.Response:
         """Answer a Trigger with what ``act`` returns, or the future it returns brings."""
         try:
             with self._lock:
@@ -176,7 +175,7 @@ class Calibrator(SettledNode):
         return response
 
 
-def main(args=None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node until it is told to end; see ``process.run``."""
     return run('calibrator', HELP, Calibrator, args)
 

@@ -11,6 +11,7 @@
 
 from functools import partial
 import sys
+from typing import Any
 
 from geometry_msgs.msg import Point, Quaternion, TwistWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -18,13 +19,14 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 
-from odocal_ros.apply.odometry import Odometry, Pose
+from odocal_ros.apply.odometry import Odometry
+from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.inputs import IMU
-from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.apply_config import ApplyConfig
@@ -49,7 +51,7 @@ settings     parameters, all in config/odometry.yaml with what they mean"""
 class OdometryNode(SettledNode):
     """Joins the inputs of the calibrator to ``Odometry`` and its poses to two topics."""
 
-    def __init__(self, node_name: str = 'odometry', **kwargs) -> None:
+    def __init__(self, node_name: str = 'odometry', **kwargs: Any) -> None:
         super().__init__(node_name, **kwargs)
 
     def _build(self) -> None:
@@ -80,10 +82,6 @@ class OdometryNode(SettledNode):
         self.create_timer(TICK_S, self._tick, clock=self._steady)
         self.get_logger().info(f'applies the {kept.words("")}')
 
-    def get_logger(self) -> PlainLog:
-        """Return the node's log."""
-        return PlainLog(super().get_logger())
-
     def _tick(self) -> None:
         now_ns = self._steady.now().nanoseconds
         if now_ns - self._look_ns > LOOK_S * 1e9:
@@ -110,7 +108,7 @@ class OdometryNode(SettledNode):
             return
         for slot, block in source.decode(raws, sent_ns, None):
             self._odometry.feed(slot, take(block, source.sound),
-                                source.reader and source.reader.form)
+                                source.reader.form if source.reader else None)
         if source.slot == 'imu' and source.health.jumped_back:
             self._odometry.begin_anew()
             for one in self._inputs.values():
@@ -153,7 +151,7 @@ class OdometryNode(SettledNode):
         self._pose.publish(odometry)
 
 
-def _xyz(values) -> dict[str, float]:
+def _xyz(values: Floats) -> dict[str, float]:
     return dict(zip('xyzw', values.tolist(), strict=False))
 
 
@@ -164,7 +162,7 @@ def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:
     return wanted | ({'odometer_right': odometer} if config.odometer.right == 'topic' else {})
 
 
-def main(args=None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node until it is told to end; see ``process.run``."""
     return run('odometry', HELP, OdometryNode, args)
 

@@ -13,6 +13,7 @@ from functools import partial
 
 from rclpy.task import Future
 
+from odocal_ros.calib.result import Calibration
 from odocal_ros.foresee.quantities import words
 from odocal_ros.live import answers, jobs, result_files as outputs
 from odocal_ros.live.automatic_way import AutomaticWay
@@ -88,7 +89,7 @@ class Operation(AutomaticWay):
             self.show_status()
             return True, f'{text}, none is left'
 
-        def take(outcome):
+        def take(outcome: tuple[Calibration, jobs.Paths]) -> None:
             self.session.finish_undo(outcome[0])
             self._take_result(*outcome)
 

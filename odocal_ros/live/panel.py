@@ -56,7 +56,7 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     return found
 
 
-def _of_result(status) -> dict[str, float]:
+def _of_result(status: dict[str, str]) -> dict[str, float]:
     """Return the sigmas of the result, as what is foreseen has them; 0 in a leg, or of none."""
     if status.get('state') == 'recording':
         return {'scale': 0.0, 'yaw': 0.0}
@@ -74,7 +74,7 @@ def number(status: dict[str, str], key: str) -> float:
     return value if isfinite(value) else 0.0
 
 
-def _bars(status) -> Table:
+def _bars(status: dict[str, str]) -> Table:
     grid = Table.grid(padding=(0, 1))
     for label, (share, words) in shares(status).items():
         full = share >= 1.0
@@ -83,7 +83,7 @@ def _bars(status) -> Table:
     return grid
 
 
-def _values(status) -> str:
+def _values(status: dict[str, str]) -> str:
     running = status.get('state') == 'recording'
     prefix = 'estimate_' if running else ''
     keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),

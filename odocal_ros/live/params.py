@@ -12,6 +12,7 @@
 from collections.abc import Iterable
 import difflib
 import math
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -47,8 +48,9 @@ NO_STAMP = 'an unknown date'
 TAKE = 'take the file that ~/save wrote'
 
 
-def _result_defaults(estimates) -> dict:
-    numbers = {PREFIX + name + end: math.nan for name in estimates for end in ('', '_sigma')}
+def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        PREFIX + name + end: math.nan for name in estimates for end in ('', '_sigma')}
     return numbers | {PREFIX + 'legs': 0, PREFIX + 'valid': False, PREFIX + 'stamp': '',
                       PREFIX + 'vehicle': ''}
 
@@ -84,7 +86,7 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
     return result
 
 
-def declare(node: Node, kind: type = Config):
+def declare(node: Node, kind: type = Config) -> Any:
     """
     Declare every setting as a parameter and return the configuration they make, of a kind.
 
@@ -108,7 +110,7 @@ def declare(node: Node, kind: type = Config):
     return with_settings(kind(), values)
 
 
-def _warn_of_unknown(node: Node, settings) -> None:
+def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
     """Name overrides in our groups that are no settings; ROS passes over what nobody declares."""
     groups = {name.partition('.')[0] for name in settings if '.' in name}
     for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public way to them
@@ -150,7 +152,7 @@ def fixed(parameters: list[Parameter]) -> SetParametersResult:
         f'{ours[0]} is taken at the start: start the node anew with it') if ours else '')
 
 
-def declare_results(node: Node, estimates=ESTIMATES) -> Restored | None:
+def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restored | None:
     """Declare ``result.*``; return the saved result that came as overrides at start-up, if any."""
     for name, default in _result_defaults(estimates).items():
         unit = estimates.get(name.removeprefix(PREFIX).removesuffix('_sigma'), '')
@@ -173,7 +175,8 @@ def declare_results(node: Node, estimates=ESTIMATES) -> Restored | None:
     return kept
 
 
-def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict:
+def as_results(calibration: Calibration, stamp: str,
+               vehicle: str = '') -> dict[str, Any]:
     """Return the values of ``result.*`` that a calibration makes."""
     values = dict(RESULTS)
     for name in ESTIMATES:
@@ -186,7 +189,8 @@ def as_results(calibration: Calibration, stamp: str, vehicle: str = '') -> dict:
     return values
 
 
-def restored_from(results: dict, estimates=ESTIMATES) -> Restored | None:
+def restored_from(results: dict[str, Any],
+                  estimates: dict[str, str] = ESTIMATES) -> Restored | None:
     """
     Return the result that ``result.*`` hold, None where they hold none.
 
@@ -202,7 +206,7 @@ def restored_from(results: dict, estimates=ESTIMATES) -> Restored | None:
         raise BadConfig(f'{error}; {TAKE}') from None
 
 
-def _restored(results, names):
+def _restored(results: dict[str, Any], names: dict[str, str]) -> Restored | None:
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
         raise ValueError(f'result.legs: {legs} is no number of legs')
@@ -220,18 +224,18 @@ def _restored(results, names):
                     results[PREFIX + 'vehicle'])
 
 
-def _number(value) -> float:
+def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-def _as_ros(setting: Setting):
+def _as_ros(setting: Setting) -> Any:
     """Return a default rclpy can type: None for an empty list, which it takes for bytes."""
     if setting.kind in ('floats', 'strs'):
         return list(setting.default) or None
     return setting.default
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """Return a parameter's value as settings/config.py knows it: no numpy, no array, no bytes."""
     if isinstance(value, (bool, int, float, str)) or value is None:
         return value

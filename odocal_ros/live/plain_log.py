@@ -9,13 +9,15 @@
 
 """The node's log: lines in which nothing from outside steers the terminal they are read on."""
 
+from typing import Any
+
 from odocal_ros.outside.names import one_line
 
 
 class PlainLog:
     """A logger of rclpy, given one visible line at a time."""
 
-    def __init__(self, logger) -> None:
+    def __init__(self, logger: Any) -> None:
         self._logger = logger
 
     # rclpy tells callers apart by their lines, and wants one severity of each
@@ -35,5 +37,5 @@ class PlainLog:
         """Log what failed."""
         self._logger.error(one_line(text))
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._logger, name)

@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import tempfile
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -25,19 +26,20 @@ from rclpy.utilities import remove_ros_args
 from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live.memory import hold_little
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.outside.names import one_line, said_by
 
 
 class SettledNode(Node):
     """A node that builds itself of its parameters, or says in one line which is wrong."""
 
-    def __init__(self, node_name: str, **kwargs) -> None:
+    def __init__(self, node_name: str, **kwargs: Any) -> None:
         try:
             super().__init__(node_name, **kwargs)
             try:
                 self._build()
             except Exception:
-                self.destroy_node()
+                self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
         except (ParameterException, InvalidQosOverridesError) as error:
             raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
@@ -45,8 +47,13 @@ class SettledNode(Node):
     def _build(self) -> None:
         raise NotImplementedError
 
+    def get_logger(self) -> PlainLog:
+        """Return the node's log."""
+        return PlainLog(super().get_logger())  # type: ignore[no-untyped-call]
 
-def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
+
+def run(name: str, about: str, make: Callable[[], Node],
+        args: list[str] | None = None) -> int:
     """
     Run a node until it is told to end.
 
@@ -99,7 +106,7 @@ def run(name: str, about: str, make: Callable[[], Node], args=None) -> int:
     return code
 
 
-def _init(args) -> None:
+def _init(args: list[str] | None) -> None:
     """Start rclpy; of an error only the exception is left, not rcl's own line on stderr."""
     sys.stderr.flush()
     stderr = os.dup(2)

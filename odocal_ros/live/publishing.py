@@ -10,18 +10,21 @@
 """The side of the node that speaks: status, diagnostics, paths, result parameters."""
 
 from functools import partial
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64, String
 
-from odocal_ros.live import params, result_files as outputs
+from odocal_ros.calib.result import Calibration
+from odocal_ros.live import jobs, params, result_files as outputs
 from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session_view import SessionView
@@ -47,7 +50,7 @@ class Publishing:
         self._diagnostics = publish(DiagnosticArray, '/diagnostics', 1)
         self._hint = publish(String, '~/hint', LATCHED)
         self._plotted = {name: publish(Float64, f'~/{name}', LATCHED) for name in PLOTTED}
-        self._shown: dict = {}        # what these publishers said last
+        self._shown: dict[Publisher, str] = {}        # what these publishers said last
         self._paths = [publish(PathMessage, f'~/path/{name}', LATCHED)
                        for name in ('dead_reckoning', 'reference')]
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -59,15 +62,15 @@ class Publishing:
         """Return whether it is the node itself that sets ``result.*`` just now."""
         return self._setting
 
-    def results(self) -> dict:
+    def results(self) -> dict[str, Any]:
         """Return the ``result.*`` parameters in force."""
         return {name: self._node.get_parameter(name).value for name in params.RESULTS}
 
     def scale_factor(self) -> float:
         """Return the scale factor in force, NaN where none is."""
-        return self._node.get_parameter('result.scale_factor').value
+        return float(self._node.get_parameter('result.scale_factor').value)
 
-    def set_results(self, calibration) -> None:
+    def set_results(self, calibration: Calibration | None) -> None:
         """Set all ``result.*`` at once: one event, never half a result; None: as it began."""
         stamp = no_date(outputs.iso(self._node.get_clock().now().nanoseconds))
         results = self._before
@@ -85,7 +88,7 @@ class Publishing:
         """Let go of a result that came with the start."""
         self._before = dict(params.RESULTS)
 
-    def show_paths(self, messages) -> None:
+    def show_paths(self, messages: jobs.Paths) -> None:
         """Publish dead reckoning and reference of a leg."""
         for publisher, message in zip(self._paths, messages, strict=True):
             publisher.publish(message)
@@ -95,7 +98,7 @@ class Publishing:
         """Return the resolved name of ``~/status``."""
         return self._status.topic_name
 
-    def view(self, recording: Recording, **known) -> SessionView:
+    def view(self, recording: Recording, **known: Any) -> SessionView:
         """Return what is so just now; ``known`` are the fields that are not read off here."""
         config, progress = known['config'], recording.progress
         return SessionView(
@@ -115,7 +118,7 @@ class Publishing:
             self._show(publisher, Float64(data=in_force(now, name)))
         return array
 
-    def _show(self, publisher, message) -> None:
+    def _show(self, publisher: Publisher, message: Float64 | String) -> None:
         """Publish what is new; NaN after NaN is not."""
         if repr(message) != self._shown.get(publisher):
             self._shown[publisher] = repr(message)
@@ -134,7 +137,7 @@ class Publishing:
             for slot, one in recording.inputs.by_slot.items()
             if slot != 'heading' or one.reader is not None]))
 
-    def _array(self, statuses) -> DiagnosticArray:
+    def _array(self, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
         array = DiagnosticArray(status=statuses)
         array.header.stamp = self._node.get_clock().now().to_msg()
         return array

@@ -148,5 +148,5 @@ class Recording:
         """Let go of the clock."""
         self._jumps.unregister()
 
-    def _note_jump(self, _jump) -> None:
+    def _note_jump(self, _jump: object) -> None:
         self._clock_jumped = True  # called from within the clock: only a note is safe

@@ -9,11 +9,12 @@
 
 """What leaves the node besides status and parameters: paths and result files."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import datetime, UTC
 import os
 from pathlib import Path
+from typing import Any
 
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Path as PathMessage
@@ -61,7 +62,7 @@ def output_root(config: Config, node: str) -> Path:
     return Path(config.output.directory or own).expanduser()
 
 
-def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame: str,
+def save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]], imu_frame: str,
          now_ns: int, folders: ResultFolders, force: bool,
          ) -> tuple[Path, str, Callable[[], str] | None]:
     """
@@ -100,6 +101,6 @@ def save(calibration: Calibration, config: Config, inputs: list[dict], imu_frame
     return folder, stays, results.draw if results.has_report else None
 
 
-def marks(legs) -> frozenset[int]:
+def marks(legs: Iterable[LegResult]) -> frozenset[int]:
     """Return the start marks of legs, ns: by them a session knows its legs."""
     return frozenset(leg.start_ns for leg in legs)

@@ -105,9 +105,9 @@ class ResultFolders:
         return self._filed[-1].folder if self._filed else None
 
 
-def _age(name):
+def _age(name: str) -> tuple[str, int]:
     """Return by what names of results are sorted: their time, and which of that second."""
-    when, count = NAME.fullmatch(name).groups()
+    when, count = NAME.findall(name)[0]
     return when, int(count or 1)
 
 

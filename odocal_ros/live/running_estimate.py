@@ -12,21 +12,27 @@
 from functools import partial
 import threading
 import time
+from typing import Any, TypeAlias
 
 from odocal_ros.data.leg import LegRecorder, SLOTS
-from odocal_ros.data.samples import join, take
-from odocal_ros.foresee.forecast import better, Forecast
-from odocal_ros.foresee.foresight import Abandoned, forecast_of
+from odocal_ros.data.samples import join, OdometerForm, take
+from odocal_ros.foresee.forecast import Abandoned, better, Forecast
+from odocal_ros.foresee.foresight import forecast_of
 from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
+from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
 EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
 SHARE = 1 / 60             # of one core is what looking may cost in the long run
+
+Block: TypeAlias = tuple[str, Any]      # slot, rows
+# forecast, faults, seconds of CPU it took, what went wrong
+Look: TypeAlias = tuple[Forecast | None, tuple[Reason, ...], float, Exception | None]
 
 
 class RunningEstimate:
@@ -40,7 +46,7 @@ class RunningEstimate:
     of the leg need not wait for it. What fails here is a note in the log, never more.
     """
 
-    def __init__(self, worker: Worker, log) -> None:
+    def __init__(self, worker: Worker, log: PlainLog) -> None:
         self._worker, self._log = worker, log
         self._newest: Forecast | None = None     # of the part that is driven
         self._earlier: Forecast | None = None    # of those before it
@@ -49,7 +55,7 @@ class RunningEstimate:
         self._thinned: ThinnedLeg | None = None
         self._smoother = SmootherSoFar()
         self._before: LegRecorder | None = None
-        self._fresh: list = []
+        self._fresh: list[Block] = []
         self._over = threading.Event()
         self._start_ns = self._due_ns = 0
         self._config = Config()
@@ -83,13 +89,13 @@ class RunningEstimate:
         self._looking = self._warm = False
         self._pause_until = 0.0
 
-    def _look_from(self, start_ns: int, form) -> None:
+    def _look_from(self, start_ns: int, form: OdometerForm) -> None:
         """Look at what comes after a stamp."""
         self._over, self._start_ns = threading.Event(), start_ns
         self._thinned, self._smoother = ThinnedLeg(form), SmootherSoFar()
         self._due_ns = start_ns + EVERY_NS
 
-    def feed(self, slot: str, block) -> None:
+    def feed(self, slot: str, block: Any) -> None:
         """Remember a block as it went into the recorder."""
         if self._thinned is None:
             return
@@ -128,7 +134,7 @@ class RunningEstimate:
                     self._smoother),
             partial(self._take, self._over))
 
-    def _take(self, over: threading.Event, look, error: Exception | None) -> None:
+    def _take(self, over: threading.Event, look: Look | None, error: Exception | None) -> None:
         if over.is_set():
             return
         self._looking = False
@@ -140,9 +146,9 @@ class RunningEstimate:
             self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')
 
 
-def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns: int,
+def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], start_ns: int,
           config: Config, over: threading.Event, smoother: SmootherSoFar,
-          ) -> tuple[Forecast | None, tuple[Reason, ...], float, Exception | None]:
+          ) -> Look:
     """
     Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.
 
@@ -163,7 +169,8 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list, start_ns
     return forecast, found, time.thread_time() - begin - smoother.once_s, failure
 
 
-def _bring_up_to_date(thinned, before, fresh, over) -> None:
+def _bring_up_to_date(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block],
+                      over: threading.Event) -> None:
     for slot in SLOTS:
         if over.is_set():
             raise Abandoned

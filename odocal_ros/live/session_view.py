@@ -11,6 +11,7 @@
 
 from dataclasses import dataclass, field
 from math import nan
+from typing import Any
 
 from odocal_ros.foresee.ability import Ability
 from odocal_ros.foresee.forecast import Forecast
@@ -29,7 +30,7 @@ class SessionView:
     doubled: list[str] = field(default_factory=list)     # topics with several publishers
     clocks: list[tuple[str, float]] = field(default_factory=list)
     rates_hz: dict[str, float] = field(default_factory=dict)
-    results: dict = field(default_factory=dict)  # result.* parameters
+    results: dict[str, Any] = field(default_factory=dict)  # result.* parameters
     restored: str = ''                           # when they were made, of a saved result
     distance_m: float = 0.0
     duration_s: float = 0.0

@@ -10,6 +10,7 @@
 """What ``~/status`` and ``/diagnostics`` say: keys for machines, a sentence for people."""
 
 import math
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -23,7 +24,7 @@ from odocal_ros.live.guidance import (
     seconds_to_stand,
 )
 from odocal_ros.live.health import Health
-from odocal_ros.live.session import State
+from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code, Verdict
 
@@ -89,7 +90,7 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
 def in_force(now: SessionView, name: str) -> float:
     """Return a value or a sigma: of the running estimate in a leg, else of the result."""
     if now.session.state is not State.RECORDING:
-        return now.results[f'result.{name}']
+        return float(now.results[f'result.{name}'])
     estimates = now.forecast.estimates if now.forecast else {}
     estimate = estimates.get(name.removesuffix('_sigma'))
     if estimate is None or estimate.value is None:
@@ -98,7 +99,7 @@ def in_force(now: SessionView, name: str) -> float:
     return math.nan if found is None else float(found)
 
 
-def level(now: SessionView) -> bytes:
+def level(now: SessionView) -> Any:
     """Return STALE before anything came, ERROR for what needs the operator, WARN for doubts."""
     state = now.session.state
     if state in (State.FAILED, State.REJECTED) or now.lost_cause:
@@ -139,13 +140,13 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
                                    _unused(session), *now.doubled, *troubles)))
 
 
-def _changes(session) -> list[str]:
+def _changes(session: Session) -> list[str]:
     """Return what is to be said of a scale that changed between legs."""
     reasons = session.calibration.reasons if session.calibration else ()
     return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
 
 
-def _unused(session) -> str:
+def _unused(session: Session) -> str:
     """Return why the last leg that began by itself does not count."""
     why = session.unused
     return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
@@ -167,7 +168,7 @@ def _reason_codes(now: SessionView) -> str:
     return ','.join(r.code.name for r in calibration.reasons) if calibration else ''
 
 
-def _bare(value, places: int | None = None) -> str:
+def _bare(value: object, places: int | None = None) -> str:
     """Return a value as PlotJuggler reads it: a number without unit, to its last digit or less."""
     if not isinstance(value, float):
         return str(value)

@@ -45,7 +45,7 @@ class StatusListener:
     def __enter__(self) -> 'StatusListener':
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -12,6 +12,7 @@
 from collections.abc import Callable
 import difflib
 from functools import partial
+from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock
@@ -21,6 +22,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.live.definitions import message_class
@@ -60,11 +62,11 @@ class Input:
         self.trouble = ''
         self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
         self.frame = ''        # of the Imu's header, once a message has come
-        self.publishers: list = []
+        self.publishers: list[TopicEndpointInfo] = []
         self.meant: list[str] = []     # topics that others publish, where nobody does this one
         self._failed = 0
         self._node = node
-        self._deserialize: Callable | None = None
+        self._deserialize: Callable[[bytes], Any] | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.waiting = WaitingMessages(node)
 
@@ -139,7 +141,7 @@ class Input:
             f'{"reliable" if reliable else "best effort"}')
 
     @staticmethod
-    def _counts_increments(reader) -> bool:
+    def _counts_increments(reader: Reader) -> bool:
         # a lost increment is travel lost for good, so such a sender is asked to repeat itself
         return reader.form is not None and reader.form.quantity == 'increment'
 
@@ -152,7 +154,8 @@ class Input:
         return ([raw for raw, _ in pending],
                 [i['source_timestamp'] or i['received_timestamp'] for _, i in pending])
 
-    def decode(self, raws: list[bytes], received_ns: list[int], max_gap_s: float | None) -> list:
+    def decode(self, raws: list[bytes], received_ns: list[int],
+               max_gap_s: float | None) -> list[tuple[str, Any]]:
         """Return (slot, block) pairs of messages; those that cannot be read are counted."""
         reader, deserialize = self.reader, self._deserialize
         if reader is None or deserialize is None:

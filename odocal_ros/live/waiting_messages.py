@@ -32,12 +32,13 @@ class Gate(MutuallyExclusiveCallbackGroup):
     """A callback group that the executor leaves alone while it is shut."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.is_open = False
 
     def can_execute(self, entity: object) -> bool:
         """Return whether the executor may wait for the entity."""
-        return self.is_open and super().can_execute(entity)
+        return self.is_open and bool(
+            super().can_execute(entity))  # type: ignore[no-untyped-call]
 
 
 class WaitingMessages:

@@ -9,13 +9,15 @@
 
 """``odocal watch``: the status of a running node as a panel in the terminal."""
 
+from argparse import ArgumentParser, Namespace
+
 from odocal_ros.errors import BadUsage
 
 NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
          'rclpy': "source ROS 2 Jazzy, or pip install 'odocal_ros[ros]'"}
 
 
-def add_arguments(parser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
@@ -23,7 +25,7 @@ def add_arguments(parser) -> None:
                         help='show the first status that comes and end')
 
 
-def run(args) -> int:
+def run(args: Namespace) -> int:
     """Show the panel until Ctrl-C."""
     try:
         from rich.live import Live

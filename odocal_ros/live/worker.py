@@ -12,10 +12,16 @@
 from collections.abc import Callable
 import queue
 import threading
+from typing import Any, TypeAlias
 
 from odocal_ros.live.memory import give_back
 
-GRACE_S, FILES_S = 1.0, 4.0      # launch asks a second time, and harder, after 5 s
+# s that a node told to end waits, for a computation and for files: launch asks again, and harder,
+# after 5 s
+GRACE_S, FILES_S = 1.0, 4.0
+Job: TypeAlias = Callable[[], Any]
+Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
+Outcome: TypeAlias = tuple[Then, Any, Exception | None]
 
 
 class Worker:
@@ -28,8 +34,8 @@ class Worker:
     """
 
     def __init__(self) -> None:
-        self._jobs: queue.Queue = queue.Queue()
-        self._done: queue.SimpleQueue = queue.SimpleQueue()
+        self._jobs: queue.Queue[tuple[Job, Then] | None] = queue.Queue()
+        self._done: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name='odocal_worker', daemon=True)
         self._thread.start()
 
@@ -38,8 +44,7 @@ class Worker:
         """Return whether a job is under way or waits."""
         return self._jobs.unfinished_tasks > 0
 
-    def submit(self, job: Callable[[], object],
-               then: Callable[[object, Exception | None], None]) -> None:
+    def submit(self, job: Job, then: Then) -> None:
         """Run ``job()``; ``poll`` will call ``then(result, error)`` with one of them None."""
         self._jobs.put((job, then))
 
@@ -63,7 +68,7 @@ class Worker:
             self._jobs.task_done()
 
 
-def _outcome(job, then):
+def _outcome(job: Job, then: Then) -> Outcome:
     """Do a job; every failure of it is an answer to the operator."""
     try:
         return then, job(), None

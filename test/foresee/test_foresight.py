@@ -378,12 +378,12 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
     monkeypatch.setattr(watch, 'time', clock)
     look, now_ns = watched(drive, config, worker, Log())
-    for _ in range(120):
+    for _ in range(320):
         clock.now += 1.0
         now_ns += EVERY_NS
         look.look(now_ns)
         finished(worker)
-    # the first comes with imports and goes free, the others 20 s apart: at 1, 2, 22, ... 102 s
+    # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s
     assert len(looks) == 7
 
 
