@@ -30,7 +30,7 @@ from odocal_ros.errors import OdocalError  # noqa: E402
 from odocal_ros.foresee.foresight import forecast_of  # noqa: E402
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar  # noqa: E402
 from odocal_ros.foresee.thinned_leg import ThinnedLeg  # noqa: E402
-from odocal_ros.live.running_estimate import EVERY_NS, SHARE  # noqa: E402
+from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, LOOK_SHARE  # noqa: E402
 from odocal_ros.pipeline.calibrate import calibrate  # noqa: E402
 from odocal_ros.settings.config import Config, with_settings  # noqa: E402
 from odocal_ros.sim.scenarios import SimOptions, simulate  # noqa: E402
@@ -58,11 +58,11 @@ def show(leg, config, seconds):
     """Print all looks at a leg; return the last forecast."""
     print('   leg s   look s CPU   of that once   next after s   scale sigma ppm   yaw sigma deg')
     state = ThinnedLeg(leg.form), SmootherSoFar()
-    before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + EVERY_NS, [], 0.0, -1.0
+    before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + LOOK_PERIOD_NS, [], 0.0, -1.0
     while before_ns < leg.stop_ns:
         seen, cost, once = look(leg, config, state, before_ns, now_ns)
         total += cost
-        pauses.append(max(EVERY_NS * 1e-9, cost + (cost - once) / SHARE))
+        pauses.append(max(LOOK_PERIOD_NS * 1e-9, cost + (cost - once) / LOOK_SHARE))
         t = (now_ns - leg.start_ns) * 1e-9
         if seen is not None and (t > shown + seconds / LINES or now_ns >= leg.stop_ns):
             shown = t

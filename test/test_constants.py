@@ -17,7 +17,7 @@ import odocal_ros
 
 PACKAGE = Path(odocal_ros.__file__).parent
 ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'planning', 'foresee',
-         'apply')
+         'apply', 'live')
 # where a vector's unknowns lie: two vectors may hold the same quantity
 LAYOUTS = ('calib/smoother/state.py', 'calib/wheels/model.py', 'apply/errors.py')
 

@@ -26,14 +26,15 @@ P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # what it tells, of a body that is nearly level: no heading
 BY_REST = np.r_[3:9]
-# m/sqrt(m) along, left, up: slip and slide of any road
+# judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
-HIDDEN_IN_GAP = 0.1    # rad/s that may hide in a gap of the Imu
-SHAKING = 0.4    # m/s^2 of driving that a second of odometer does not tell, and more seconds
-# rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the vehicle: 11
-# deg/h that stay alike for half a minute or so
+HIDDEN_IN_GAP = 0.1    # rad/s; judgement: of a turn that may hide in a gap of the Imu
+# m/s^2; judgement: of driving, that a second of odometer, or more, does not tell
+SHAKING = 0.4
+# physical: rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the
+# vehicle: 11 deg/h that stay alike for half a minute or so
 EARTH_LEFT = 6e-4
-GRAVITY = 9.81    # m/s^2; its last digits tilt nothing
+GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
 
 
 class Errors:

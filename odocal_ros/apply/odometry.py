@@ -40,10 +40,9 @@ from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FASTEST
 
-LOOK = 1.0           # s between corrections
-SPEED_OVER = 0.2     # s that a speed is taken over
-SILENT = 10.0        # s without odometer, after which attitude goes on alone
-HOLE = 0.1           # s without Imu that hide motion
+# judgement, all in s: between corrections; that a speed is taken over; without odometer, after
+# which attitude goes on alone; without Imu, that hide motion
+CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
 
 
 class Odometry:
@@ -130,7 +129,7 @@ class Odometry:
         last = max(last, at + 1)
         if last > len(t) - 2:            # a cubic needs the sample beyond
             return None
-        if t[last] > self.wheels.newest() and t[-1] - t[last] < SILENT:
+        if t[last] > self.wheels.newest() and t[-1] - t[last] < ODOMETER_SILENCE:
             return None
         return last
 
@@ -156,11 +155,11 @@ class Odometry:
         gaps = np.diff(t)
         C_mid = C[len(C) // 2]
         self.errors.grow(T, C_mid, way_n, C_mid @ turn_b, C_mid @ self.vehicle.C_vb.T,
-                         self.wheels.doubt(t[0], t[-1]), gaps[gaps > HOLE].sum())
+                         self.wheels.doubt(t[0], t[-1]), gaps[gaps > IMU_HOLE].sum())
         if lost > self.wheels.quantum:
             self.errors.lost(lost)
         f = imu.f_b[at:last + 1] - self.accel_bias
-        self._felt &= bool(np.isfinite(f).all()) and not (gaps > HOLE).any()
+        self._felt &= bool(np.isfinite(f).all()) and not (gaps > IMU_HOLE).any()
         f_n = np.einsum('kij,kj->ki', C, f)
         self._felt_n = self._felt_n + gaps @ (f_n[:-1] + f_n[1:]) / 2
         self._turn_b = self._turn_b + turn_b
@@ -171,17 +170,17 @@ class Odometry:
     def _velocity_n(self, t: float) -> Floats:
         """Return the velocity of the Imu in n, by the odometer's last rows."""
         v, C_nb = self.vehicle, matrix_from_quat(self.q)
-        now, before = self.wheels.at(np.array([t, t - SPEED_OVER]))
+        now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
         arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
         rate = self.imu.w_b[self.imu.at] - self.bias
         velocity: Floats = C_nb @ (
-            v.forward_b * (now - before) / SPEED_OVER + np.cross(rate, arm_b))
+            v.forward_b * (now - before) / SPEED_SPAN + np.cross(rate, arm_b))
         return velocity
 
     def _look(self) -> None:
         """Correct tilt and gyro bias, a second after the last time."""
         T = self._t - self._t_look
-        if T < LOOK - 1e-6:
+        if T < CORRECTION_PERIOD - 1e-6:
             return
         velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
         w = np.concatenate(self._w_look)
@@ -192,7 +191,7 @@ class Odometry:
         standing = resting and self._rested
         if self.config.levelling and heard and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
-            noise = 2 * self.wheels.quantum / SPEED_OVER / T
+            noise = 2 * self.wheels.quantum / SPEED_SPAN / T
             self._correct(self.errors.by_gravity(
                 matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise)))
         if self.config.levelling and standing:
@@ -231,4 +230,4 @@ class Odometry:
         """Forget what lies behind."""
         if last > 2000:
             self.imu.drop(last - 2)
-            self.wheels.forget(self._t - 2 * LOOK)
+            self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)

@@ -25,10 +25,10 @@ from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import Grade
 
-LOOKED_AT = 2.0      # s of samples that a start is taken from
-TILT_GIVEN = 0.01    # rad of an attitude from outside
-ROAD_TILT = 0.1      # rad of a road, and of a vehicle that moves while it is levelled
-UNDER_WAY = 2.0      # m/s^2 that a mean of so long may hold of braking
+START_SPAN = 2.0           # s; judgement: of samples that a start is taken from
+GIVEN_TILT_SIGMA = 0.01    # rad; judgement: of an attitude from outside
+ROAD_TILT_SIGMA = 0.1      # rad; physical: a road of 10 %
+BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may hold of braking
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
     row = int(np.searchsorted(imu.t, wheels.oldest()))
     if config.start.attitude:
         return _given(row, vehicle, config, grade) if len(imu.t) > row else None
-    end = int(np.searchsorted(imu.t, max(wheels.oldest(), imu.t[0]) + LOOKED_AT))
+    end = int(np.searchsorted(imu.t, max(wheels.oldest(), imu.t[0]) + START_SPAN))
     if end >= len(imu.t) or wheels.newest() < imu.t[end]:
         return None
     t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
@@ -68,7 +68,7 @@ def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Sta
     start = config.start
     q = np.asarray(start.attitude)
     earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))
-    errors = Errors(grade, vehicle, TILT_GIVEN, grade.gyro_bias, not earth.any())
+    errors = Errors(grade, vehicle, GIVEN_TILT_SIGMA, grade.gyro_bias, not earth.any())
     return Start(row, q / np.linalg.norm(q), np.array(start.gyro_bias), earth, errors)
 
 
@@ -86,7 +86,7 @@ def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehi
     else:
         known = vehicle.gyro_bias is not None
         bias, sigma = (vehicle.gyro_bias if known else np.zeros(3)), grade.gyro_bias
-    errors = Errors(grade, vehicle, ROAD_TILT, sigma)
+    errors = Errors(grade, vehicle, ROAD_TILT_SIGMA, sigma)
     if felt:        # so that the tilt hangs on the accelerometer's bias
-        errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else UNDER_WAY)
+        errors.by_gravity(C_nb, np.zeros(3), length, 0.0 if resting else BRAKING_SIGMA)
     return Start(row, quat_from_matrix(C_nb), bias, np.zeros(3), errors)

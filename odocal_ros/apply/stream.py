@@ -15,10 +15,9 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import ImuSamples
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
-WILD_RATE = 100.0    # rad/s: no turn rate
-BACK_NS = 10**9      # stamps that step back by more,
-BACK_ROWS = 3        # so many in turn, are a time that began anew
+WILD_TURN_RATE = 100.0    # rad/s; physical: more than any gyro of a vehicle measures
 
 
 class ImuStream:
@@ -44,15 +43,15 @@ class ImuStream:
     def feed(self, block: ImuSamples) -> bool:
         """Take rows; return False, nothing taken, where their time has begun anew."""
         stamp = block.stamp_ns + self._offset_ns
-        good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD_RATE).all(axis=1)
+        good = (block.stamp_ns > 0) & (np.abs(block.w_i) < WILD_TURN_RATE).all(axis=1)
         newest = self.stamp_ns[-1] if len(self.stamp_ns) else 0
         for k in np.flatnonzero(good):
             if stamp[k] <= newest:
                 good[k] = False
-                self._stale = self._stale + 1 if stamp[k] < newest - BACK_NS else self._stale
+                self._stale = self._stale + 1 if stamp[k] < newest - TIME_ANEW_NS else self._stale
             else:
                 newest, self._stale = stamp[k], 0
-        if self._stale >= BACK_ROWS:
+        if self._stale >= TIME_ANEW_ROWS:
             return False
         if not good.any():
             return True

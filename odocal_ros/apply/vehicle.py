@@ -22,7 +22,8 @@ from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.settings.apply_config import ApplyConfig
 
-UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05    # rad, 1 sigma of what no calibration determined
+# rad, 1 sigma of what no calibration determined; judgement: 5 and 3 deg of a mounting by eye
+UNKNOWN_YAW, UNKNOWN_PITCH = 0.087, 0.05
 SIDES = ('scale_factor_left', 'scale_factor_right')
 
 

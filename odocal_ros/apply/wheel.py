@@ -22,12 +22,12 @@ import numpy as np
 from odocal_ros.data.arrays import FloatOrFloats, Floats, Values
 from odocal_ros.data.samples import OdometerForm
 
-SPEED_TIME = 0.5                       # s over which the speed beside a row is taken
-# m/s that a speed may change by, s that a burst of stamps may hide
+SPEED_TIME = 0.5    # s; judgement: over which the speed beside a row is taken
+# judgement: m/s that a speed may change by, s that a burst of stamps may hide
 SPEED_CHANGE, STAMP_BURST = 5.0, 0.25
-SURE_ROWS = 5                          # rows before any is doubted
-MOST_REFUSED = 2                       # rows in turn; a third is believed
-MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals: messages are missing
+# judgement: rows before any is doubted; rows in turn that are refused, the next is believed
+SURE_ROWS, MOST_REFUSED = 5, 2
+MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals; judgement: messages are missing
 
 
 class Wheel:

@@ -18,7 +18,7 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.nav.standstill import REST_TRAVEL
 from odocal_ros.settings.apply_config import ApplyConfig
 
-STILL_COUNTS = 1.5    # counts that a wheel at rest may still show
+STILL_COUNTS = 1.5    # physical: counts that a wheel at rest may still show
 SIDES = ('odometer', 'odometer_right')
 Rows = tuple[str, OdometerSamples, OdometerForm]
 

@@ -27,8 +27,8 @@ from odocal_ros.planning.drive import from_rates
 from odocal_ros.screening.glitches import Oriented, oriented
 from odocal_ros.settings.config import Config, with_settings
 
-EXACT_HEADING = 1e-6      # rad, of a heading that is said to be known exactly
-COURSE_FIX_SIGMA = 1.5    # m, sigma of a fix that a course is taken to come from
+EXACT_HEADING = 1e-6      # rad; judgement: of a heading that is said to be known exactly
+COURSE_FIX_SIGMA = 1.5    # m; physical: of a single receiver, that a course may come from
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
            'imu_orientation': "the Imu's orientation", 'gyrocompass': 'the gyrocompass'}
 ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside

@@ -17,10 +17,10 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import Samples
 from odocal_ros.screening.clocks import CLOCK_APART, remedy
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import DAY_NS
 
-IMU_BLOCKS = 40       # newest, that rows of others are laid beside: some seconds
-CLOCK_ROWS = 10       # newest of a topic that its clock is told by
-DAY_S = 86400.0
+IMU_BLOCKS = 40       # judgement: newest, that rows of others are laid beside: some seconds
+CLOCK_ROWS = 10       # judgement: newest of a topic that its clock is told by
 
 
 class Clocks:
@@ -84,5 +84,5 @@ def clocks_differ(clocks: list[tuple[str, float]]) -> str:
 
 
 def _apart(seconds: float) -> str:
-    days = seconds / DAY_S
+    days = seconds / (DAY_NS * 1e-9)
     return f'{seconds:.3g} s' if days < 2 else f'{days:.0f} days'

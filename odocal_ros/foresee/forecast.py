@@ -15,8 +15,11 @@ import math
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
-PERCENT_FROM = 0.01    # relative sigma from which it is said in per cent
-FARTHEST = 2e4         # m: who must drive on for more needs something else
+PERCENT_FROM = 0.01       # judgement: relative sigma from which it is said in per cent
+FARTHEST_M = 2e4          # judgement: who must drive on for more needs something else
+# judgement: standstill at an end that is foreseen and asked for; it levels well and tells the gyro
+# bias
+REST_FORESEEN_S = 10.0
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 

@@ -10,8 +10,8 @@
 """
 Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
 
-Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN in all, with the
-start mark and the way as recorded. Shown to the operator, never part of a result.
+Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN_S in all, with
+the start mark and the way as recorded. Shown to the operator, never part of a result.
 """
 
 from collections.abc import Callable
@@ -26,14 +26,23 @@ from odocal_ros.data.leg import Leg
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData
 from odocal_ros.foresee.ability import stated_variance, with_heading
-from odocal_ros.foresee.forecast import Abandoned, FARTHEST, Forecast, Prospect
+from odocal_ros.foresee.forecast import (
+    Abandoned,
+    FARTHEST_M,
+    Forecast,
+    Prospect,
+    REST_FORESEEN_S,
+)
 from odocal_ros.foresee.leg_so_far import screened_in_cells
 from odocal_ros.foresee.smoother_forecast import (
     gives_all,
     look,
     nothing_foreseen,
     ONLY,
+    PITCH,
+    SCALE,
     with_running,
+    YAW,
 )
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.wheels_so_far import sources_of, with_wheels
@@ -45,11 +54,9 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
-SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
-REST_FORESEEN = 10.0    # s of standstill at the end that is foreseen
-MOST_ROWS = 1000        # of the drive that a prediction is made from
-NEAR_NS = 1_000_000_000
-NEWEST = 100    # orientations that tell how good they claim to be
+DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from
+# judgement: up to so long after the start mark so many tell how good orientations claim to be
+ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
 
@@ -130,8 +137,8 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
         sigma = now.sigma(parameter)
         metres = 0.0 if sigma is not None and sigma <= asked else None
         if metres is None and not why:
-            metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST)
-            why = f'no {FARTHEST / 1000:.0f} km more bring it to what is asked'
+            metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST_M)
+            why = f'no {FARTHEST_M / 1000:.0f} km more bring it to what is asked'
         return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
 
     limits = config.verdict
@@ -161,7 +168,7 @@ def _yaw_limit(now: Prediction, asked: float) -> str:
 def _heading_found(leg: Leg, config: Config) -> Config:
     """Return config with the heading source, and its sigma, that the alignment will find."""
     def before(stamp_ns: Ints) -> Ints:
-        return np.flatnonzero(stamp_ns <= leg.start_ns + NEAR_NS)[-NEWEST:]
+        return np.flatnonzero(stamp_ns <= leg.start_ns + ORIENTATION_NS)[-ORIENTATION_ROWS:]
 
     return with_heading(config, {
         'heading_topic': stated_variance(take(leg.heading, before(leg.heading.stamp_ns))),
@@ -181,19 +188,19 @@ def _thinned(drive: PlannedDrive) -> PlannedDrive:
     """Return a drive of not many rows; where it stops and starts it stays as it is."""
     rest = np.abs(drive.speed) <= REST_SPEED
     change = np.flatnonzero(np.diff(rest))
-    if len(change) > MOST_ROWS // 4:
+    if len(change) > DRIVE_ROWS // 4:
         change = change[:0]
-    every = np.linspace(0, len(rest) - 1, min(len(rest), MOST_ROWS - 2 * len(change))).astype(int)
+    every = np.linspace(0, len(rest) - 1, min(len(rest), DRIVE_ROWS - 2 * len(change))).astype(int)
     keep = np.unique(np.concatenate([every, change, change + 1]))
     return replace(drive, **{name: getattr(drive, name)[keep]
                              for name in ('t', 'speed', 'yaw', 'slope')})
 
 
 def _at_rest(drive: PlannedDrive, wanted: Callable[[], bool]) -> DriveSoFar:
-    """Return the drive with as much rest at its end as makes REST_FORESEEN seconds."""
+    """Return the drive with as much rest at its end as makes REST_FORESEEN_S seconds."""
     moving = np.flatnonzero(np.abs(drive.speed) > REST_SPEED)
     rested = drive.duration - float(drive.t[moving[-1]]) if moving[-1] < len(drive.t) - 1 else 0.0
-    if rested < REST_FORESEEN:
-        drive = drive.until(drive.duration, REST_FORESEEN - rested)
+    if rested < REST_FORESEEN_S:
+        drive = drive.until(drive.duration, REST_FORESEEN_S - rested)
     return DriveSoFar(drive.t, drive.speed, drive.yaw, drive.slope, drive.latitude,
                       drive.longitude, drive.height, wanted)

@@ -17,8 +17,8 @@ from odocal_ros.data.samples import join, OdometerForm, OdometerSamples, take
 from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
 SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # after which no row to come moves one
-BESIDE_NS = 3 * SETTLED_NS          # of rows before, that tell the rhythm
-COUNT = OdometerForm('cumulative', 0, '')
+RHYTHM_NS = 3 * SETTLED_NS       # judgement: of rows before, that tell the rhythm
+UNROLLED = OdometerForm('cumulative', 0, '')     # a count that never rolls over
 
 
 class LateSoFar:
@@ -34,7 +34,7 @@ class LateSoFar:
         settled = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[-1] - SETTLED_NS))
         settled = max(settled, self._given)
         out = take(_on_time(rows), slice(self._given, settled))
-        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - BESIDE_NS))
+        first = int(np.searchsorted(rows.stamp_ns, rows.stamp_ns[settled] - RHYTHM_NS))
         self._rows, self._given = take(rows, slice(first, None)), settled - first
         return out
 
@@ -46,5 +46,6 @@ class LateSoFar:
 
 def _on_time(rows: OdometerSamples) -> OdometerSamples:
     since_s = (rows.stamp_ns - rows.stamp_ns[0]) * 1e-9
-    true_ns = rows.stamp_ns[0] + np.rint(on_time(rows, since_s, COUNT, []) * 1e9).astype(np.int64)
+    true_s = on_time(rows, since_s, UNROLLED, [])
+    true_ns = rows.stamp_ns[0] + np.rint(true_s * 1e9).astype(np.int64)
     return replace(rows, stamp_ns=np.maximum.accumulate(true_ns))

@@ -15,6 +15,7 @@ the Imu is seen in the stamps themselves, at once, and is never forgotten.
 """
 
 from functools import lru_cache
+import math
 
 import numpy as np
 
@@ -23,10 +24,9 @@ from odocal_ros.data.samples import ImuSamples
 from odocal_ros.pipeline.calibrate import faults, Screened, screened
 from odocal_ros.reasons import Reason
 from odocal_ros.screening.screen import imu_gap
-from odocal_ros.settings.config import Config, with_settings
+from odocal_ros.settings.config import Config, SETTINGS, with_settings
 
-MOST_GAP = 10.0      # s, of the setting leg.max_gap
-SILENT_TIME = 0.9    # what comes in no order may be as late; said within a second
+SILENT_TIME = 0.9    # s; judgement: what comes in no order may be as late; said within a second
 
 
 class ImuGaps:
@@ -75,5 +75,5 @@ def _with_cells(leg: Leg, config: Config) -> Config:
     """Return config with cells to be no gaps of the Imu."""
     cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
         else 0.0
-    limit_s = min(config.leg.max_gap + 2 * cell_s, MOST_GAP)
+    limit_s = min(config.leg.max_gap + 2 * cell_s, SETTINGS['leg.max_gap'].high or math.inf)
     return with_settings(config, {'leg.max_gap': limit_s})

@@ -28,9 +28,9 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import FASTEST
 from odocal_ros.settings.nominal import nominal_scale
 
-SPEED_NS = 1_000_000_000         # speeds are taken over that long, or longer
-STANDS_S = 0.5                   # without a count: the vehicle stands
-SHORT_REST_NS = 1_000_000_000    # a shorter pause is no standstill
+SPEED_SPAN_NS = 10**9       # judgement: speeds are taken over that long, or longer
+STANDING_S = 0.5            # judgement: without a count, the vehicle stands
+SHORTEST_REST_NS = 10**9    # judgement: a shorter pause is no standstill
 
 
 def known_scale(config: Config, form: OdometerForm | None, found: float = np.nan) -> float:
@@ -67,13 +67,13 @@ class Travel:
         for total, stamp in zip(path, stamps, strict=True):
             if total - self._anchor > self._rows.still:
                 rest_ns = int(stamp) - self.moved_ns if self.moved_ns else 0
-                if rest_ns > SHORT_REST_NS:
+                if rest_ns > SHORTEST_REST_NS:
                     self._rest = rest_ns * 1e-9, int(stamp)
                 self._anchor, self.moved_ns = total, int(stamp)
         self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
         self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
         before, since_ns = self._since
-        if abs(self.newest_ns - since_ns) >= SPEED_NS:    # rows of a burst tell no speed
+        if abs(self.newest_ns - since_ns) >= SPEED_SPAN_NS:    # rows of a burst tell no speed
             if since_ns:
                 self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
             self._since = self.total, self.newest_ns
@@ -111,7 +111,7 @@ class FixPath:
                             (lon - self._anchor[1]) * normal * np.cos(lat))
             apart_ns = stamp - self._anchor[2]
             noise = 3 * np.sqrt(variance) if variance > 0 else 0.0
-            if step > max(3.0, noise) and apart_ns >= SPEED_NS:
+            if step > max(3.0, noise) and apart_ns >= SPEED_SPAN_NS:
                 self.total += float(step)
                 self.top = max(self.top, float(step) * 1e9 / apart_ns)
                 self._anchor = (lat, lon, stamp)
@@ -140,7 +140,7 @@ class Progress:
             self._travel.setdefault(slot, Travel(form)).feed(block, self._scale)
         elif slot == 'fix':
             travel = self._travel.get('odometer')
-            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDS_S
+            moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDING_S
             self._path.feed(block, config.gnss.min_status, moving)
 
     def heard_before(self, preroll_s: float) -> Heard:

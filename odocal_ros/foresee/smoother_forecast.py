@@ -17,7 +17,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import ABOUT, choose, deciding
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.foresee.forecast import FARTHEST, Forecast, Prospect
+from odocal_ros.foresee.forecast import FARTHEST_M, Forecast, Prospect
 from odocal_ros.foresee.smoother_so_far import Running, SmootherSoFar
 from odocal_ros.foresee.wheels_so_far import sources_of
 from odocal_ros.reasons import Verdict
@@ -25,11 +25,12 @@ from odocal_ros.settings.config import Config
 
 ONLY = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
-BRISK_FORCE = 1.5    # m/s^2, of an ordinary stop and start
-SLOWEST_TOP = 5.0    # m/s that one would do them from
-# the way goes with the sigma to the power of minus this: with white errors of the fixes, with slow
-BY_WAY, BY_WAY_SLOW = 1.0, 2.0
-FAR_TOO_FEW = 50    # stops and starts: nobody does so many
+# physical: m/s^2 of an ordinary stop and start, m/s that one would do it from at least
+STOP_FORCE, STOP_SPEED = 1.5, 5.0
+# physical: the way goes with the sigma to the power of minus this: with white errors of the
+# fixes, with slow
+WAY_POWER, WAY_POWER_SLOW = 1.0, 2.0
+MOST_STOPS = 50    # judgement: more stops and starts nobody does
 
 
 def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
@@ -92,12 +93,12 @@ def _scale(running: Running, asked: float) -> Prospect:
     e = running.method.estimates[SCALE]
     slow = running.method.details['noise']['correlation_time'] > 0
     sigma = float(running.sigmas[0])
-    metres = _metres(running, sigma / asked, BY_WAY_SLOW if slow else BY_WAY)
+    metres = _metres(running, sigma / asked, WAY_POWER_SLOW if slow else WAY_POWER)
     now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
     return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
-                    f'no {FARTHEST / 1000:.0f} km more bring it to what is asked', now)
+                    f'no {FARTHEST_M / 1000:.0f} km more bring it to what is asked', now)
 
 
 def _yaw(running: Running, asked: float) -> Prospect:
@@ -106,9 +107,9 @@ def _yaw(running: Running, asked: float) -> Prospect:
     sigma = float(running.sigmas[1])
     ratio, lack = sigma / asked, ''
     if ratio > 1:
-        one = 2 * BRISK_FORCE * max(running.speed, SLOWEST_TOP)
+        one = 2 * STOP_FORCE * max(running.speed, STOP_SPEED)
         stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
-        often = 'often' if stops > FAR_TOO_FEW else f'{stops} time{"s" * (stops > 1)}'
+        often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
         lack = f'stop and start {often}, or turn as often, for the yaw'
     now = '' if e.value is None or e.sigma is None else _digits(
         math.degrees(e.value), math.degrees(e.sigma))
@@ -119,7 +120,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
 def _metres(running: Running, ratio: float, power: float) -> float | None:
     """Return the metres more that make a sigma so many times better, driven as so far."""
     metres = running.distance * (max(ratio, 1.0)**power - 1)
-    return metres if metres <= FARTHEST else None
+    return metres if metres <= FARTHEST_M else None
 
 
 def _digits(value: float, sigma: float) -> str:

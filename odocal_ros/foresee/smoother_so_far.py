@@ -30,7 +30,7 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
 
-MOVING = 0.5    # m/s over a keyframe's step, from which a speed counts as one of the drive
+DRIVING_SPEED = 0.5    # m/s; judgement: a slower step between keyframes tells no usual speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ def _refuse_unusable(found: Iterable[Reason]) -> None:
 def _running(so_far: SoFar) -> Running:
     state = so_far.state
     T, steps = np.diff(state.t), np.linalg.norm(np.diff(state.p_n, axis=0), axis=1)
-    moving = steps > MOVING * T
+    moving = steps > DRIVING_SPEED * T
     gained = np.diff(state.v_n[:, :2], axis=0)
     return Running(so_far.method, so_far.sigmas, max(float(steps.sum()), 1.0),
                    float((gained**2).sum(axis=1) @ (1 / T)),

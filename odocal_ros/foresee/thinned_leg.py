@@ -31,11 +31,12 @@ from odocal_ros.data.samples import (
     SomeSamples,
     take,
 )
-from odocal_ros.foresee.late_so_far import LateSoFar
+from odocal_ros.foresee.late_so_far import LateSoFar, UNROLLED
 
-CELL_NS = 100_000_000
-MOST_CELLS = 16_000    # cells of a topic: 26 minutes of 0.1 s, pre-roll and all
-FLOATS = OdometerForm('cumulative', 0, '')
+# judgement: a tenth of what keyframes are apart; of a topic as many as 26 minutes of them,
+# pre-roll and all, so that a look has a bound
+FIRST_CELL_NS = 100_000_000
+MOST_CELLS = 16_000
 
 
 class ThinnedLeg:
@@ -64,7 +65,7 @@ class ThinnedLeg:
             if not len(samples.stamp_ns):
                 return
         rows = join([self._open[slot], samples]) if slot in self._open else samples
-        width_ns = self._width_ns.setdefault(slot, CELL_NS)
+        width_ns = self._width_ns.setdefault(slot, FIRST_CELL_NS)
         cell = rows.stamp_ns // width_ns
         over = int(np.flatnonzero(np.diff(cell))[-1]) + 1 if (np.diff(cell) != 0).any() else 0
         self._open[slot] = take(rows, slice(over, None))
@@ -83,7 +84,7 @@ class ThinnedLeg:
         if form.quantity != 'rate':
             whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \
                 if 'odometer' in cells else True
-            form = replace(COUNTER if whole else FLOATS, scale_unit=form.scale_unit,
+            form = replace(COUNTER if whole else UNROLLED, scale_unit=form.scale_unit,
                            sides=form.sides)
         stop_ns = int(self._cells['imu'].stamp_ns[-1]) if 'imu' in self._cells else start_ns
         return Leg(start_ns=start_ns, stop_ns=stop_ns, form=form, **cells)
@@ -93,7 +94,7 @@ class ThinnedLeg:
         rows = self._late[slot].rest()
         if slot in self._open:
             rows = join([self._open[slot], rows])
-        width_ns = self._width_ns.get(slot, CELL_NS)
+        width_ns = self._width_ns.get(slot, FIRST_CELL_NS)
         cells = _gathered(rows, rows.stamp_ns // width_ns, ())
         before: OdometerSamples | None = self._cells.get(slot)
         return cells if before is None else join([before, cells])

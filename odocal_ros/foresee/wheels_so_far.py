@@ -22,7 +22,7 @@ from odocal_ros.reasons import Verdict
 from odocal_ros.screening.force import felt
 from odocal_ros.settings.config import Config, with_settings
 
-SOURCE_SHARE = 0.01    # of the variance: a source of less is not told
+SOURCE_SHARE = 0.01    # judgement: of the variance; a source of less is not told
 
 
 def with_wheels(forecast: Forecast, leg: Leg, config: Config) -> Forecast:

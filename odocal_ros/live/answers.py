@@ -18,7 +18,7 @@ from odocal_ros.output.summary import sentence
 from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import Reason, Verdict
 
-MOST_REASONS = 3
+MOST_REASONS = 3     # judgement: in an answer
 
 
 def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: int = 0,

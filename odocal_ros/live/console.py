@@ -13,8 +13,8 @@ from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code
 
-FIRST_NS = 5_000_000_000       # of waiting, before it is said
-SELDOM_NS = 60_000_000_000     # and then
+# judgement: of waiting, until it is said, and said again
+SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 60 * 10**9
 
 
 class Console:
@@ -30,7 +30,7 @@ class Console:
         self._doubled: set[str] = set()      # said
         self._silence = False        # has been said
         self._due_ns = 0             # when the next word about what is missing is due
-        self._pause_ns = FIRST_NS
+        self._pause_ns = SILENCE_FIRST_NS
         self._leg_id = 0             # the leg whose faults are said
         self._told: set[Code] = set()      # of them
 
@@ -47,15 +47,15 @@ class Console:
 
     def _missing(self, now: SessionView, steady_ns: int) -> None:
         if not self._due_ns:     # what has been there and falls silent is said at once
-            self._due_ns = steady_ns + (0 if self._ready else FIRST_NS)
+            self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:
             self._log.warning(('' if self._ready else 'waiting: ') + '; '.join(now.missing))
             self._silence = True
-            self._pause_ns = min(2 * self._pause_ns, SELDOM_NS)
+            self._pause_ns = min(2 * self._pause_ns, SILENCE_SELDOM_NS)
             self._due_ns = steady_ns + self._pause_ns
 
     def _complete(self, now: SessionView) -> None:
-        self._due_ns, self._pause_ns = 0, FIRST_NS
+        self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
             what = ('legs begin and end by themselves' if now.config.leg.automatic else

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 from odocal_ros.calib.choice import ABOUT, deciding
 from odocal_ros.foresee import quantities
 from odocal_ros.foresee.clocks_so_far import clocks_differ
+from odocal_ros.foresee.forecast import REST_FORESEEN_S
 from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Reason, Verdict
 
-REST_S = 10.0     # standstill that levels well, tells the gyro bias, and is foreseen at the end
 KMH = 3.6
-OLD_S = 15.0      # age from which what is foreseen is said to be old
+FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
 DRIVE = 'drive '
 STRAIGHT = 'go straight on at speed until left and right wheel are told apart'
 TURNS = 'turn by about 90 deg in all, or more, for the track width'
@@ -85,7 +85,7 @@ def metres_to_go(now: SessionView) -> float:
 def seconds_to_stand(now: SessionView) -> float:
     """Return the seconds of standstill still wanted: before the start, or at the end of a leg."""
     if now.session.state is State.RECORDING or not now.session.busy:
-        return max(0.0, REST_S - now.still_s)
+        return max(0.0, REST_FORESEEN_S - now.still_s)
     return 0.0
 
 
@@ -115,8 +115,8 @@ def _of_two_wheels(now: SessionView) -> list[str]:
 
 
 def _before_start(still_s: float) -> str:
-    if still_s < REST_S:
-        return f'stand still {REST_S:.0f} s before ~/start_leg ({still_s:.0f} s so far)'
+    if still_s < REST_FORESEEN_S:
+        return f'stand still {REST_FORESEEN_S:.0f} s before ~/start_leg ({still_s:.0f} s so far)'
     return 'call ~/start_leg'
 
 
@@ -129,12 +129,12 @@ def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
         if metres > 0:
             wants = [f'drive {metres:.0f} m more', *(w.removeprefix(DRIVE) for w in wants)]
         end = _end(now) if now.session.by_itself else (
-            f'then stand still {REST_S:.0f} s and call ~/stop_leg')
+            f'then stand still {REST_FORESEEN_S:.0f} s and call ~/stop_leg')
         return [', '.join(wants), end], facts
     if now.forecast is None:
         return [*wants, _end(now)], facts
     facts.append(now.forecast.words())
-    if now.forecast_age_s > OLD_S:
+    if now.forecast_age_s > FORECAST_OLD_S:
         facts.append(f'as it was {now.forecast_age_s:.0f} s ago')
     ends = now.forecast.complete or now.session.by_itself
     return wants + ([_end(now)] if ends else []), facts
@@ -156,7 +156,7 @@ def _end(now: SessionView) -> str:
         left = now.session.config.leg.automatic_minutes - now.duration_s / 60
         return (f'the leg ends by itself, at a standstill or within {max(1, round(left))} min')
     if now.still_s < now.session.config.leg.standstill:
-        return f'stand still {REST_S:.0f} s at the end point, then call ~/stop_leg'
+        return f'stand still {REST_FORESEEN_S:.0f} s at the end point, then call ~/stop_leg'
     left = seconds_to_stand(now)
     return (f'stand still {left:.0f} s more, then ' if left >= 1 else '') + 'call ~/stop_leg'
 

@@ -16,13 +16,13 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.data.samples import FixSamples, Samples
+from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
-MEMORY = 64            # blocks kept for the rate
-RATE_SPAN_NS = 3_000_000_000
-SILENCE_NS = 2_000_000_000
-JUMP_NS = 1_000_000_000
-WILD_NS = 30_000_000_000     # a stamp further ahead is believed when others follow it
-FEW = 3
+# judgement: of stamps that tell a rate, blocks that hold them; of silence until a topic is gone
+RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
+SILENCE_NS = 2 * 10**9
+# judgement: a stamp further ahead is believed when TIME_ANEW_ROWS of them follow one another
+WILD_STAMP_NS = 30 * 10**9
 
 
 class Health:
@@ -47,7 +47,7 @@ class Health:
         self._behind = 0                 # stale rows at the end of the last block
         self._last_sequence: int | None = None
         # count and stamp after each block
-        self._ends: deque[tuple[int, int]] = deque(maxlen=MEMORY)
+        self._ends: deque[tuple[int, int]] = deque(maxlen=RATE_BLOCKS)
         self._interval_s = 0.0
 
     def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
@@ -77,7 +77,7 @@ class Health:
         stamps, known = block.stamp_ns[sound], self.newest_ns
         self._take(stamps, max_gap_s)
         self.delay_s = (int(block.received_ns[sound][-1]) - int(stamps[-1])) * 1e-9
-        sound[sound] = stamps >= np.maximum.accumulate(np.maximum(stamps, known)) - JUMP_NS
+        sound[sound] = stamps >= np.maximum.accumulate(np.maximum(stamps, known)) - TIME_ANEW_NS
         return sound
 
     def _not_ahead(self, stamps: Ints) -> Bools:
@@ -85,15 +85,15 @@ class Health:
         sound: Bools = stamps > 0
         given = stamps[sound]
         if not len(given) or not self._ahead and (
-                given.max() - (self.newest_ns or given[0]) < WILD_NS):
+                given.max() - (self.newest_ns or given[0]) < WILD_STAMP_NS):
             return sound
         last = self.newest_ns
         for i in np.flatnonzero(sound):
             stamp = int(stamps[i])
-            if last and stamp - last >= WILD_NS:
-                near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_NS
+            if last and stamp - last >= WILD_STAMP_NS:
+                near = self._ahead and abs(stamp - self._ahead[-1]) < WILD_STAMP_NS
                 self._ahead = [*self._ahead, stamp] if near else [stamp]
-                sound[i] = len(self._ahead) >= FEW
+                sound[i] = len(self._ahead) >= TIME_ANEW_ROWS
             if sound[i]:
                 last, self._ahead = stamp, []
         return sound
@@ -122,15 +122,15 @@ class Health:
         steps = np.diff(known)
         at = int(np.argmin(steps)) if len(steps) else 0
         after = known[at + 1:].max() if len(steps) else 0
-        fell = bool(len(steps)) and after < known[at] - JUMP_NS
+        fell = bool(len(steps)) and after < known[at] - TIME_ANEW_NS
         # back to where the stamps were before one that was wild
-        after_wild = at and steps[at - 1] > JUMP_NS and after >= known[at - 1] - JUMP_NS
+        after_wild = at and steps[at - 1] > TIME_ANEW_NS and after >= known[at - 1] - TIME_ANEW_NS
         after_wild = after_wild or not (at or self.newest_ns)
         behind, self._behind = self._behind, 0
         if not fell or after_wild:
             return int(stamps[-1])
         rows = len(known) - 1 - at
-        if rows < FEW if at else rows + behind < 2:
+        if rows < TIME_ANEW_ROWS if at else rows + behind < 2:
             self._behind = rows
             return int(known[at])
         self.jumped_back = True

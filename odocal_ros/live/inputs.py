@@ -18,6 +18,8 @@ from odocal_ros.settings.config import Config
 IMU, FIX = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')
 
+LOOK_AROUND_S = 1.0     # judgement: between two looks for publishers
+
 
 class Inputs:
     """All topics of the node, those that a configuration asks for."""

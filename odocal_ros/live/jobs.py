@@ -20,6 +20,7 @@ from odocal_ros.calib.carried import Carried
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.live.result_files import paths
+from odocal_ros.live.session import LEGS_HELD
 from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import combine
@@ -28,7 +29,6 @@ from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
 Paths: TypeAlias = tuple[PathMessage, PathMessage]      # dead reckoning, reference
-MOST_KEPT = 30      # legs in memory and in the report; what those before tell is carried on
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
     if by_itself and (why := refusal(results[0])):
         return LeftOut(results, why)
     paths = leg_paths(max(results, key=lambda one: one.distance), config)
-    folded = max(0, len(kept) + 1 - MOST_KEPT) if by_itself else 0
+    folded = max(0, len(kept) + 1 - LEGS_HELD) if by_itself else 0
     carried = fold([one for leg in kept[:folded] for one in leg], config, carried)
     left = [one for leg in kept[folded:] for one in leg]
     calibration = combine([*left, *results], config, carried, known_imu(config))

@@ -25,14 +25,14 @@ from odocal_ros.live.definitions import message_class
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_text import journal_text
 from odocal_ros.live.journal_writer import Heard, JournalWriter
+from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
-EVERY_NS = 800_000_000    # with the time that writing takes, a kill then costs about a second
-MARGIN_S = 2.0            # kept beyond the pre-roll: the recorder's own margin, and a batch
-GRACE_S = 2.0
+BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second
+JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node is told to end
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED = ('cancelled', 'undone')
 
@@ -102,11 +102,12 @@ class Journal:
         if self._limit and not config.journal.max_bytes:
             self.start_anew()
         self._limit = config.journal.max_bytes
-        self._reach_ns = round((config.leg.preroll + MARGIN_S) * 1e9)
+        # the recorder's margin, and a batch of about a second
+        self._reach_ns = round((config.leg.preroll + PREROLL_MARGIN_S + 1.0) * 1e9)
         return self._limit
 
     def _hand_over(self) -> None:
-        self._due_ns = self._steady.now().nanoseconds + EVERY_NS
+        self._due_ns = self._steady.now().nanoseconds + BATCH_NS
         batch, self._batch = self._batch, {}
         marks, self._marks = self._marks, None
         if batch or marks:
@@ -165,4 +166,4 @@ class Journal:
         """Write what is left; a long leg's files may stay apart; return whether all is done."""
         self._hand_over()
         self._writer.submit(self._writer.finish)
-        return self._writer.close(GRACE_S)
+        return self._writer.close(JOURNAL_GRACE_S)

@@ -22,8 +22,8 @@ from odocal_ros.bagio.segments import SegmentedBag
 from odocal_ros.live.journal_space import claim, clear_empty, make_room
 from odocal_ros.outside.whole import new_folder, write_text
 
-MOST_WAITING = 64 * 2**20     # bytes kept in memory while the disk does not take them
-MARGIN = 2**20                # for metadata and file heads
+WAITING_BYTES = 64 * 2**20     # judgement: held while the disk does not take them
+HEADS_BYTES = 2**20            # judgement: for metadata and file heads
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class LegJournal:
         if self._waiting:
             self._try(self._write)
         if self.trouble and not self._over and sum(
-                chunk.size for chunk in self._waiting) > MOST_WAITING:
+                chunk.size for chunk in self._waiting) > WAITING_BYTES:
             self._give_up(f'{self.trouble}; it is not tried again in this leg')
 
     def finish(self) -> None:
@@ -113,7 +113,7 @@ class LegJournal:
         if self._bag is None:
             self._bag = self._open()
         # joining some files, this one too, takes their size once more for a moment
-        size = 2 * sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + MARGIN
+        size = 2 * sum(chunk.size for chunk in self._waiting) + self._bag.loose_size + HEADS_BYTES
         if self._others + self._bag.size + size > self.plan.limit:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size
@@ -143,8 +143,8 @@ class LegJournal:
 
     def _finish(self) -> None:
         assert self._bag is not None
-        taken = make_room(self.plan.root, self.plan.limit, self._bag.size + MARGIN)
-        self._bag.finish(room=self.plan.limit - taken - MARGIN)
+        taken = make_room(self.plan.root, self.plan.limit, self._bag.size + HEADS_BYTES)
+        self._bag.finish(room=self.plan.limit - taken - HEADS_BYTES)
 
     def _give_up(self, trouble: str) -> None:
         self.trouble, self._over, self._waiting = trouble, True, []

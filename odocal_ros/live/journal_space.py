@@ -20,8 +20,8 @@ from typing import TextIO
 from odocal_ros.bagio.numbered import JOURNAL
 from odocal_ros.outside.whole import PART
 
-NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
-NEW_S = 10.0       # a node may be about to write into its folder
+JOURNAL_NAME = re.compile(r'\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ_leg_\d+(-\d+)?')     # of a journal
+FOLDER_NEW_S = 10.0       # judgement: a node may be about to write into its folder
 
 
 def journals(root: Path) -> list[Path]:
@@ -39,8 +39,8 @@ def clear_empty(root: Path) -> None:
     """Remove journals in which nothing is: their nodes died before, or the disk took no more."""
     for folder in list(root.iterdir()):
         with suppress(OSError):
-            named = NAME.fullmatch(folder.name) and not folder.is_symlink()
-            old = named and folder.stat().st_mtime < time.time() - NEW_S
+            named = JOURNAL_NAME.fullmatch(folder.name) and not folder.is_symlink()
+            old = named and folder.stat().st_mtime < time.time() - FOLDER_NEW_S
             if old and all(is_nothing(path) for path in folder.iterdir()) and not _in_use(folder):
                 shutil.rmtree(folder)
 

@@ -21,7 +21,7 @@ from odocal_ros.bagio.chunks import Chunk, pack
 from odocal_ros.live.definitions import definition_of
 from odocal_ros.live.journal_leg import in_order, LegJournal, Plan
 
-MOST_HELD = 256 * 2**20        # bytes of pre-roll; 1 kHz for 600 s are 55 MB
+PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
 
 
 @dataclass
@@ -51,7 +51,7 @@ class PreRoll:
         # by each topic's own stamps: one on a foreign clock must not grow without bound
         while held[0][0] < newest_ns - reach_ns:
             self._drop(held)
-        while self.size > MOST_HELD:
+        while self.size > PREROLL_BYTES:
             self._drop(max(self._held.values(), key=lambda h: sum(c.size for _, c in h)))
 
     def _drop(self, held: deque[tuple[int, Chunk]]) -> None:

@@ -38,11 +38,11 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.running_estimate import RunningEstimate
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
-from odocal_ros.live.worker import FILES_S, GRACE_S, Worker
+from odocal_ros.live.worker import FILES_GRACE_S, JOB_GRACE_S, Worker
 from odocal_ros.outside.names import for_shell
 from odocal_ros.settings.config import Config
 
-PATIENCE_S = 1.0   # a topic that has not passed the stop mark by then is not waited for
+LATE_TOPIC_S = 1.0   # judgement: a topic later than that at the stop mark is not waited for
 
 
 class LegCompletion:
@@ -109,7 +109,7 @@ class LegCompletion:
     def close(self) -> bool:
         """Let the worker end; return whether it has."""
         self._watch.end()
-        until = time.monotonic() + (FILES_S if self._filing.busy else GRACE_S)
+        until = time.monotonic() + (FILES_GRACE_S if self._filing.busy else JOB_GRACE_S)
         done = self._worker.close(until - time.monotonic())
         return self._filing.close(max(0.0, until - time.monotonic())) and done
 
@@ -206,7 +206,7 @@ class LegCompletion:
         self._distance_m = self._recording.progress.distance_m()
         self.session.stop(mark_ns)
         self._watch.end()
-        self._close_by_ns = self._steady.now().nanoseconds + round(PATIENCE_S * 1e9)
+        self._close_by_ns = self._steady.now().nanoseconds + round(LATE_TOPIC_S * 1e9)
         self.show_status()
         self._close_when_complete()
 

@@ -16,7 +16,8 @@ one was freed: a node held 100 MiB that nobody used after an hour's leg at 1 kHz
 
 import ctypes
 
-# of mallopt(3): arenas for all threads together, bytes from which a block is mapped by itself
+# judgement, of mallopt(3): arenas for all threads together, bytes from which a block is mapped by
+# itself
 OPTIONS = {-8: 2, -3: 2**22}
 _libc = ctypes.CDLL(None)
 

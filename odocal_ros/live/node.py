@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 
 from odocal_ros.errors import OdocalError
 from odocal_ros.live import params
+from odocal_ros.live.inputs import LOOK_AROUND_S
 from odocal_ros.live.journal import Journal
 from odocal_ros.live.operation import Operation
 from odocal_ros.live.process import complain, run, SettledNode
@@ -33,10 +34,9 @@ from odocal_ros.live.recording import Recording
 from odocal_ros.live.topic_input import TOPICS
 from odocal_ros.output.stored import known_imu
 
-# s between turns, and while somebody waits for an answer. A queue holds 25 of the long ones; of
-# 0.1 s each the node takes half as much again (benchmarks/live_load.py)
-TICK_S, AWAITED_TICK_S = 0.2, 0.05
-LOOK_S = 1.0       # publishers are looked for, and old samples forgotten, this often
+# tuned by benchmarks/live_load.py: s between turns, and while somebody waits for an answer. Of
+# 0.05 s all would cost twice as much; a queue holds 25 of 0.2 s
+TURN_S, AWAITED_TURN_S = 0.2, 0.05
 HELP = """\
 usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] ...]
 
@@ -90,7 +90,7 @@ class Calibrator(SettledNode):
             self.create_service(Trigger, f'~/{name}', partial(self._serve, act),
                                 callback_group=group)
         # on the steady clock: a paused or missing /clock must not silence the status
-        self._timer = self.create_timer(TICK_S, self._tick, clock=self._steady)
+        self._timer = self.create_timer(TURN_S, self._tick, clock=self._steady)
 
     def destroy_node(self) -> None:
         """End worker, journal and clock callbacks with the node."""
@@ -131,7 +131,7 @@ class Calibrator(SettledNode):
     def _tick(self) -> None:
         with self._lock:
             self.operation.tick()
-            if self._due('look', LOOK_S):
+            if self._due('look', LOOK_AROUND_S):
                 self.recording.look_around(self.config)
                 session = self.operation.session
                 self.recording.forget(self.config.leg.preroll,
@@ -145,7 +145,7 @@ class Calibrator(SettledNode):
     def _pace(self) -> None:
         """Take turns as often as is wanted now."""
         awaited = self.operation.awaited
-        period_s = AWAITED_TICK_S if awaited else min(TICK_S, 1 / self.config.publish.rate)
+        period_s = AWAITED_TURN_S if awaited else min(TURN_S, 1 / self.config.publish.rate)
         period_ns = round(period_s * 1e9)
         if period_ns != self._timer.timer_period_ns:
             self._timer.timer_period_ns = period_ns

@@ -26,15 +26,15 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
-from odocal_ros.live.inputs import IMU
+from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
+from odocal_ros.live.inputs import IMU, LOOK_AROUND_S
 from odocal_ros.live.process import run, SettledNode
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.apply_config import ApplyConfig
 
-TICK_S, LOOK_S = 0.01, 1.0
-WAIT_S, SELDOM_S = 5.0, 60.0     # of silence before it is said, and said again
-APART_S = 2.0                    # of stamps: two clocks
-MOST_SAID = 20                   # sentences on what comes in, of one run of the node
+POSE_TURN_S = 0.01              # judgement: what a controller lets pose and twist be late
+CLOCKS_APART_S = 2.0       # judgement: between the stamps of two topics, from which it is said
+MOST_SENTENCES = 20        # judgement: on what comes in, of one run of the node
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
 
@@ -77,14 +77,14 @@ class OdometryNode(SettledNode):
         self._twist = publish(TwistWithCovarianceStamped, 'odometry/twist', 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._look_ns = self._silent_ns = 0
-        self._said, self._begun, self._pause_s = 0, False, WAIT_S
+        self._said, self._begun, self._pause_ns = 0, False, SILENCE_FIRST_NS
         self.add_on_set_parameters_callback(params.fixed)
-        self.create_timer(TICK_S, self._tick, clock=self._steady)
+        self.create_timer(POSE_TURN_S, self._tick, clock=self._steady)
         self.get_logger().info(f'applies the {kept.words("")}')
 
     def _tick(self) -> None:
         now_ns = self._steady.now().nanoseconds
-        if now_ns - self._look_ns > LOOK_S * 1e9:
+        if now_ns - self._look_ns > LOOK_AROUND_S * 1e9:
             self._look_ns = now_ns
             self._look_around(now_ns)
         for source in self._inputs.values():
@@ -97,8 +97,8 @@ class OdometryNode(SettledNode):
             self.get_logger().info('odometry begins')
         for text in self._odometry.take_told():
             self._said += 1
-            if self._said <= MOST_SAID:
-                last = ' (more of this kind is not said)' if self._said == MOST_SAID else ''
+            if self._said <= MOST_SENTENCES:
+                last = ' (more of this kind is not said)' if self._said == MOST_SENTENCES else ''
                 self.get_logger().warning(text + last)
 
     def _pump(self, source: Input) -> None:
@@ -122,17 +122,17 @@ class OdometryNode(SettledNode):
                 one.find(self.config)
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]
         apart = self._odometry.apart()
-        if not missing and abs(apart) > APART_S:
+        if not missing and abs(apart) > CLOCKS_APART_S:
             missing = [f'the stamps of the odometer are {apart:+.3g} s from those of the Imu: two '
                        'clocks; mend the drivers, or set use_sim_time where a bag is played']
         if not missing:
-            self._silent_ns, self._pause_s = 0, WAIT_S
+            self._silent_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         elif not self._silent_ns:
-            self._silent_ns = now_ns + round(self._pause_s * 1e9)
+            self._silent_ns = now_ns + self._pause_ns
         elif now_ns > self._silent_ns:
             self.get_logger().warning('nothing is published: ' + '; '.join(missing))
-            self._pause_s = SELDOM_S
-            self._silent_ns = now_ns + round(self._pause_s * 1e9)
+            self._pause_ns = SILENCE_SELDOM_NS
+            self._silent_ns = now_ns + self._pause_ns
 
     def _publish(self, pose: Pose) -> None:
         frames = self.config.frames

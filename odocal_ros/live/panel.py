@@ -17,11 +17,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from odocal_ros.foresee.forecast import three_digits
+from odocal_ros.foresee.forecast import REST_FORESEEN_S, three_digits
 from odocal_ros.output.figures import with_sigma
 
 COLOURS = {b'\x00': 'green', b'\x01': 'yellow', b'\x02': 'red', b'\x03': 'dim'}
-REST_S = 10.0
 
 
 def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
@@ -45,7 +44,7 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     way, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
     found = {'way': (way / (way + lacks) if way + lacks > 0 else 0.0, f'{lacks:.0f} m to go'),
-             'standing': (1 - stand / REST_S, f'{stand:.0f} s to go')}
+             'standing': (1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go')}
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         asked = number(status, f'asked_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]

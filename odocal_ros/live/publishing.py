@@ -20,7 +20,6 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64, String
 
 from odocal_ros.calib.result import Calibration
@@ -29,13 +28,12 @@ from odocal_ros.live.guidance import action_first
 from odocal_ros.live.recording import Recording
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.live.status import calibration_status, in_force, input_status
+from odocal_ros.live.status_listener import LATCHED
 from odocal_ros.outside.yaml_text import no_date
 from odocal_ros.settings.config import Config
 
 PLOTTED = ('scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle',
            'yaw_mounting_angle_sigma')
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PARTS = {'fix': 'gnss', 'fix_velocity': 'gnss velocity', 'odometer_right': 'odometer right'}
 
 

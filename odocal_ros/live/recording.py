@@ -25,8 +25,8 @@ from odocal_ros.live.inputs import Inputs
 from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
-BACKWARD_S = 0.1   # a clock that steps back by more has jumped
-MARGIN_S = 1.0     # kept beyond the pre-roll, since forgetting goes by whole blocks
+CLOCK_BACK_S = 0.1         # judgement: a clock that steps back by more has jumped
+PREROLL_MARGIN_S = 1.0     # judgement: kept beyond the pre-roll; forgetting goes by whole blocks
 
 
 class Recording:
@@ -48,7 +48,7 @@ class Recording:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._clock_jumped = False
         self._jumps = self._clock.create_jump_callback(
-            JumpThreshold(min_forward=None, min_backward=Duration(seconds=-BACKWARD_S)),
+            JumpThreshold(min_forward=None, min_backward=Duration(seconds=-CLOCK_BACK_S)),
             post_callback=self._note_jump)
 
     def _no_progress(self) -> Progress:
@@ -83,7 +83,7 @@ class Recording:
             if source.health.newest_ns:
                 since_ns = min(source.health.newest_ns, start_ns or source.health.newest_ns)
                 self.recorder.forget_before(
-                    since_ns - round((preroll_s + MARGIN_S) * 1e9), slots)
+                    since_ns - round((preroll_s + PREROLL_MARGIN_S) * 1e9), slots)
 
     def _both(self, source: Input) -> bool:
         """Return whether a topic's messages hold both wheels."""

@@ -27,7 +27,7 @@ from odocal_ros.live.result_folders import ResultFolders
 from odocal_ros.outside.whole import new_folder
 from odocal_ros.settings.config import Config
 
-MOST_POSES = 2000
+MOST_POSES = 2000    # judgement: of a path shown
 
 
 def path_message(track_n: np.ndarray | None, header: Header) -> PathMessage:

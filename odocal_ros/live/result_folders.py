@@ -19,7 +19,7 @@ from odocal_ros.output.worse import replacing, stored_in
 from odocal_ros.outside.whole import locked
 
 LATEST = 'latest'
-NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # of a result, by its time
+RESULT_NAME = re.compile(r'(\d{4}-\d\d-\d\dT\d\d-\d\d-\d\dZ)(?:-(\d+))?')     # by its time
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ class ResultFolders:
         """
         root = newest.parent
         with locked(root):
-            names = sorted((p.name for p in root.iterdir() if NAME.fullmatch(p.name)), key=_age)
+            names = sorted((p.name for p in root.iterdir() if RESULT_NAME.fullmatch(p.name)),
+                           key=_age)
             old = names[:-kept] if kept else []
             shown = _target(root / LATEST)
             stay = {newest.name, shown, *(f.before for f in self._filed if f.folder.name == shown)}
@@ -107,7 +108,7 @@ class ResultFolders:
 
 def _age(name: str) -> tuple[str, int]:
     """Return by what names of results are sorted: their time, and which of that second."""
-    when, count = NAME.findall(name)[0]
+    when, count = RESULT_NAME.findall(name)[0]
     return when, int(count or 1)
 
 

@@ -27,8 +27,11 @@ from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
-EVERY_NS = 5_000_000_000   # of the Imu's time, so that a fast replay is looked at as often
-SHARE = 1 / 60             # of one core is what looking may cost in the long run
+# judgement: of the Imu's time, so that a fast replay is looked at as often
+LOOK_PERIOD_NS = 5 * 10**9
+# tuned by benchmarks/live_load.py: of one core, what looking may cost in the long run; with it and
+# all else the node takes less than three fifths of a typed subscriber of 455 messages a second
+LOOK_SHARE = 1 / 60
 
 Block: TypeAlias = tuple[str, Any]      # slot, rows
 # forecast, faults, seconds of CPU it took, what went wrong
@@ -93,7 +96,7 @@ class RunningEstimate:
         """Look at what comes after a stamp."""
         self._over, self._start_ns = threading.Event(), start_ns
         self._thinned, self._smoother = ThinnedLeg(form), SmootherSoFar()
-        self._due_ns = start_ns + EVERY_NS
+        self._due_ns = start_ns + LOOK_PERIOD_NS
 
     def feed(self, slot: str, block: Any) -> None:
         """Remember a block as it went into the recorder."""
@@ -126,7 +129,7 @@ class RunningEstimate:
         if (self._thinned is None or self._looking or newest_ns < self._due_ns
                 or time.monotonic() < self._pause_until):
             return
-        self._due_ns, self._looking = newest_ns + EVERY_NS, True
+        self._due_ns, self._looking = newest_ns + LOOK_PERIOD_NS, True
         before, self._before = self._before, None
         fresh, self._fresh = self._fresh, []
         self._worker.submit(
@@ -140,7 +143,7 @@ class RunningEstimate:
         self._looking = False
         self._newest, self._faults, seconds, failure = look or (None, (), 0.0, error)
         # the first look brings in the pre-roll, and modules: a cost that comes once
-        self._pause_until = time.monotonic() + seconds / SHARE if self._warm else 0.0
+        self._pause_until = time.monotonic() + seconds / LOOK_SHARE if self._warm else 0.0
         self._warm = True
         if failure is not None:
             self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')

@@ -23,7 +23,8 @@ from odocal_ros.live.restored import Restored
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
-MOST_DRAWN = 30     # newest legs whose tracks are kept: a day of legs must not fill the memory
+# judgement: newest legs held with their tracks, and drawn; a day of legs must not fill the memory
+LEGS_HELD = 30
 
 
 class Refused(OdocalError):
@@ -115,9 +116,9 @@ class Session:
     def finish(self, results: tuple[LegResult, ...], calibration: Calibration) -> None:
         """Keep the computed leg."""
         self.legs.append(KeptLeg(self.leg_id, self.start_ns, self.stop_ns, results))
-        self.legs[:-MOST_DRAWN] = [
+        self.legs[:-LEGS_HELD] = [
             replace(leg, results=tuple(one.numbers() for one in leg.results))
-            for leg in self.legs[:-MOST_DRAWN]]
+            for leg in self.legs[:-LEGS_HELD]]
         self.unused = None
         self._settle(calibration)
 

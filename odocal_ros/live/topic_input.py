@@ -35,13 +35,13 @@ from odocal_ros.settings.config import Config
 
 TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
           'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
-# messages in five seconds of the highest rate believed, 4 kHz, 1 kHz and 100 Hz: a queue that runs
-# over is what loses them
+# physical: messages in five seconds of the highest rate believed, 4 kHz, 1 kHz and 100 Hz: a queue
+# that runs over is what loses them
 DEPTH = {'imu': 20_000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
          'fix': 500, 'fix_velocity': 500}
 LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
           'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
-MOST_MEANT, ALIKE = 2, 0.4
+MOST_TOPICS_MEANT, NAMES_ALIKE = 2, 0.4      # judgement: of difflib, 1 for the same name
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
@@ -89,8 +89,8 @@ class Input:
                  if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]
         # of the many types that may be an odometer's only what is called alike
-        return difflib.get_close_matches(self.topic, names, MOST_MEANT,
-                                         0.0 if self.allowed else ALIKE)
+        return difflib.get_close_matches(self.topic, names, MOST_TOPICS_MEANT,
+                                         0.0 if self.allowed else NAMES_ALIKE)
 
     def doubled(self) -> str:
         """Name those who publish the topic where they are several, else return nothing."""

@@ -16,9 +16,9 @@ from typing import Any, TypeAlias
 
 from odocal_ros.live.memory import give_back
 
-# s that a node told to end waits, for a computation and for files: launch asks again, and harder,
-# after 5 s
-GRACE_S, FILES_S = 1.0, 4.0
+# judgement: s that a node told to end waits, for a computation and for files: launch asks again,
+# and harder, after 5 s
+JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
 Then: TypeAlias = Callable[[Any, Exception | None], None]      # one of them is None
 Outcome: TypeAlias = tuple[Then, Any, Exception | None]
@@ -54,7 +54,7 @@ class Worker:
             then, result, error = self._done.get()
             then(result, error)
 
-    def close(self, grace_s: float = GRACE_S) -> bool:
+    def close(self, grace_s: float = JOB_GRACE_S) -> bool:
         """Let the thread end after the jobs it was given; return whether it has, in that time."""
         self._jobs.put(None)
         self._thread.join(grace_s)

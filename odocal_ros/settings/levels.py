@@ -29,4 +29,6 @@ INFORMED_SHARE = 0.5
 NORMAL_MEDIAN = 0.6745      # of |x|, x normal with sigma 1
 RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
 SWAY = 0.05             # m/s to the side and up, of a body on its springs, that no wheel feels
+# judgement: stamps further back, so many in turn, are those of a time that began anew
+TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
 DAY_NS = 86_400 * 10**9

@@ -29,7 +29,7 @@ from odocal_ros.foresee.thinned_leg import MOST_CELLS, ThinnedLeg
 from odocal_ros.foresee.wheels_so_far import with_wheels
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
-from odocal_ros.live.running_estimate import EVERY_NS, RunningEstimate
+from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
 from odocal_ros.live.session import Session
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.live.worker import Worker
@@ -255,10 +255,10 @@ def test_a_prediction_is_made_from_few_rows_and_keeps_its_stops(drive, config, m
 
     predict = foresight.predict
     monkeypatch.setattr(foresight, 'predict', counted)
-    monkeypatch.setattr(foresight, 'MOST_ROWS', 100)
+    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100)
     sparse = foreseen(drive, config, 270.0)
     assert len(seen[0].t) <= 100 + 2 * 100      # a rest of 10 s is put on in steps of 0.1 s
-    monkeypatch.setattr(foresight, 'MOST_ROWS', 100_000)
+    monkeypatch.setattr(foresight, 'DRIVE_ROWS', 100_000)
     dense = foreseen(drive, config, 270.0)
     assert len(seen[-1].t) > 10 * len(seen[0].t)
     assert seen[0].standstills(2.0) == seen[-1].standstills(2.0)
@@ -326,7 +326,7 @@ def worker():
 def test_the_watch_foresees_what_its_thinned_does(drive, config, worker):
     log = Log()
     look, now_ns = watched(drive, config, worker, log)
-    look.look(drive.leg().start_ns + EVERY_NS - 1)
+    look.look(drive.leg().start_ns + LOOK_PERIOD_NS - 1)
     finished(worker)
     assert look.forecast is None                      # too early
     look.look(now_ns)
@@ -350,7 +350,7 @@ def test_what_goes_wrong_in_a_look_is_only_noted(drive, config, worker, monkeypa
     line, = log.lines
     assert 'a bug' in line
     monkeypatch.undo()
-    look.look(now_ns + EVERY_NS)
+    look.look(now_ns + LOOK_PERIOD_NS)
     finished(worker)
     assert look.forecast is not None
 
@@ -362,7 +362,7 @@ def test_a_leg_that_ended_meanwhile_leaves_no_forecast(drive, config, worker):
     look.end()
     finished(worker)
     assert (look.forecast, log.lines) == (None, [])
-    look.look(now_ns + EVERY_NS)
+    look.look(now_ns + LOOK_PERIOD_NS)
     finished(worker)
     assert look.forecast is None
 
@@ -380,7 +380,7 @@ def test_looks_take_a_small_share_of_a_core(drive, config, worker, monkeypatch):
     look, now_ns = watched(drive, config, worker, Log())
     for _ in range(320):
         clock.now += 1.0
-        now_ns += EVERY_NS
+        now_ns += LOOK_PERIOD_NS
         look.look(now_ns)
         finished(worker)
     # the first comes with imports and goes free, the others 60 s apart: at 1, 2, 62, ... 302 s

@@ -96,7 +96,7 @@ def leg(root, limit, leg_id=1):
 
 
 def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'MARGIN', 10_000)
+    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
     monkeypatch.setattr(segments, 'TOGETHER', 3)
     limit, taken, write_file = 1_200_000, [], segments.write_file
 
@@ -117,7 +117,7 @@ def test_journals_together_stay_within_the_limit(tmp_path, monkeypatch):
 
 
 def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'MARGIN', 10_000)
+    monkeypatch.setattr(journal_leg, 'HEADS_BYTES', 10_000)
     journal(tmp_path, 'old', 1000, 1)
     one = leg(tmp_path, 500_000)
     for k in range(20):
@@ -133,7 +133,7 @@ def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeyp
 
 
 def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal_leg, 'MOST_WAITING', 350_000)
+    monkeypatch.setattr(journal_leg, 'WAITING_BYTES', 350_000)
     one = leg(tmp_path / 'file' / 'journal', 10**9)
     (tmp_path / 'file').touch()
     for k in range(3):
@@ -169,7 +169,7 @@ def test_the_preroll_reaches_back_far_enough_and_no_further():
 
 
 def test_the_preroll_is_bounded_in_bytes(monkeypatch):
-    monkeypatch.setattr(journal_writer, 'MOST_HELD', 1_050_000)
+    monkeypatch.setattr(journal_writer, 'PREROLL_BYTES', 1_050_000)
     preroll = PreRoll()
     preroll.feed('fix', SECOND, chunk(1, 100), 600 * SECOND)
     for k in range(100):

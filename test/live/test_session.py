@@ -16,7 +16,7 @@ from drives import drive, settings
 import pytest
 
 from odocal_ros.calib.result import Calibration, LegResult
-from odocal_ros.live.session import MOST_DRAWN, Refused, Session, State
+from odocal_ros.live.session import LEGS_HELD, Refused, Session, State
 from odocal_ros.output.files import as_json
 from odocal_ros.output.geojson import geojson
 from odocal_ros.output.report import report_html
@@ -163,12 +163,12 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
     made = drive(scenario='town', duration=120.0, imu_grade='industrial', seed=4)
     whole, config = calibrate(made.leg(), settings(made, method='auto')), settings(made)
     session = Session()
-    for leg in range(MOST_DRAWN + 2):
+    for leg in range(LEGS_HELD + 2):
         session.start(10 * leg + 1, CONFIG)
         session.stop(10 * leg + 5)
         session.finish((whole,), calibration())
     drawn = [leg.results[0].evidence is not None for leg in session.legs]
-    assert drawn == [False] * 2 + [True] * MOST_DRAWN
+    assert drawn == [False] * 2 + [True] * LEGS_HELD
     bare = session.legs[0].results[0]
     later = replace(whole, start_ns=whole.stop_ns, stop_ns=2 * whole.stop_ns - whole.start_ns)
     full, both = (combine([first, later], config) for first in (whole, bare))
