@@ -9,14 +9,21 @@
 
 """The node inside another program: its executor, its context, and a pipeline that fails."""
 
+from contextlib import nullcontext
 import threading
+from types import SimpleNamespace
 
 from bench import Client, wait_for
 from player import messages_of, part, Player
 import pytest
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import String
 
 from odocal_ros.live import answers, jobs, operation
+from odocal_ros.live.node import AWAITED_TURN_S, TURN_S
 from odocal_ros.live.topic_input import Input
+from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 
@@ -76,6 +83,44 @@ def test_messages_wait_in_the_queue_and_are_stamped_by_their_sender(embedded):
     waiting._receive(b'second', info | {'source_timestamp': 0})  # a middleware that does not tell
     assert imu.take() == ([b'first', b'second'], [5, 9])
     assert imu.take() == ([], [])
+
+
+def test_without_take_message_the_executor_carries_all(embedded):
+    node, client = embedded
+    client.until(state='waiting')
+    waiting = WaitingMessages(node)
+    waiting.subscribe(String, 'words', QoSProfile(depth=10))
+    publisher = client.node.create_publisher(
+        String, node.resolve_topic_name('words'), QoSProfile(depth=10))
+    wait_for(publisher.get_subscription_count, 'the subscription')
+    got = []
+
+    def heard(words):
+        publisher.publish(String(data=words))
+        return wait_for(lambda: got.extend(raw for raw, _ in waiting.take()) or (
+            got and deserialize_message(got[-1], String).data == words), words)
+
+    assert heard('taken')
+    assert not waiting.gate.is_open
+    kept, waiting._subscription = waiting._subscription, SimpleNamespace(
+        handle=nullcontext(), msg_type=String)      # no take_message
+    assert heard('carried')
+    assert waiting.gate.is_open
+    waiting.follow_clock()
+    assert heard('and on')
+    assert len(got) == 3
+    node.destroy_subscription(kept)
+
+
+def test_turns_are_long_unless_somebody_waits(embedded):
+    node, client = embedded
+    client.until(state='waiting')
+    wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns')
+    gate = threading.Event()
+    node.operation._filing._artist.submit(gate.wait, lambda *_: None)      # a report to be drawn
+    wait_for(lambda: node._timer.timer_period_ns == round(AWAITED_TURN_S * 1e9), 'short turns')
+    gate.set()
+    wait_for(lambda: node._timer.timer_period_ns == round(TURN_S * 1e9), 'long turns again')
 
 
 def test_a_failing_computation_is_an_answer_and_the_leg_is_kept(embedded, monkeypatch):
