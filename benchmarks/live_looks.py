@@ -13,8 +13,9 @@ What looks at a leg cost while it is recorded, and how good the running estimate
     python benchmarks/live_looks.py [--seconds 600] [--grade consumer] [--noise white]
 
 A simulated town drive is looked at as the node does, without ROS. Printed as the leg grows: CPU of
-a look, what of it is done ever less often, and when the next will be; at the end how far the
-running estimate is from the result of the whole leg.
+a look, what of it is done ever less often, and when the next will be; at the end the CPU of all
+looks against that of the first EARLY_S, each by time, beside the goal, and how far the running
+estimate is from the result of the whole leg.
 """
 
 import argparse
@@ -37,6 +38,7 @@ from odocal_ros.sim.scenarios import SimOptions, simulate  # noqa: E402
 
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LINES = 40       # printed of a leg
+EARLY_S, GOAL_GROWTH = 600.0, 1.1
 
 
 def look(leg, config, state, before_ns, now_ns):
@@ -59,11 +61,13 @@ def show(leg, config, seconds):
     print('   leg s   look s CPU   of that once   next after s   scale sigma ppm   yaw sigma deg')
     state = ThinnedLeg(leg.form), SmootherSoFar()
     before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + LOOK_PERIOD_NS, [], 0.0, -1.0
+    early = 0.0
     while before_ns < leg.stop_ns:
         seen, cost, once = look(leg, config, state, before_ns, now_ns)
         total += cost
         pauses.append(max(LOOK_PERIOD_NS * 1e-9, cost + (cost - once) / LOOK_SHARE))
         t = (now_ns - leg.start_ns) * 1e-9
+        early = total if t <= EARLY_S else early
         if seen is not None and (t > shown + seconds / LINES or now_ns >= leg.stop_ns):
             shown = t
             print(f'{t:8.0f} {cost:12.2f} {once:14.2f} {pauses[-1]:14.1f} '
@@ -73,6 +77,10 @@ def show(leg, config, seconds):
     middle, most = sorted(pauses)[len(pauses) // 2], max(pauses[1:])
     print(f'{len(pauses)} looks, {100 * total / seconds:.1f} % of a core; from one to the next '
           f'{middle:.1f} s in the middle, {most:.1f} s at most')
+    if seconds > EARLY_S:
+        growth = total / seconds / (early / EARLY_S)
+        print(f'CPU by time against that of the first {EARLY_S:.0f} s: {growth:.2f}, goal '
+              f'{GOAL_GROWTH:g}{"" if growth <= GOAL_GROWTH else "   MISSED"}')
     return seen
 
 
