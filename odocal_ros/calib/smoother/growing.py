@@ -25,7 +25,7 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.failed import told_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive
-from odocal_ros.calib.smoother.estimate import Fit, fit, WarmStart
+from odocal_ros.calib.smoother.estimate import Fit, fit, Trace, WarmStart
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -39,8 +39,6 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.settings.config import Config
 
-Trace = Callable[..., None]
-
 # s between keyframes of a leg up to LONG_LEG and beyond: tuned, docs/decisions/0005: 2 s for 1 s
 # cost a tenth in sigma and save a fifth of the time
 FINE_SPACING, COARSE_SPACING = 1.0, 2.0
@@ -49,7 +47,7 @@ LONG_LEG = 660.0        # s
 FEW_KEYS = 150
 LOOK_PASSES, MORE_PASSES = 2, 6    # from the last fit, and where that was not enough
 ANEW_GROWTH = 1.5       # of the leg, until what is decided once is decided anew
-BEARS_OUT_SIGMAS = 3.0  # statistical: one leg in 120 is fit anew for nothing
+BEARS_OUT_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +120,10 @@ class GrowingFit:
                 self.once_s += self._cpu_s() - begin
             return best, problem
         # the levels are let alone until the state is on the new stretch too
-        best = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace)
-        best = judge_running(best, problem.grade).outline()     # more of a drive tells more of it
-        best = fit(problem, best.state, best.levels, LOOK_PASSES, about=best, trace=trace)
+        near = judge_running(      # more of a drive tells more of what is imperfect
+            fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace),
+            problem.grade).outline()
+        best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
         if not best.settled:
             best = fit(problem, best.state, best.levels, MORE_PASSES, about=best, trace=trace)
         if duration > ANEW_GROWTH * self._judged:
