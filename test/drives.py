@@ -39,6 +39,7 @@ def settings(made, heading_sigma=1e-3, **changes):
         'method': 'two_point',
         'odometer.nominal_scale': float(o.nominal_scale),
         'odometer.lever_arm': tuple(map(float, o.odometer_lever_arm)),
+        'imu.lever_arm': tuple(map(float, o.imu_lever_arm)),
         'gnss.lever_arm': tuple(map(float, o.antenna_lever_arm)),
         'imu.mounting_rpy': tuple(map(float, o.mounting_rpy)),
         'imu.grade': 'navigation' if o.imu_grade == 'perfect' else o.imu_grade,

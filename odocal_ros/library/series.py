@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
-from odocal_ros.nav.dead_reckoning import Origin
+from odocal_ros.nav.dead_reckoning import forward_b, Origin
 from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 
 Series = dict[str, NDArray[Any]]
@@ -87,7 +87,8 @@ def _vehicle(leg: LegResult, smoothed: dict[str, Any]) -> Floats:
     from odocal_ros.calib.smoother.state import C_bv
     found = leg.methods['smoother'].estimates
     yaw, pitch = (found[f'{name}_mounting_angle'].value or 0.0 for name in ('yaw', 'pitch'))
-    C_nv: Floats = _rows(smoothed, smoothed['key_C_nb']) @ C_bv(yaw, pitch)
+    C_nb = smoothed['key_C_nb']
+    C_nv: Floats = _rows(smoothed, C_nb) @ C_bv(forward_b(yaw, pitch), C_nb[:, 2].mean(axis=0))
     return C_nv
 
 

@@ -148,4 +148,5 @@ def _state(motion: _Motion, key: Ints) -> State:
     """Return the true state at the keyframes."""
     N = len(key)
     return State(motion.t[key], motion.p_n[key], motion.v_n[key], motion.C_nb[key],
-                 np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)), np.zeros(M))
+                 np.zeros((N, 3)), np.zeros((N, 3)), np.zeros(N), np.zeros((N, 3)),
+                 np.zeros(M)).level()

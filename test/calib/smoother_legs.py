@@ -16,9 +16,11 @@ from drives import settings
 import numpy as np
 
 from odocal_ros.calib.smoother import keyframe_times, smoother_leg
-from odocal_ros.calib.smoother.state import C_bv, GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
+from odocal_ros.calib.smoother.state import GNSS_DELAY, LN_K, M, ODO_DELAY, PITCH, State, YAW
 from odocal_ros.data.samples import VelocitySamples
+from odocal_ros.nav.dead_reckoning import mounting_from_forward
 from odocal_ros.nav.earth import C_en
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.nav.standstill import standstills
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import screen
@@ -63,7 +65,7 @@ def with_velocity(drive, errors, stated=VELOCITY_SIGMA**2):
 
 
 def truth(drive, config, leg) -> State:
-    """Return the true state at the keyframes of a leg; Imu and odometer at the axle."""
+    """Return the true state at the keyframes of a leg, on level ground."""
     o = drive.options
     t = keyframe_times(leg, config)
     since = t + (drive.truth.start_ns - o.start_ns) * 1e-9
@@ -71,16 +73,20 @@ def truth(drive, config, leg) -> State:
     to_n = C_en(leg.origin.latitude, leg.origin.longitude).T @ C_en(state.latitude,
                                                                     state.longitude)
     C_nb = to_n @ motion.attitude(state)
+    arm_n = C_nb @ np.array(o.imu_lever_arm)
+    turning = np.stack([0 * since, 0 * since, state.yaw_rate], -1)
     if drive.motion.tilt:
         C_nb = C_nb @ body.rotation(drive.motion, since)
-    C_nb = C_nb @ C_bv(o.yaw, o.pitch).T
+    C_vb = matrix_from_rpy([o.roll, o.pitch, o.yaw])
+    C_nb = C_nb @ C_vb
     v_n = np.einsum('kij,kj->ki', to_n, motion.velocity_n(state))
     p_n = leg.origin.to_n(np.stack([state.latitude, state.longitude, state.height], -1))
     constants = np.zeros(M)
     constants[[LN_K, YAW, PITCH, ODO_DELAY, GNSS_DELAY]] = (
-        np.log(o.scale), o.yaw, o.pitch, o.odometer_delay, o.fix_delay)
-    return State(t, p_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
-                 np.zeros((len(t), 3)), constants)
+        np.log(o.scale), *mounting_from_forward(C_vb[0]), o.odometer_delay, o.fix_delay)
+    v_n = v_n + np.cross(turning, arm_n)
+    return State(t, p_n + arm_n, v_n, C_nb, *_biases(drive, since), np.zeros(len(t)),
+                 np.zeros((len(t), 3)), constants).level()
 
 
 def _biases(drive, since):

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
+from odocal_ros.calib.smoother.axle import Axle
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import ACCEL, BARE, LEAN, M, PITCH, TYRES, YAW
 from odocal_ros.nav.dead_reckoning import forward_b
+from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.real_wheels import G
 
@@ -74,6 +76,41 @@ def test_a_turn_is_no_braking():
     assert len(turns) > 3 < len(straight)
     # the air's resistance at other speeds: 2e-5 of it; taken for braking, turns were 1e-3 off
     assert np.abs(turns - np.median(straight)).max() < 1e-4
+
+
+def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
+    """An Imu 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
+    found = []
+    for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
+        drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
+                                  imu_lever_arm=arm)
+        problem = Problem.of(leg, config)
+        state = truth(drive, config, leg)
+        axle = Axle(problem, state)
+        found.append((axle.pushes()[:, :2], axle.speeding_up(), problem))
+    (at_axle, ahead, problem), (pushed, faster, _) = found
+    change = np.abs(np.diff(problem.rate_b[:, 2])).max()
+    assert change > 0.15
+    # a turn that begins amid the 0.1 s over which rates are means: a quarter of 0.05 s of its
+    # change is missing, at both ends, 0.9 m from the axle
+    most = 2 * 0.9 * change * 0.05 / 4
+    assert np.abs(pushed - at_axle).max() < most
+    assert np.abs(faster - ahead).max() < most
+
+
+def test_a_lean_is_level_though_the_imu_is_rolled():
+    """About axes of an Imu that is rolled by 5 deg a squat were a tenth of a sideslip too."""
+    roll = 0.09
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, roll=roll)
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    motion = Equations(problem, state, problem.sums(state)).parts['motion'].motion
+    C_nv = state.C_nb[:-1] @ matrix_from_rpy([roll, drive.options.pitch, drive.options.yaw]).T
+    by = np.swapaxes(C_nv, 1, 2) @ motion.jacobians(BARE)[2][:, 15:18, LEAN]
+    sizes = np.linalg.norm(by, axis=1).max(axis=0)
+    assert (sizes > 0.1).all()
+    # the axis of the mounting's pitch is level to the second order of yaw and pitch, 1 deg each
+    assert np.abs(by[:, 1, 0]).max() < 0.005 * sizes[0]
+    assert np.abs(by[:, 2, 1]).max() < 0.005 * sizes[1]
 
 
 @pytest.mark.parametrize(('real', 'axis'), [(Real(sideslip=0.005), 1), (Real(squat=0.005), 2)])

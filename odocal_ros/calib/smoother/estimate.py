@@ -160,7 +160,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
-    count = 0
+    count, state = 0, state.level()
     while True:
         count += 1
         sums = problem.sums_near(state)

@@ -23,7 +23,6 @@ from odocal_ros.calib.smoother.state import (
     BA,
     BARE,
     BG,
-    C_bv_gradient,
     FIX_LAG2,
     GNSS_ARM,
     GNSS_DELAY,
@@ -97,8 +96,7 @@ class Fixes(PointRows):
         J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
         if n > BARE:
             J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
-        yaw, pitch = self.state.constants[YAW], self.state.constants[PITCH]
-        by_yaw, by_pitch = C_bv_gradient(yaw, pitch)
+        by_yaw, by_pitch = self.state.C_bv_gradient()
         c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before

@@ -17,10 +17,11 @@ of the Earth rate (what is left is below 1e-8 of the motion), gravity where the 
 """
 
 from copy import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.axle import Axle, varies_with
 from odocal_ros.calib.smoother.preintegrate import Intervals, turn
 from odocal_ros.calib.smoother.state import (
     ACCEL,
@@ -28,9 +29,7 @@ from odocal_ros.calib.smoother.state import (
     ACCEL_SIGNAL,
     BA,
     BG,
-    C_bv_gradient,
     E,
-    FAST_SPEED,
     GYRO,
     GYRO_AXIS,
     GYRO_SIGNAL,
@@ -53,6 +52,9 @@ from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en, earth_rate_n, gravity
 from odocal_ros.nav.rotations import exp_so3, skew, transpose
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
 
 D = slice(E, E + 3)     # rows of the odometer, after those of the other unknowns
 ROWS = D.stop
@@ -79,51 +81,6 @@ def gravity_n(position_n: Floats, origin: Origin) -> Floats:
     return down
 
 
-def pushes(state: State) -> Floats:
-    """
-    Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
-
-    Acceleration forward and left, m/s^2, and their change, m/s^3.
-    """
-    T = np.diff(state.t)[:, None]
-    # by the axes at mid interval: those at its begin would take the push of a turn for braking
-    C_vn = np.swapaxes(state.C_nb @ state.C_bv, 1, 2)
-    accel = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(state.v_n, axis=0) / T)[:, :2]
-    jerk = np.gradient(accel, axis=0) / T if len(T) > 1 else np.zeros_like(accel)
-    return np.concatenate([accel, jerk], axis=1)
-
-
-def forward_speed(state: State) -> Floats:
-    """Return the speed along the vehicle at each keyframe: (N,) m/s."""
-    out: Floats = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
-    return out
-
-
-def speeding_up(state: State) -> Floats:
-    """
-    Return by how much the way is driven faster, what tyres pull for, in each interval: (K,) m/s^2.
-
-    Of speeds, since a vehicle that slides in a turn has part of its push ahead.
-    """
-    return np.diff(np.abs(forward_speed(state))) / np.diff(state.t)
-
-
-def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
-    """Return what the scale varies with, docs/method.md (S11), as TYRES has it: (..., 4)."""
-    # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
-    force = faster + 0.1 + 1e-4 * speed**2
-    return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
-                     np.minimum(force, 0.0)], -1)
-
-
-def means_by_way(sums: Intervals, state: State) -> Floats:
-    """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""
-    way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
-    t = (state.t[1:] + state.t[:-1]) / 2
-    out: Floats = way @ varies_with(way / sums.T, t, speeding_up(state)) / max(way.sum(), 1e-9)
-    return out
-
-
 class Motion:
     """
     The interval equations at one state.
@@ -135,15 +92,16 @@ class Motion:
         the fit then takes for information, and a smaller signal for a better one.
     """
 
-    def __init__(self, leg: SmootherLeg, state: State, intervals: Intervals,
+    def __init__(self, problem: 'Problem', state: State, intervals: Intervals,
                  change: tuple[Floats | float, float] = (0.0, 0.0), fitted: bool = False) -> None:
+        leg, self.axle = problem.leg, Axle(problem, state)
         self.state, self.sums, self.fitted = state, intervals, fitted
         self.by_steps = leg.by_steps
         T = self.T = intervals.T[:, None]
         self.C, self.C_end = state.C_nb[:-1], state.C_nb[1:]
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
         self.f = state.scale * state.forward
-        self.by_yaw, self.by_pitch = C_bv_gradient(state.constants[YAW], state.constants[PITCH])
+        _, self.left, self.up = state.C_bv.T
         w = earth_rate_n(leg.origin.latitude)
         W = skew(w)
         self.f_n, self.f_n_end = self.C @ self.f, self.C_end @ self.f
@@ -189,14 +147,14 @@ class Motion:
     def _vary(self) -> None:
         """Work out how scale and forward axis change on the way: docs/method.md (S11), (S12)."""
         state, T, c = self.state, self.T, self.state.constants
-        self.pushed = pushes(state)
+        self.pushed = self.axle.pushes()
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
-        self.from_mean = varies_with(speed, t, speeding_up(state)) - means_by_way(self.sums, state)
+        self.from_mean = varies_with(
+            speed, t, self.axle.speeding_up()) - self.axle.means_by_way(self.sums)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
-        self.leaned = state.scale * (np.outer(pitch, self.by_pitch[:, 0])
-                                     + np.outer(yaw, self.by_yaw[:, 0]))
+        self.leaned = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
 
     def _unsaid(self, coarse: CoarseSpeed | None) -> Floats | None:
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
@@ -209,8 +167,8 @@ class Motion:
 
     def _faster(self) -> Floats:
         """Return the derivative of the way by a delay of the odometer: (K, 3)."""
-        state = self.state
-        return (self.f_n + self.f_n_end) / 2 * np.diff(forward_speed(state) / state.scale)[:, None]
+        faster = np.diff(self.axle.wheel / self.state.scale)
+        return (self.f_n + self.f_n_end) / 2 * faster[:, None]
 
     def jacobians(self, n: int) -> tuple[Floats, Floats, Floats]:
         """Return derivatives by begin, end and constants: (K, 18, n), (K, 18, n), (K, 18, M)."""
@@ -247,10 +205,12 @@ class Motion:
         c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
         c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]
-        for i, column, gradient in ((0, PITCH, self.by_pitch), (1, YAW, self.by_yaw)):
-            turned = -(C @ s.S @ (state.scale * gradient[:, 0]))
-            c[:, D, column] = turned + swing @ gradient @ self.arm_v
-            c[:, D, LEAN.start + i:LEAN.stop:2] = turned[:, :, None] * self.pushed[:, None, i::2]
+        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
+            c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
+                + swing @ gradient @ self.arm_v
+        for i, axis in enumerate((self.up, -self.left)):
+            turned = C @ s.S @ (state.scale * axis)
+            c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
         c[:, D, ODO_ARM] = swing @ state.C_bv
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid

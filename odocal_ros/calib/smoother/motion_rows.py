@@ -50,7 +50,7 @@ class MotionRows(Part):
 
     def __init__(self, problem: 'Problem', here: Here) -> None:
         change = here.gyro_change, here.odo_later
-        self.motion = Motion(problem.leg, here.state, here.intervals, change, here.fitted)
+        self.motion = Motion(problem, here.state, here.intervals, change, here.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.noise = interval_noise(self.motion, problem.leg,
                                     problem.still[:-1] & problem.still[1:], here.spread)

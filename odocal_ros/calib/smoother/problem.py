@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from odocal_ros.calib.smoother.axle import rates_at
 from odocal_ros.calib.smoother.equations import PARTS
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
@@ -76,6 +77,7 @@ class Problem:
     outside: dict[str, Velocity | Heading]    # within the keyframes, where there are any
     turned: float            # rad, in turns
     fix_time: float          # s, as gnss.correlation_time: 0 white, NaN to be judged
+    rate_b: np.ndarray       # (N, 3) rad/s, measured at the keyframes
     first_levels: Levels = field(default_factory=lambda: Levels({}))
     least: dict[str, float] = field(default_factory=dict)     # levels
     shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
@@ -93,7 +95,7 @@ class Problem:
         grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, root, still, used(leg, t),
-                   turned(leg, imu), config.gnss.correlation_time)
+                   turned(leg, imu), config.gnss.correlation_time, rates_at(imu.t, imu.w_b, t))
         for part in PARTS:
             if part.there(made):
                 first, least = part.first_levels(made)

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.motion import gravity_n, means_by_way, speeding_up, varies_with
+from odocal_ros.calib.smoother.axle import Axle, varies_with
+from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
 from odocal_ros.calib.smoother.preintegrate import turn
@@ -26,7 +27,6 @@ from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
     BG,
-    C_bv_gradient,
     GYRO_SCALE,
     LN_K,
     M,
@@ -73,9 +73,10 @@ class SpeedSteps(PointRows):
         self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g) + np.einsum(
             'ki,ki->k', np.cross(points.rate, state.forward), self.v_b)
         c = state.constants
+        axle = Axle(problem, state)
         self.from_mean = varies_with(
-            self.speed, state.t[self.k] + points.tau, speeding_up(state)[self.k]
-        ) - means_by_way(here.intervals, state)
+            self.speed, state.t[self.k] + points.tau, axle.speeding_up()[self.k]
+        ) - axle.means_by_way(here.intervals)
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.told.value + self.told.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
@@ -119,8 +120,7 @@ class SpeedSteps(PointRows):
         c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.told.side
         c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
-        for column, gradient in zip((YAW, PITCH), C_bv_gradient(
-                state.constants[YAW], state.constants[PITCH]), strict=True):
+        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv

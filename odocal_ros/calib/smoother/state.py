@@ -16,14 +16,14 @@ travel error is that of the odometer's reading at the keyframe (quantisation: bo
 units. The constants are the border.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
-from odocal_ros.nav.rotations import exp_so3, matrix_from_rpy
+from odocal_ros.nav.rotations import exp_so3
 
 Floats = NDArray[np.float64]
 # the unknowns of a block, one after the other, and how many each has
@@ -110,6 +110,7 @@ class State:
     t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the Imu, m, m/s.   C_nb : (N, 3, 3).
     gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
     slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
+    up_b : (3,) up in b, in the mean of the leg: what the Imu's roll on the vehicle is told by.
     """
 
     t: Floats
@@ -121,6 +122,7 @@ class State:
     travel_error: Floats
     slow_n: Floats
     constants: Floats
+    up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @property
     def scale(self) -> float:
@@ -134,9 +136,18 @@ class State:
 
     @property
     def C_bv(self) -> Floats:
-        """Return the rotation from vehicle to body axes, roll 0: (3, 3)."""
-        out: Floats = C_bv(self.constants[YAW], self.constants[PITCH])
-        return out
+        """Return the rotation from vehicle to body axes: (3, 3)."""
+        return C_bv(self.forward, self.up_b)
+
+    def level(self) -> 'State':
+        """Return the state with what its attitudes tell of the Imu's roll."""
+        return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
+
+    def C_bv_gradient(self) -> tuple[Floats, Floats]:
+        """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
+        C, up = self.C_bv, self.up_b
+        by_yaw, by_pitch = forward_gradient(self.constants[YAW], self.constants[PITCH])
+        return _turned_axes(C, up, by_yaw), _turned_axes(C, up, by_pitch)
 
     def moved(self, step: Floats, step_constants: Floats) -> 'State':
         """Return the state with an increment of every unknown: (N, n), (M,)."""
@@ -162,17 +173,31 @@ def upright(constants: Floats) -> Floats:
     return out
 
 
-def C_bv(yaw: float, pitch: float) -> Floats:
-    """Return the rotation from vehicle to body axes for mounting angles, rad, roll 0."""
-    return matrix_from_rpy([0.0, pitch, yaw]).T
+def C_bv(forward: Floats, up: Floats) -> Floats:
+    """
+    Return the rotation from vehicle to body axes, forward, left, up in columns: (3, 3).
+
+    forward, up : (3,) in b. The left axis is level: nothing in the motion of a point tells roll.
+    """
+    left = np.cross(up, forward)
+    left = left / np.linalg.norm(left)
+    return np.stack([forward, left, np.cross(forward, left)], -1)
 
 
-def C_bv_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
-    """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
+def _turned_axes(C: Floats, up: Floats, by_forward: Floats) -> Floats:
+    """Return the derivative of C_bv by what turns the forward axis by ``by_forward``: (3, 3)."""
+    forward, left = C[:, 0], C[:, 1]
+    size = np.linalg.norm(np.cross(up, forward))
+    by_left = np.cross(up, by_forward) / size
+    by_left = by_left - left * (left @ by_left)
+    return np.stack([by_forward, by_left,
+                     np.cross(by_forward, left) + np.cross(forward, by_left)], -1)
+
+
+def forward_gradient(yaw: float, pitch: float) -> tuple[Floats, Floats]:
+    """Return the derivatives of the forward axis by yaw and by pitch: two (3,)."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    by_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
-    by_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
-    return by_yaw, by_pitch
+    return np.array([-sy * cp, -cy, -sy * sp]), np.array([-cy * sp, 0.0, cy * cp])
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,6 @@ from odocal_ros.calib.smoother.state import (
     BA,
     BARE,
     BG,
-    C_bv_gradient,
     GNSS_ARM,
     GNSS_DELAY,
     GYRO_SCALE,
@@ -77,7 +76,7 @@ def _velocity(problem: 'Problem', state: State, points: Points, later: float) ->
     J[:, :, BA] = C * t
     # a turn rate less by the bias: half the turn acts on what force did, all of it on the arm
     J[:, :, BG] = -(skew(dv) / 2 + skew(swing)) @ C * t - C_t @ skew(arm_b)
-    by_yaw, by_pitch = C_bv_gradient(state.constants[YAW], state.constants[PITCH])
+    by_yaw, by_pitch = state.C_bv_gradient()
     W = C_t @ skew(points.rate)
     c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
     c[:, :, GNSS_ARM] = -W @ state.C_bv

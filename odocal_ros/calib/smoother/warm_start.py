@@ -30,6 +30,8 @@ from odocal_ros.calib.smoother.start import SPEED_WINDOW
 from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
 from odocal_ros.data.arrays import Floats
 
+OF_LEG = ('constants', 'up_b')    # of a state what has no row for each keyframe
+
 
 def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
     """
@@ -58,7 +60,7 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     if n < 2 or t[n - 1] < old[-1] - 3.0:       # s at the end, where rows may have come late
         return None
     at = at[:n]
-    state = State(**{name: value if name == 'constants' else value[at]
+    state = State(**{name: value if name in OF_LEG else value[at]
                      for name, value in vars(last.state).items()})
     slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
     spread = np.concatenate([slipped, np.ones((len(t) - n, SPREAD))])
@@ -75,7 +77,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     rows = replace(imu, key=key)
     K, c = len(key) - 1, state.constants
     on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
-          for name, value in vars(state).items() if name != 'constants'}
+          for name, value in vars(state).items() if name not in OF_LEG}
     t = on['t'] = imu.t[imu.key]
     on['travel_error'][n:] = 0.0
     f = state.scale * state.forward

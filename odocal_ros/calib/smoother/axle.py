@@ -1,0 +1,97 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the vehicle's axle does: springs and tyres answer to its pushes, not to those at the Imu.
+
+An Imu half a metre beside it feels half a metre times the change of the turn rate as a push ahead,
+in left turns and right ones with opposite signs, which a wheel that slips would turn into way.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from odocal_ros.calib.smoother.preintegrate import Intervals, turn
+from odocal_ros.calib.smoother.state import FAST_SPEED, ODO_ARM, State
+from odocal_ros.data.arrays import Floats
+
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.problem import Problem
+
+RATE_WINDOW = 0.1    # s about a keyframe, in which vibration averages down
+
+
+def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
+    """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
+    first = np.searchsorted(t, at - RATE_WINDOW / 2)
+    last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
+    return np.stack([w_b[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
+
+
+class Axle:
+    """
+    Speeds and pushes of the origin of base_link, where the vehicle does not slide, at one state.
+
+    v_n : (N, 3) its velocity at the keyframes, m/s.   wheel : (N,) speed along the vehicle where
+    the odometer is, m/s.
+    """
+
+    def __init__(self, problem: 'Problem', state: State) -> None:
+        self.state = state
+        leg = problem.leg
+        rate = problem.rate_b - state.gyro_bias
+        arm = state.constants[ODO_ARM] - leg.imu_arm
+
+        def at(arm_v: Floats) -> Floats:
+            return state.v_n + turn(state.C_nb, np.cross(rate, state.C_bv @ arm_v))
+
+        self.v_n = at(arm)
+        self.wheel = self._ahead(at(arm + leg.odometer_arm))
+
+    def _ahead(self, v_n: Floats) -> Floats:
+        speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
+        return speed
+
+    def pushes(self) -> Floats:
+        """
+        Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
+
+        Acceleration forward and left, m/s^2, and their change, m/s^3.
+        """
+        T = np.diff(self.state.t)[:, None]
+        # by the axes at mid interval: those at its begin would take the push of a turn for braking
+        C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
+        accel = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
+        jerk = np.gradient(accel, axis=0) / T if len(T) > 1 else np.zeros_like(accel)
+        return np.concatenate([accel, jerk], axis=1)
+
+    def speeding_up(self) -> Floats:
+        """
+        Return by how much the way is driven faster, what tyres pull for, in each interval: (K,).
+
+        In m/s^2; of speeds, since a vehicle that slides in a turn has part of its push ahead.
+        """
+        return np.diff(np.abs(self._ahead(self.v_n))) / np.diff(self.state.t)
+
+    def means_by_way(self, sums: Intervals) -> Floats:
+        """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""
+        state = self.state
+        way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
+        t = (state.t[1:] + state.t[:-1]) / 2
+        mean: Floats = way @ varies_with(way / sums.T, t, self.speeding_up()) / max(way.sum(), 1e-9)
+        return mean
+
+
+def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
+    """Return what the scale varies with, docs/method.md (S11), as TYRES has it: (..., 4)."""
+    # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
+    force = faster + 0.1 + 1e-4 * speed**2
+    return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
+                     np.minimum(force, 0.0)], -1)
