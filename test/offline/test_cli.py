@@ -15,6 +15,7 @@ import sys
 
 import pytest
 
+from odocal_ros import __version__
 from odocal_ros.errors import BadBag
 from odocal_ros.offline import cli
 
@@ -84,3 +85,9 @@ def test_help_imports_nothing_heavy():
     done = subprocess.run([sys.executable, '-c', probe], capture_output=True, text=True,
                           check=True)
     assert done.stderr.strip() == '[]'
+
+
+def test_the_package_run_as_a_module_is_the_command():
+    result = subprocess.run([sys.executable, '-m', 'odocal_ros', '--version'], text=True,
+                            capture_output=True, check=True)
+    assert result.stdout == f'odocal_ros {__version__}\n'

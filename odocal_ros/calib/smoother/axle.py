@@ -85,7 +85,8 @@ class Axle:
         state = self.state
         way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
-        mean: Floats = way @ varies_with(way / sums.T, t, self.speeding_up()) / max(way.sum(), 1e-9)
+        share = way / max(way.sum(), 1e-9)
+        mean: Floats = share @ varies_with(way / sums.T, t, self.speeding_up())
         return mean
 
 
