@@ -27,8 +27,9 @@ import numpy as np
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.result import Source
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_step
+from odocal_ros.data.pieces import by_row, by_step
 from odocal_ros.nav.alignment import Alignment
+from odocal_ros.nav.dead_reckoning import Track
 from odocal_ros.nav.earth import A
 from odocal_ros.nav.rotations import matrix_from_quat, skew
 
@@ -223,6 +224,17 @@ def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: f
     # the square of one Gaussian: mean m, standard deviation sqrt(2) m, rms sqrt(3) m
     size = 0.5 * np.sqrt(3) * np.linalg.norm([by_bias, by_noise, by_height])
     return Source('second_order', np.array([[size], [0.0], [0.0]]))
+
+
+def epochs_between(track: Track, begin: float, end: float) -> slice:
+    """Return which epochs of a track lie between two times, s, those at them too."""
+    return slice(np.searchsorted(track.t, begin), np.searchsorted(track.t, end, side='right'))
+
+
+def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
+    """Return how far f takes a track at some epochs from where it is at t_start: (m, 3) m."""
+    start = track.at(t_start)
+    return by_row(lambda P: (P - start) @ f, track.P[rows])
 
 
 def total_covariance(sources: Iterable[Source]) -> Floats:

@@ -11,7 +11,7 @@
 
 from odocal_ros.settings.levels import TYRE_SPREAD
 
-ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change of a scale beyond what any tyres do
+ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change of a scale beyond any tyres: physical
 TYRES = 'tyre pressure, wear, load or another tyre'
 OTHER = 'another vehicle, gear, counter or unit: no tyre changes so much'
 

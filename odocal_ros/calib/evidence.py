@@ -27,7 +27,7 @@ from odocal_ros.nav.rotations import yaw_from_quat
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
-KEPT_ROWS = 5000       # of each kind kept in a result: more than a screen has columns
+KEPT_ROWS = 5000       # of each kind kept in a result, more than a screen has columns: judgement
 
 
 @dataclass(frozen=True, eq=False)

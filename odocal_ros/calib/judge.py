@@ -17,7 +17,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
-# ratio to the nominal scale, by unit of the scale: what sends such a number
+# ratio to the nominal scale, by unit of the scale: what sends such a number. Physical, definitions
 MISTAKEN = {
     '1': {1 / 3.6: 'speeds in km/h', 0.44704: 'speeds in mph', 1852 / 3600: 'speeds in knots',
           0.3048: 'speeds in ft/s', 0.01: 'speeds in cm/s', 1e-3: 'speeds in mm/s'},

@@ -135,7 +135,7 @@ class LinkedLegs:
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """
-        Return the legs' cost when they are one vehicle's, and what it should be.
+        Return chi-square of the legs as one vehicle's, and its degrees of freedom: (S36).
 
         Of what legs determine at least as well as the priors: farther off than that their
         equations need not be true.
@@ -151,10 +151,10 @@ class LinkedLegs:
 
     def deviations(self, spread: dict[str, float] | None = None) -> Floats:
         """
-        Return by how much each leg's constants differ from those by the others, in sigmas: (J, m).
+        Return the normalised residual of each leg's constants against the others': (J, m) sigmas.
 
-        The leg's pull at the joint estimate over its own sigma, each constant alone: the test of
-        one more unknown, as if the leg were left out (Baarda 1968).
+        The leg's gradient at the joint estimate over its own sigma, each constant alone: the test
+        of one more unknown, as if the leg were left out (Baarda 1968), docs/method.md (S37).
         """
         x, C = self.solve(spread)
         out = np.zeros((len(self.borders), len(self.names)))
@@ -170,7 +170,7 @@ class LinkedLegs:
 
 
 def _left(A: Floats, b: Floats, keep: Ints) -> tuple[Floats, Floats]:
-    """Return rows of some unknowns, the others taken out, and what they should be."""
+    """Return rows of some unknowns, the others eliminated by QR, and what they should be."""
     gone = np.setdiff1d(np.arange(A.shape[1]), keep)
     # orthogonal rows of which only the first hold what is eliminated
     R = np.asarray(np.linalg.qr(np.column_stack([A[:, gone], A[:, keep], b]), mode='r'))

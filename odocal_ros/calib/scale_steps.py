@@ -19,7 +19,8 @@ from odocal_ros.calib.linked_legs import LinkedLegs
 from odocal_ros.data.arrays import Floats
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-FREE_STEP = 1.0     # 1 sigma of ln K where it changes for good: any tyre, gear or counter
+# 1 sigma of ln K where it changes for good, by any tyre, gear or counter: physical
+FREE_STEP = 1.0
 
 
 @dataclass(frozen=True)

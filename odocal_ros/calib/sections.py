@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Complexes, Floats
 
-BLOCK_LAGS = (1, 3)        # blocks, at which the correlation of what a fit leaves is looked at
+# blocks, at which the correlation of what a fit leaves is looked at: judgement, the next and one
+# that white noise on top does not hide
+BLOCK_LAGS = (1, 3)
 Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
 # correlation of errors from block to block: a grid, finer where a stretch's sigma grows faster
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])

@@ -30,9 +30,10 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
-SPIN_GRID = 0.2      # s between rows: a spin lasts longer
-PIN_STEPS = 2        # rows each side that the speed at an end is taken over
-SPIN_TURN = 0.1      # rad in a window: in more of a turn the level's error is another axis'
+SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
+PIN_STEPS = 2        # rows each side that the speed at an end is taken over: judgement
+# rad in a window: in more of a turn the level's error is another axis'. Judgement
+SPIN_TURN = 0.1
 # odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
 # window, its own ends 1 more; the rest is margin
 PIN_COUNTS = 8.0

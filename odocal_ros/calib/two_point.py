@@ -27,6 +27,8 @@ from odocal_ros.calib.budget import (
     budget,
     budget_table,
     correlations,
+    displacement,
+    epochs_between,
     parameter_gradient,
     PARAMETERS,
     total_covariance,
@@ -36,7 +38,6 @@ from odocal_ros.calib.mounting import BACKWARDS_YAW, FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.slip import slip_source
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward, Origin, Track
@@ -46,7 +47,8 @@ from odocal_ros.settings.config import Config
 
 # rad, prior sigma of the pitch where heights say nothing: physical, what holders and loads do
 PITCH_PRIOR = 0.05
-PITCH_LIMIT = 0.26    # rad: a pitch beyond 15 deg is a height gone wrong, not a mounting
+# rad: a pitch beyond 15 deg is a height gone wrong, not a mounting. Physical, judgement
+PITCH_LIMIT = 0.26
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,17 +211,6 @@ def _sources(chord: Chord, f: Floats, vertical_known: bool, quantum: float, fix_
                   velocity_change=chord.velocity_change @ f,
                   lever_arm_sigma=config.gnss.lever_arm_sigma,
                   odometer_time_sigma=config.odometer.time_sigma)
-
-
-def epochs_between(track: Track, begin: float, end: float) -> slice:
-    """Return which epochs of a track lie between two times, s, those at them too."""
-    return slice(np.searchsorted(track.t, begin), np.searchsorted(track.t, end, side='right'))
-
-
-def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats:
-    """Return how far f takes a track at some epochs from where it is at t_start: (m, 3) m."""
-    start = track.at(t_start)
-    return by_row(lambda P: (P - start) @ f, track.P[rows])
 
 
 def _doubt(chord: Chord, f: Floats) -> tuple[Source, ...]:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.budget import drift_sources
+from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.check import (
     against_travel,
     bent,
@@ -31,8 +31,6 @@ from odocal_ros.calib.slip import find_slips, rounding, slip_reason, SPIN_WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import (
     Chord,
-    displacement,
-    epochs_between,
     fit,
     refusal,
     solve,

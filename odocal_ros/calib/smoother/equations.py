@@ -100,7 +100,7 @@ class Weighted:
 
     def components(self, neighbours: Neighbours) -> dict[str, tuple[float, float]]:
         """
-        Return for each variance component its quadratic sum and what is expected of it.
+        Return for each variance component its quadratic sum and its expectation: (S26).
 
         The restricted likelihood has its maximum where, for every component of level s with
         covariance s V, r' R^-1 s V R^-1 r equals the trace of R^-1 s V less that of the part the

@@ -205,7 +205,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
 def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
            pace: dict[str, tuple[float, float]], slipping: bool = False) -> Levels:
     """
-    Return levels moved towards the maximum of the restricted likelihood.
+    Return levels one step on to the maximum of the restricted likelihood: docs/method.md (S27).
 
     pace : power and last step of each level, kept up to date.   slipping : leave levels alone that
     slips and jumps are factors on.

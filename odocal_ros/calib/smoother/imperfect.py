@@ -38,7 +38,7 @@ SAME_SIGMAS = 1e-3      # relative change of prior sigmas that is none
 
 def mixture_prior(data: Floats, pull: Floats, odds: float = 0.5) -> tuple[Floats, float]:
     """
-    Return how large errors of one kind are to be taken for.
+    Return prior variances of one kind of errors by their evidence: docs/method.md (S28), (S29).
 
     Parameters
     ----------

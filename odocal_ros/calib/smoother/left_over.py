@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.smoother.chain import blocks, Neighbours
+from odocal_ros.calib.smoother.equations import Weighted
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -51,6 +52,16 @@ def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray
     rows = {**_of_intervals(fit), 'fix': _of_fixes(fit)}
     return {f'left_{name}': np.concatenate(pair, axis=1).astype(np.float32)
             for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
+
+
+def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
+    """Return the whitened residuals' rms and tails by sensor, before weights take off tails."""
+    motion, fixes = weighted[MotionRows].r, weighted[Fixes]
+    white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
+    return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
+                   'beyond_3_sigma': float((np.abs(r) > 3).mean())}
+            for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
+                            ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
 
 
 def _of_intervals(fit: Fit) -> dict[str, tuple[Floats, Floats]]:

@@ -23,7 +23,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: grades are 5 apart
+WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
 BY_SHAKING = 'the Imu errs more than its grade, in ways that are not white noise'
 SHAKEN = ('What shakes an Imu is no white noise; the sigmas were widened. Mount it firmly and '
           'away from the engine.')

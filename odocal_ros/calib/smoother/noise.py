@@ -37,8 +37,9 @@ GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 # rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s
 TURNING_RATE = 0.05
-REST_NOISE = 5e-4       # m that an odometer at rest may err by in a second, at least: play
-ABSENT_VARIANCE = 1e4   # m^2: no odometer
+# m that an odometer at rest may err by in a second, at least: physical, play of a drive train
+REST_NOISE = 5e-4
+ABSENT_VARIANCE = 1e4   # m^2, of a way that no odometer says: nothing is known of it
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,11 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
-from odocal_ros.calib.smoother.equations import Weighted
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
-from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over
+from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over, normalised
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.mismatch import mismatch
-from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, model_floor, remarks
@@ -43,9 +41,7 @@ from odocal_ros.calib.smoother.state import (
     LN_K,
     M,
     ODO_ARM,
-    PHI,
     PITCH,
-    V,
     YAW,
 )
 from odocal_ros.data.arrays import Floats
@@ -268,7 +264,7 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'residuals': {'fix_rms_in_sigmas': float(np.sqrt((fixes.r[:, :2]**2).mean())),
                       'fix_correlation_2s': alike,
                       'fixes_downweighted': int((fixes.weight[:, 0] < 0.5).sum()),
-                      'fixes': len(t_fix), 'normalised': _normalised(fit.weighted),
+                      'fixes': len(t_fix), 'normalised': normalised(fit.weighted),
                       'intervals_slipping': int((fit.spread[:, 0] > SLIP_VARIANCE).sum())},
         'excitation': {'distance': float(np.linalg.norm(motion.way, axis=1).sum()),
                        'speed_changes': float(np.abs(np.diff(speed)).sum()),
@@ -278,16 +274,6 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
         'key_t': state.t, 'key_C_nb': state.C_nb, 'gyro_bias': state.gyro_bias.mean(axis=0),
         'key_biases': np.stack([state.gyro_bias, state.accel_bias]),
     }
-
-
-def _normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
-    """Return how the rows of each sensor lie in their sigmas, before weights take off tails."""
-    motion, fixes = weighted[MotionRows].r, weighted[Fixes]
-    white = fixes.r / np.sqrt(fixes.weight / fixes.per_effective)
-    return {name: {'rms': float(np.sqrt((r**2).mean())), 'rows': r.size,
-                   'beyond_3_sigma': float((np.abs(r) > 3).mean())}
-            for name, r in (('gyro', motion[:, PHI]), ('accelerometer', motion[:, V]),
-                            ('odometer', motion[:, D]), ('fixes, level', white[:, :2]))}
 
 
 def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,

@@ -31,7 +31,8 @@ from odocal_ros.settings.config import Config
 
 Floats = NDArray[np.float64]
 VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say: physical, Doppler
-HEADING_RATE = 5.0          # Hz: receivers' errors of a heading stay longer than that
+# Hz: physical, errors of a heading stay longer than a fifth of a second
+HEADING_RATE = 5.0
 GIVEN_HEADING_NOISE = 1e-4  # rad, of a heading given at the mark, beside its error: next to none
 
 

@@ -120,7 +120,7 @@ class Part:
         return 0.0
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
-        """Return of each level its quadratic sum and what is expected of it."""
+        """Return of each level its quadratic sum and the redundancy of its rows, (S26)."""
         return {}
 
     def effects(self, near: Neighbours) -> Iterable[tuple[str, Floats]]:

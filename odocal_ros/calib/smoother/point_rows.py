@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # sigmas beyond which a row, or a slip of an interval, has a heavy tail. Statistical: one sound row
 # in 370 loses some of its weight
 TAIL_SIGMAS = 3.0
-FEWEST_JUDGED = 5    # rows, of which one may be an outlier
+FEWEST_JUDGED = 5    # rows, of which one may be an outlier: judgement
 
 
 Gather = Callable[[Floats], Floats]     # rows (m, d, c) to (intervals, d most, c)
@@ -221,7 +221,7 @@ class PointRows(Part):
 
 
 def alike(rows: PointRows) -> float:
-    """Return how many neighbouring errors are as good as one, by the spread of their means."""
+    """Return rows per effective one (1: independent), by the spread of means of neighbours."""
     r = rows.r / np.sqrt(rows.weight)
     r = (r - np.median(r, axis=0))[:, :2]       # the level ones tell scale and yaw
     scale = np.median(np.abs(r), axis=0) / NORMAL_MEDIAN

@@ -34,10 +34,10 @@ from odocal_ros.data.arrays import Floats
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-# where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up
+# where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up.
+# Judgement, far wider than any data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
-    'position': (P, 1e4), 'velocity': (V, 100.0),
-                'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
+    'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
 # priors of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': constants_from('odometer_delay'),

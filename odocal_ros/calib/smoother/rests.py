@@ -23,8 +23,10 @@ from odocal_ros.nav.rotations import transpose
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-STILL_SPEED = 0.005                           # m/s at each keyframe of a standstill
-STILL_TURN = np.array([1e-4, 1e-4, 2e-5])     # rad/sqrt(s) about east, north, up
+# 1 sigma of a vehicle at rest, at each keyframe m/s, and rad/sqrt(s) about east, north, up.
+# Physical, judgement: wind, an engine and people move it on its springs, and tilt it more than
+# they turn it
+STILL_SPEED, STILL_TURN = 0.005, np.array([1e-4, 1e-4, 2e-5])
 
 
 class Rests(Part):

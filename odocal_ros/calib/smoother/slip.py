@@ -19,7 +19,8 @@ from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 
-# factor on the variance of an interval from which it is a slip: it lies 3.7 sigmas off
+# factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
+# off, once in 4200 by chance
 SLIP_VARIANCE = 1.5
 
 
