@@ -45,8 +45,6 @@ EMPTY: dict[str, Callable[[], Samples]] = {
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
-LEAD_NS = 10**9         # of odometer and fixes, to interpolate at the first row of the Imu
-AFTER_NS = 600 * 10**9   # a first row later than that after a mark tells nothing of it
 MOST_DAYS = 7          # of a leg
 COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
 
@@ -152,7 +150,8 @@ class LegRecorder:
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
     """Return what lies between two stamps of a leg; ``first_ns``: no Imu row before it is."""
-    rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - LEAD_NS, stop_ns) for slot in SLOTS}
+    lead_ns = 10**9    # of odometer and fixes, to interpolate at the first row of the Imu
+    rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
     rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
     return replace(leg, start_ns=start_ns, stop_ns=stop_ns, **rows)
@@ -170,7 +169,8 @@ def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
 
 def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     key = by_row(_placed, samples.stamp_ns, samples.received_ns)
-    after = key[(key > stop_ns) & (key <= stop_ns + AFTER_NS)]
+    after_ns = 600 * 10**9    # a first row later than that after a mark tells nothing of it
+    after = key[(key > stop_ns) & (key <= stop_ns + after_ns)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)
     if keep.all():

@@ -28,8 +28,6 @@ from odocal_ros.fleet.leg_text import leg_text
 from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, Row, RowStore
 from odocal_ros.outside.names import said_by
 
-LATER = 10.0          # s after which what cannot even be told is ended
-LONGEST = 500         # characters of a reason
 NO_THREAD = "can't start new thread"      # what Python says where there is no memory for its stack
 
 
@@ -59,9 +57,10 @@ class BagJob:
 
     def failed(self, reason: str, **more: Any) -> Row:
         """Return the row of the bag, failed."""
+        longest = 500    # characters of a reason
         return Row(key=self.place, bag=self.bag.bag, vehicle=self.bag.vehicle,
                    model=self.bag.model, odometer_km=self.bag.odometer_km, status=FAILED,
-                   reason=reason[:LONGEST], **more)
+                   reason=reason[:longest], **more)
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,8 @@ def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
     clock.daemon = True
     if job.seconds:
         clock.start()
-        faulthandler.dump_traceback_later(job.seconds + LATER, exit=True)   # needs no interpreter
+        later = 10.0    # s after which what cannot even be told is ended
+        faulthandler.dump_traceback_later(job.seconds + later, exit=True)   # needs no interpreter
     before = resource.getrlimit(resource.RLIMIT_DATA)
     if job.memory:
         most = _data_bytes() + job.memory

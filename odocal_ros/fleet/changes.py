@@ -24,9 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-FALSE = 1e-3       # chance that a vehicle without any is said to have a change
-RIDGE = 1e-18      # smallest variance of a leg: the inverse exists
-DAY_NS = 86400e9
 
 
 @dataclass(frozen=True)
@@ -61,14 +58,16 @@ def covariance(own: Floats, shared: Sequence[Floats] = (), days: Floats | None =
     own : (n,) variance of what is each leg's alone.   shared : (n, k) one-sigma effects of errors
     that legs have in common.   walk : sigma of a random walk per square root of a day.
     """
-    V = np.diag(np.maximum(own, RIDGE)) + sum((g @ g.T for g in shared), np.zeros(()))
+    ridge = 1e-18    # smallest variance of a leg: the inverse exists
+    V = np.diag(np.maximum(own, ridge)) + sum((g @ g.T for g in shared), np.zeros(()))
     return V if days is None else V + walk**2 * np.minimum.outer(days, days)
 
 
 def chance(n: int) -> float:
     """Return the deviate that no step, odd leg or slope of n legs comes to by chance."""
     from scipy.special import ndtri
-    return float(-ndtri(FALSE / (2 * max(1, 2 * n - 2))))
+    false = 1e-3    # chance that a vehicle without any is said to have a change
+    return float(-ndtri(false / (2 * max(1, 2 * n - 2))))
 
 
 def history(y: Floats, V: Floats, t: Floats | None = None) -> History:

@@ -24,15 +24,14 @@ if TYPE_CHECKING:
 
 TIMEOUT = 3600.0      # s for a bag
 GIB = 2**30
-UNITS = {'': 1, 'K': 2**10, 'M': 2**20, 'G': GIB}
-SHOWN = 20            # vehicles that are named on the terminal
 
 
 def _bytes(text: str) -> int:
     found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
     if not found or not float(found[1]):
         raise argparse.ArgumentTypeError(f'{text}: want a size, as in 2G or 500M')
-    return int(float(found[1]) * UNITS[found[2]])
+    units = {'': 1, 'K': 2**10, 'M': 2**20, 'G': GIB}
+    return int(float(found[1]) * units[found[2]])
 
 
 def _positive(text: str) -> int:
@@ -97,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
         for row in vehicles:
             say(row['line'])
     if not args.quiet:
-        say(said(vehicles, output, SHOWN))
+        shown = 20    # vehicles that are named on the terminal
+        say(said(vehicles, output, shown))
     return OK if exit_code(vehicles, args.strict) == 0 else REJECTED
 
 

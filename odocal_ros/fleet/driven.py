@@ -21,7 +21,7 @@ from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.combine import DRAWN_ANEW
 from odocal_ros.calib.result import Estimate, LegResult
 from odocal_ros.fleet.bags import FleetBag
-from odocal_ros.fleet.changes import covariance, DAY_NS, History, history
+from odocal_ros.fleet.changes import covariance, History, history
 from odocal_ros.fleet.leg_text import legs_from
 from odocal_ros.fleet.rows import Row
 from odocal_ros.fleet.tables import utc
@@ -29,8 +29,7 @@ from odocal_ros.library.bags import told_apart
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
-
-YEAR = 365.25        # days
+from odocal_ros.settings.levels import DAY_NS
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,8 @@ def history_of(name: str, driven: Sequence[Driven],
     V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
     km = [driven[k].odometer_km for k in number]
     by_way = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
-    return number, history(y, V, days / YEAR), by_way
+    year = 365.25    # days
+    return number, history(y, V, days / year), by_way
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -21,7 +21,6 @@ from odocal_ros.errors import BadUsage, OdocalError
 NEEDS = ('dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 INSTALL = "pip install 'odocal_ros[fleet]'"
 MEMORY = 2 * 2**30       # bytes for a task, unless said
-PER_WORKER = 2           # tasks at the scheduler from which on it is given as many again
 FEWEST = 50              # of them, least: workers may be on their way
 LOST = ('the Dask scheduler is gone; start it again and give the same command: what is done is '
         'kept')
@@ -133,6 +132,7 @@ def results(client: Any, task: Callable[[Any], Any], jobs: Sequence[Any], name: 
 def _ahead(client: Any) -> int:
     """Return of how many tasks the scheduler is given as many again."""
     try:
-        return max(FEWEST, PER_WORKER * int(sum(client.nthreads().values())))
+        per_worker = 2    # tasks at the scheduler from which on it is given as many again
+        return max(FEWEST, per_worker * int(sum(client.nthreads().values())))
     except OSError:
         raise EngineLost(LOST) from None

@@ -17,11 +17,9 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.fleet.second_stage import COMPARED, flagged
+from odocal_ros.output.summary import DEG
 
-DEG = 57.29577951308232
 MOST_POINTS = 3000       # of a picture: more are thinned, but for those far off
-WIDE = 6.0               # medians of the distance that a picture shows
-MOST_LINES = 6           # vehicles that are told apart in time
 TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
           'pitch_mounting_angle': 'Pitch mounting angle'}
 
@@ -74,7 +72,8 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
 def _within(ax: Any, points: np.ndarray) -> None:
     """Have the many fill the picture; those far beyond are arrows at its edge."""
     from odocal_ros.output.plots_svg import RED
-    usual = WIDE * float(np.median(np.abs(points[:, 1])))
+    wide = 6.0    # medians of the distance that a picture shows
+    usual = wide * float(np.median(np.abs(points[:, 1])))
     beyond = np.abs(points[:, 1]) > 2 * usual
     if not beyond.any() or not usual:
         return
@@ -89,10 +88,11 @@ def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, 
     """Draw the scale of legs over dates, those that changed or drift told apart."""
     from odocal_ros.output.plots_svg import BLUE, GREEN, GREY, PINK, RED, sheet, svg
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
+    most_lines = 6    # vehicles that are told apart in time
     told = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
-        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:MOST_LINES]
+        change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
     told += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
-             and row['vehicle'] not in told][:MOST_LINES - len(told)]
+             and row['vehicle'] not in told][:most_lines - len(told)]
     found = _legs(legs, set(base), set(told))
     if not found:
         return None

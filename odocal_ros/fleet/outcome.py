@@ -30,6 +30,7 @@ from odocal_ros.fleet.second_stage import (
     vehicles_together,
 )
 from odocal_ros.fleet.tables import VEHICLES
+from odocal_ros.output.summary import DEG
 from odocal_ros.outside.names import for_table
 from odocal_ros.outside.whole import write_text
 from odocal_ros.reasons import Verdict
@@ -129,7 +130,7 @@ def remarks(row: dict[str, Any]) -> list[str]:
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
-                f'{57.29577951308232 * change["size"]:+.2f} deg')
+                f'{DEG * change["size"]:+.2f} deg')
         odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                    f'{change["after"][:10]} and {change["by"][:10]}'

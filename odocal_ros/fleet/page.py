@@ -24,9 +24,7 @@ from odocal_ros.fleet.population import LEAST, population
 from odocal_ros.fleet.second_stage import COMPARED, file_name
 from odocal_ros.fleet.tables import LEGS
 from odocal_ros.output.figures import with_sigma
-
-DEG = 57.29577951308232
-MOST_ROWS = 2000     # vehicles in the table
+from odocal_ros.output.summary import DEG
 
 
 def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
@@ -39,12 +37,13 @@ def fleet_page(vehicles: Sequence[dict[str, Any]], output: Path) -> str:
         (files('odocal_ros.fleet') / 'templates' / 'fleet.html').read_text(encoding='utf-8'))
     style = (files('odocal_ros.output') / 'templates' / 'report.css').read_text(encoding='utf-8')
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
+    most_rows = 2000    # vehicles in the table
     return template.render(
         style=style, title=output.resolve().name, facts=_facts(vehicles),
         counts=sorted(counts.items()), models=[_model(*one) for one in _models(vehicles)],
         figures=fleet_figures(vehicles, output / LEGS),
-        vehicles=[_row(row) for row in vehicles[:MOST_ROWS]],
-        left=max(0, len(vehicles) - MOST_ROWS)) + '\n'
+        vehicles=[_row(row) for row in vehicles[:most_rows]],
+        left=max(0, len(vehicles) - most_rows)) + '\n'
 
 
 def _facts(vehicles: Sequence[dict[str, Any]]) -> str:

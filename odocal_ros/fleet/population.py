@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from odocal_ros.settings.levels import NORMAL_MEDIAN
+
 Floats = NDArray[np.float64]
 FAR = 4.0            # sigmas of a vehicle from its model: by chance one in 16,000
-HUBER = 1.5          # sigmas from which a vehicle counts for less
-QUARTILE = 0.6745    # of the normal law: half of all lie within
 LEAST = 3            # vehicles of which a spread can be told
-PASSES = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +53,13 @@ def population(values: Floats, sigmas: Floats) -> Population:
     mean, spread = float(np.median(x)), 0.0
     if len(x) < LEAST:
         return Population(mean, float(s.max()), 0.0, np.full(len(x), np.nan))
-    for _ in range(PASSES):
+    huber = 1.5    # sigmas from which a vehicle counts for less
+    passes = 50
+    for _ in range(passes):
         before = mean
         spread = _spread(np.abs(x - mean), s)
         total = np.hypot(s, max(spread, 1e-300))
-        weight = np.minimum(1.0, HUBER * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
+        weight = np.minimum(1.0, huber * total / np.maximum(np.abs(x - mean), 1e-300)) / total**2
         mean = float(weight @ x / weight.sum())
         if abs(mean - before) <= 1e-12 * max(float(total.min()), 1e-300):
             break
@@ -67,11 +68,11 @@ def population(values: Floats, sigmas: Floats) -> Population:
 
 def _spread(off: Floats, s: Floats) -> float:
     """Return the spread at which the median of off / sigma is that of the normal law."""
-    if np.median(off / np.maximum(s, 1e-300)) <= QUARTILE:
+    if np.median(off / np.maximum(s, 1e-300)) <= NORMAL_MEDIAN:
         return 0.0
-    low, high = 0.0, float(off.max()) / QUARTILE
+    low, high = 0.0, float(off.max()) / NORMAL_MEDIAN
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if np.median(off / np.hypot(s, middle)) > QUARTILE else (
+        low, high = (middle, high) if np.median(off / np.hypot(s, middle)) > NORMAL_MEDIAN else (
             low, middle)
     return high

@@ -34,7 +34,6 @@ from odocal_ros.fleet.tables import (
 )
 from odocal_ros.fleet.vehicles import Vehicle, vehicle_of, VehicleJob
 
-TOGETHER = 500       # bags of a group of vehicles, at least
 COMPARED = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WORST = ('FAIL', 'UNDECIDED', 'rejected', 'caution', 'PASS', 'accepted')
 
@@ -90,9 +89,10 @@ def vehicles_together(client: Any, jobs: Sequence[VehicleJob], folder: Path, fil
 
 def _grouped(jobs: Sequence[VehicleJob]) -> Iterator[tuple[VehicleJob, ...]]:
     group: list[VehicleJob] = []
+    together = 500    # bags of a group of vehicles, at least
     for job in jobs:
         group.append(job)
-        if sum(len(one.bags) for one in group) >= TOGETHER:
+        if sum(len(one.bags) for one in group) >= together:
             yield tuple(group)
             group = []
     if group:

@@ -24,8 +24,8 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.angles import wrap
 from odocal_ros.output.stored import Stored
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
-CHANGED = 3.0        # sigmas of the difference: by chance once in 370 times
 # what belongs to a drive (turn-on bias, its heading) or follows from another value
 NOT_COMPARED = {'scale_ratio', 'heading_error', 'gyro_bias_x', 'gyro_bias_y', 'gyro_bias_z'}
 ANGLES = {'yaw_mounting_angle', 'pitch_mounting_angle'}
@@ -51,7 +51,7 @@ class Difference:
     @property
     def beyond(self) -> bool:
         """Return whether the change is more than chance explains."""
-        return self.sigmas is not None and abs(self.sigmas) > CHANGED
+        return self.sigmas is not None and abs(self.sigmas) > REMARK_SIGMAS
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,16 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import math
 from pathlib import Path
 from typing import Any
 
 from odocal_ros.calib.causes import ANOTHER_SCALE, change_in_words, OTHER, TYRES
 from odocal_ros.errors import BadUsage
 from odocal_ros.library.calibration import Calibration
-from odocal_ros.library.changes import Change, CHANGED, changes, Difference, notes
+from odocal_ros.library.changes import Change, changes, Difference, notes
 from odocal_ros.output.stored import read_stored, Stored, stored_from
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 CAUSES = {
     'scale': f'{TYRES}; calibrate again to be sure, then use the newer value',
@@ -101,7 +103,7 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
     if not judged:
         return 'nothing to judge: no sigma is known', None
     size, change, _ = max(judged, key=lambda one: one[0])
-    return (f'no change beyond {CHANGED:.0f} sigma: the largest is that of the '
+    return (f'no change beyond {REMARK_SIGMAS:.0f} sigma: the largest is that of the '
             f'{label(change.parameter)}, {size:.1f} sigma'), False
 
 
@@ -132,7 +134,7 @@ def amount(change: Change, difference: Difference, stored: Sequence[Stored]) -> 
     if change.parameter.startswith('scale_'):
         return change_in_words(difference.change / _value_before(change, difference, stored))
     if change.unit == 'rad':
-        return f'{57.29577951308232 * difference.change:+.3g} deg'
+        return f'{math.degrees(1.0) * difference.change:+.3g} deg'
     return f'{difference.change:+.3g} {change.unit}'
 
 
@@ -142,7 +144,8 @@ def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
         last = change.entries[-1]
         for d in (last.to_first, last.to_previous):
             sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
-            if d is not None and stored[last.index].usable and not d.beyond and sigmas > CHANGED:
+            if d is not None and stored[last.index].usable and not d.beyond \
+                    and sigmas > REMARK_SIGMAS:
                 yield (f'note: the change of the {label(change.parameter)} would be '
                        f'{sigmas:.1f} sigma if the errors of heading '
                        'source, lever arm and the like were the same in both')

@@ -22,15 +22,7 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.planning.drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.settings.config import Config
 
-TURN_TIME = 8.0          # s of a turn of 90 deg
-MOST_METRES, MOST_SECONDS = 1e6, 36_000.0
-GPX_STEP = 5.0           # m between points used: nearer ones are receiver noise
-GPX_REST, GPX_SLOW = 0.3, 0.1    # m/s, or of the median speed: slower steps were mostly a stop
-# s: what changes faster between points is their noise and spacing; rests, found too long by the
-# way to the next point used, lose half of it at each end
-GPX_SMOOTH = 4.0
-SLOPES = 5     # odd; times longer for slopes: heights are noisier, hills longer
-MOST_POINTS = 1_000_000
+MOST_SECONDS = 36_000.0
 
 
 def from_figures(speed: float, distance: float, standstill: float, turns: int,
@@ -50,19 +42,21 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     top = min(speed, math.sqrt(distance * acceleration))
     ramp, cruise = top / acceleration, distance / top - top / acceleration
     whole = 2 * (standstill + ramp) + cruise
-    if distance > MOST_METRES or whole > MOST_SECONDS:
+    most_metres = 1e6
+    if distance > most_metres or whole > MOST_SECONDS:
         raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {whole / 3600:.1f} h; want '
-                       f'{MOST_METRES / 1000:g} km and {MOST_SECONDS / 3600:g} h at most')
-    if turns < 0 or turns * TURN_TIME > cruise:
-        raise BadUsage(f'--turns {turns}: want 0 to {int(cruise / TURN_TIME)}, each takes '
-                       f'{TURN_TIME:g} s of the {cruise:.0f} s at full speed')
+                       f'{most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h at most')
+    turn_time = 8.0    # s of a turn of 90 deg
+    if turns < 0 or turns * turn_time > cruise:
+        raise BadUsage(f'--turns {turns}: want 0 to {int(cruise / turn_time)}, each takes '
+                       f'{turn_time:g} s of the {cruise:.0f} s at full speed')
     t = np.linspace(0.0, whole, max(2, math.ceil(whole / max(DRIVE_STEP, whole / 20_000)) + 1))
     knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])
     t = np.union1d(t, knots)        # kinks on the grid: the trapezoid sum is then exact
     rate = np.zeros_like(t)
     for k in range(turns):
-        begin = standstill + ramp + (k + 1) * cruise / (turns + 1) - TURN_TIME / 2
-        rate[(t >= begin) & (t < begin + TURN_TIME)] = (-1)**k * math.pi / 2 / TURN_TIME
+        begin = standstill + ramp + (k + 1) * cruise / (turns + 1) - turn_time / 2
+        rate[(t >= begin) & (t < begin + turn_time)] = (-1)**k * math.pi / 2 / turn_time
     return from_rates(t, np.interp(t, knots, [0.0, top, top, 0.0]), rate,
                       latitude=math.radians(45.0))
 
@@ -116,8 +110,9 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         raise BadUsage(f'{path}: is no GPX file ({error}); export the track again as '
                        'GPX') from None
     points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
-    if not 2 <= len(points) <= MOST_POINTS:
-        raise BadUsage(f'{path}: holds {len(points)} track points, want 2 to {MOST_POINTS:,}; '
+    most_points = 1_000_000
+    if not 2 <= len(points) <= most_points:
+        raise BadUsage(f'{path}: holds {len(points)} track points, want 2 to {most_points:,}; '
                        'export a track, not waypoints')
     try:
         level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
@@ -152,21 +147,23 @@ def _seconds(text: str | None) -> float | None:
 
 
 def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> PlannedDrive:
-    """Return the drive through points; nearer than GPX_STEP they tell no direction."""
+    """Return the drive through points; nearer than 5 m they tell no direction."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, p = t[rising], position_n[rising]
     used = [0]
+    gpx_step = 5.0    # m between points used: nearer ones are receiver noise
     for k in range(1, len(t)):
-        if np.hypot(*(p[k] - p[used[-1]])[:2]) >= GPX_STEP:
+        if np.hypot(*(p[k] - p[used[-1]])[:2]) >= gpx_step:
             used.append(k)
     if len(used) < 2:
-        raise BadUsage(f'{path}: the track never moves {GPX_STEP:g} m; give one that was driven')
+        raise BadUsage(f'{path}: the track never moves {gpx_step:g} m; give one that was driven')
     a, b = np.array(used[:-1]), np.array(used[1:])
     step = p[b] - p[a]
     way, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
     # a slow step was mostly a stop: its motion is put into the interval of its last point
     pace = way / (t[b] - t[a])
-    rest = pace < max(GPX_REST, GPX_SLOW * np.median(pace))
+    gpx_rest, gpx_slow = 0.3, 0.1    # m/s, of the median speed: slower steps were mostly a stop
+    rest = pace < max(gpx_rest, gpx_slow * np.median(pace))
     begin = np.where(rest, t[b - 1], t[a])
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
     if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
@@ -177,9 +174,13 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
     speed = np.where(moving, (way / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
-    wide = max(1, round(GPX_SMOOTH / (grid[1] - grid[0]) / 2)) * 2 + 1
+    # s: what changes faster between points is their noise and spacing; rests, found too long by
+    # the way to the next point used, lose half of it at each end
+    gpx_smooth = 4.0
+    wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
+    slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer
     return marked(grid, _smooth(speed, wide), _smooth(np.interp(grid, middle, yaw), wide),
-                  _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), SLOPES * wide),
+                  _smooth(np.interp(grid, middle, arctan2(step[:, 2], level)), slopes * wide),
                   latitude=float(start[0]), longitude=float(start[1]), height=float(start[2]))
 
 

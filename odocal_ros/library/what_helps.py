@@ -27,10 +27,6 @@ from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
 RTK = 0.02                        # m
-OUTSIDE_HEADING = math.radians(0.1)     # of two antennas a metre or two apart
-LEAST_REST = 60.0                 # s
-TOWN_MINUTES = 5
-WORTH = 0.98                      # of a sigma: what leaves more is no help
 
 
 @dataclass(frozen=True)
@@ -70,12 +66,14 @@ def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
     """Yield longer drives, and such with more to see in them."""
     yield (f'{length(drive.distance)} more, straight on', drive.lengthened(drive.distance),
            sigmas)
-    rest = max(LEAST_REST, *before.two_point.standing)
+    least_rest = 60.0    # s
+    rest = max(least_rest, *before.two_point.standing)
     yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest),
            sigmas)
     yield 'a stop and a start on the way', stop_and_start(drive), sigmas
     yield 'a turn to the left and one to the right on the way', turns_both_ways(drive), sigmas
-    yield (f'{TOWN_MINUTES} min more, stop and go with turns', town_driving(drive, TOWN_MINUTES),
+    town_minutes = 5
+    yield (f'{town_minutes} min more, stop and go with turns', town_driving(drive, town_minutes),
            sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
@@ -90,7 +88,8 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
         yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
     alignment = before.two_point.alignment
     now = alignment.heading_sigma if alignment.heading_separable else math.inf
-    better = OUTSIDE_HEADING if now > 2 * OUTSIDE_HEADING else now / 2
+    outside_heading = math.radians(0.1)    # of two antennas a metre or two apart
+    better = outside_heading if now > 2 * outside_heading else now / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
                                            'alignment.heading_sigma': better})
     yield (f'a heading known to {math.degrees(better):.2g} deg', drive,
@@ -143,5 +142,6 @@ def _whole(method: MethodResult) -> MethodResult:
 
 def ranked(found: list[Change], before: Plan, parameter: str) -> list[Change]:
     """Return the changes that help a parameter, best first."""
-    helpful = [c for c in found if c.gain(before, parameter) > 1 / WORTH]
+    worth = 0.98    # of a sigma: what leaves more is no help
+    helpful = [c for c in found if c.gain(before, parameter) > 1 / worth]
     return sorted(helpful, key=lambda c: (-c.gain(before, parameter), c.sigma(parameter)))

@@ -32,7 +32,6 @@ NO_TRAVEL = ('arm', 'shoulder', 'elbow', 'wrist', 'finger', 'gripper', 'hand', '
              'laser', 'hinge', 'slider', 'yaw', 'pitch', 'roll')
 REAR, FRONT = ('rear', 'back', 'aft'), ('front', 'fore')
 LETTERS = {'f': 'front', 'r': 'rear', 'b': 'rear', 'm': 'middle', 'c': 'middle'}
-MOST_SHOWN = 12
 
 
 @dataclass(frozen=True)
@@ -167,5 +166,6 @@ def _axle(rest: Sequence[str]) -> str:
 
 
 def _listed(keys: Sequence[str]) -> str:
-    more = len(keys) - MOST_SHOWN
-    return ', '.join(keys[:MOST_SHOWN]) + (f' and {more} more' if more > 0 else '')
+    most_shown = 12
+    more = len(keys) - most_shown
+    return ', '.join(keys[:most_shown]) + (f' and {more} more' if more > 0 else '')

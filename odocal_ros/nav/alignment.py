@@ -24,8 +24,6 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
-# sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
-RULED_OUT_SIGMAS = 10.0
 # what a leg is aligned by, recorded or planned
 MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
 COURSE_DISTANCE = 30.0    # m of track for a course
@@ -263,6 +261,8 @@ def _gyro_bias_n(level: Level, C_nb: Floats, yaw_sigma: float, latitude: float,
     by_tilt = level.level_sigma * np.array([up_rate, up_rate, level_rate])
     sigma = np.sqrt(level.rate_sigma**2 + by_yaw**2 + by_tilt**2)
     measured = C_nb @ level.mean_rate_b - earth_rate_n(latitude)
+    # sigmas of noise and turn-on bias: a gyro that reads more is not of its grade
+    ruled_out_sigmas = 10.0
     known = (sigma < grade.gyro_bias) | (
-        np.abs(measured) > RULED_OUT_SIGMAS * np.hypot(sigma, grade.gyro_bias))
+        np.abs(measured) > ruled_out_sigmas * np.hypot(sigma, grade.gyro_bias))
     return np.where(known, measured, 0.0), np.where(known, sigma, grade.gyro_bias)

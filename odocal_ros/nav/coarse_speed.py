@@ -24,21 +24,10 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.gaps import MISSING_INTERVALS
 
-FEWEST_VALUES = 20         # distinct values to know a grid by
-# a slow drive's: distinct, times sent, of a cell
-FEW_VALUES, OFTEN_SENT, DIVIDES_CELL = 4, 5, 0.02
 LEAST_CELLS = 3.0          # cells that the values must span
-FEWEST_CELLS = 6           # cells that they must lie in
 GRID_COHERENCE = 0.9       # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 # of the values' span, and with zeros: frequencies between; those that rule out a grid
 GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
-COLLINEAR_OF_TOP = 1e-6    # of the top speed: a second difference that vanishes
-KNOT_SHARE = 0.5           # share of the rows that change: more are no knots of an interpolation
-KNOT_STEP = 1.5            # the knots' grid over that of all rows, at least, of an interpolation
-LEAST_CELL = 2             # cells from zero: in the first, a dead band may be at work
-GOLDEN = 0.618034          # steps through a range evenly
-SHARP_CHANGE = 0.5         # of a cell: a speed that changes by more in a step tells no crossing
-LEAST_CROSSING = 0.02      # of a cell, sigma of a crossing: what speeds do beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +100,21 @@ class CoarseSpeed:
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
         # in a long step a cruise ends anywhere, and before it the speed was that of the cruise
         gained = _gain(middle, edge, q) * h
-        jump = np.where(gained > SHARP_CHANGE * q, 2, jump)
-        single = (jump == 1) & (outer >= LEAST_CELL) & (inner > 0)
+        sharp_change = 0.5    # of a cell: a speed that changes by more in a step tells no crossing
+        jump = np.where(gained > sharp_change * q, 2, jump)
+        least_cell = 2    # cells from zero: in the first, a dead band may be at work
+        single = (jump == 1) & (outer >= least_cell) & (inner > 0)
         if not self.interpolated:
             single &= h <= MISSING_INTERVALS * usual
         sigma = gained[single]
-        run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= LEAST_CELL)
+        run = (jump[:-1] > 1) & (jump[1:] > 1) & (np.abs(cell[at[1:]]) >= least_cell)
         first, length = at[:-1][run] + 1, np.diff(at)[run]
+        golden = 0.618034    # steps through a range evenly
         # one of its rows by turns: where the speed turns about, the middle one is the fastest
-        row = first + (length * (np.arange(len(first)) * GOLDEN % 1.0)).astype(int)
+        row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
-        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), LEAST_CROSSING * q)
+        least_crossing = 0.02    # of a cell, sigma of a crossing: what speeds do beside
+        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), least_crossing * q)
         order = np.argsort(when, kind='stable')
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 
@@ -147,11 +140,14 @@ def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:
     top = np.abs(value).max(initial=0.0)
     knots = np.ones(len(value), bool)
     if len(value) > 2:
-        knots[1:-1] = np.abs(np.diff(value, n=2)) > COLLINEAR_OF_TOP * top
+        collinear_of_top = 1e-6    # of the top speed: a second difference that vanishes
+        knots[1:-1] = np.abs(np.diff(value, n=2)) > collinear_of_top * top
     changes = np.diff(value, prepend=value[:1]) != 0
-    if (knots & changes).sum() < KNOT_SHARE * changes.sum():
+    knot_share = 0.5    # share of the rows that change: more are no knots of an interpolation
+    if (knots & changes).sum() < knot_share * changes.sum():
         own = grid(value[knots])
-        if own and own > KNOT_STEP * (step or 0.0):
+        knot_step = 1.5    # the knots' grid over that of all rows, at least, of an interpolation
+        if own and own > knot_step * (step or 0.0):
             return CoarseSpeed(own, t[knots], value[knots], True)
     return CoarseSpeed(step, t, value) if step else None
 
@@ -169,7 +165,8 @@ def grid(value: Floats) -> float | None:
         return None
     u, count = np.unique(np.rint((value - value.min()) / span * (GRID_CELLS - 1)).astype(int),
                          return_counts=True)
-    if len(u) < FEWEST_VALUES:
+    fewest_values = 20    # distinct values to know a grid by
+    if len(u) < fewest_values:
         return _of_few(value, u * (span / (GRID_CELLS - 1)) + value.min(), count)
     if not _may_be_grid(u):
         return None
@@ -181,8 +178,9 @@ def grid(value: Floats) -> float | None:
     last = high[0] + int(np.argmax(np.r_[np.diff(high) > 1, True]))      # of the first peak
     peak = high[0] + int(np.argmax(phase[high[0]:last + 1]))
     step = _refined(value, 1 / float(f[peak]))
+    fewest_cells = 6    # cells that they must lie in
     # where a speed bends into a cruise values crowd: at two or three speeds, on some grid
-    return step if len(np.unique(np.rint(value / step))) >= FEWEST_CELLS else None
+    return step if len(np.unique(np.rint(value / step))) >= fewest_cells else None
 
 
 def _coherence(u: Ints, size: int) -> Floats:
@@ -207,11 +205,13 @@ def _may_be_grid(u: Ints) -> bool:
 
 def _of_few(value: Floats, u: Floats, count: Ints) -> float | None:
     """Return the step of few distinct values u, each sent time and again, that it divides."""
-    if len(u) < FEW_VALUES or np.median(count) < OFTEN_SENT:
+    few_values, often_sent = 4, 5    # distinct, times that each is sent
+    if len(u) < few_values or np.median(count) < often_sent:
         return None
     step = _refined(value, float(np.diff(u).min()))
     off = u / step - np.rint(u / step)
-    return step if np.abs(off).max() < DIVIDES_CELL else None
+    divides_cell = 0.02    # of a cell, by which values may be off its grid
+    return step if np.abs(off).max() < divides_cell else None
 
 
 def _refined(value: Floats, step: float) -> float:

@@ -28,8 +28,6 @@ from odocal_ros.nav.earth import C_en, ecef_from_geodetic, geodetic_from_ecef
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat
 
-LEAST_EPOCH_STEP = 1e-9    # s, no two epochs are nearer
-
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -71,7 +69,8 @@ class Track:
         last = len(self.t) - 1
         k = np.clip(np.searchsorted(self.t, t, side='right') - 1, 0, max(last - 1, 0))
         after = np.minimum(k + 1, last)         # a track of one epoch has but that
-        step = np.maximum(self.t[after] - self.t[k], LEAST_EPOCH_STEP)
+        least_epoch_step = 1e-9    # s, no two epochs are nearer
+        step = np.maximum(self.t[after] - self.t[k], least_epoch_step)
         x = np.clip((t - self.t[k]) / step, 0.0, 1.0)[..., None, None]
         before, beyond = self.P.take(k, axis=0), self.P.take(after, axis=0)
         before *= 1 - x

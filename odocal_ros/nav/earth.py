@@ -19,9 +19,6 @@ A = 6378137.0                  # m, semi-major axis
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
 OMEGA = 7.292115e-5            # rad/s, Earth rate
-GAMMA_E = 9.7803253359         # m/s^2, normal gravity at the equator
-K_GAMMA = 0.00193185265241     # Somigliana's constant
-M_GAMMA = 0.00344978650684     # omega^2 a^2 b / GM
 
 
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
@@ -34,9 +31,12 @@ def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:
 def gravity(latitude: FloatOrFloats, height: FloatOrFloats) -> FloatOrFloats:
     """Return normal gravity, m/s^2, at latitude (rad) and height (m) (NIMA TR8350.2, 4-1, 4-3)."""
     s2 = np.sin(latitude) ** 2
-    gamma_0 = GAMMA_E * (1 + K_GAMMA * s2) / np.sqrt(1 - E2 * s2)
+    gamma_e = 9.7803253359    # m/s^2, normal gravity at the equator
+    k_gamma = 0.00193185265241    # Somigliana's constant
+    gamma_0 = gamma_e * (1 + k_gamma * s2) / np.sqrt(1 - E2 * s2)
+    m_gamma = 0.00344978650684    # omega^2 a^2 b / GM
     gamma: FloatOrFloats = gamma_0 * (
-        1 - 2 / A * (1 + F + M_GAMMA - 2 * F * s2) * height + 3 / A**2 * height**2)
+        1 - 2 / A * (1 + F + m_gamma - 2 * F * s2) * height + 3 / A**2 * height**2)
     return gamma
 
 

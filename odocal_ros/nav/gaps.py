@@ -16,8 +16,6 @@ from odocal_ros.data.pieces import by_step
 
 MISSING_INTERVALS = 2.5  # median intervals: a message or more is missing
 GAP_INTERVALS = 5.0      # of the median interval: what is longer is a gap
-SHORTEST_GAP = 0.2       # s
-FEWEST_INTERVALS = 10    # rows that show a rhythm
 
 
 def gaps_longer(t: Floats, limit: float) -> Floats:
@@ -28,6 +26,8 @@ def gaps_longer(t: Floats, limit: float) -> Floats:
 
 def gaps_in_rhythm(t: Floats) -> Floats:
     """Return begin and end of the steps far beyond the stream's own rhythm: (k, 2) s."""
-    if len(t) < FEWEST_INTERVALS:
+    fewest_intervals = 10    # rows that show a rhythm
+    if len(t) < fewest_intervals:
         return np.empty((0, 2))
-    return gaps_longer(t, max(GAP_INTERVALS * float(np.median(np.diff(t))), SHORTEST_GAP))
+    shortest_gap = 0.2    # s
+    return gaps_longer(t, max(GAP_INTERVALS * float(np.median(np.diff(t))), shortest_gap))

@@ -20,7 +20,6 @@ from odocal_ros.data.arrays import Floats
 # semi-major axis m, inverse flattening
 ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
               'Krassovsky': (6378245.0, 298.3)}
-SCALE = {'leg': 1.0, 'gauss_krueger': 1.0, 'utm': 0.9996}
 ZONE_WIDTH = 6.0       # deg
 
 
@@ -67,7 +66,8 @@ def plane_for(projection: Projection, longitude: float) -> Plane:
     if np.isnan(meridian):
         zone = ZONE_WIDTH * np.floor(degrees / ZONE_WIDTH) + ZONE_WIDTH / 2
         meridian = degrees if projection.kind == 'leg' else zone
-    return Plane(float(meridian), SCALE[projection.kind], projection.ellipsoid)
+    scale = {'leg': 1.0, 'gauss_krueger': 1.0, 'utm': 0.9996}
+    return Plane(float(meridian), scale[projection.kind], projection.ellipsoid)
 
 
 def plane_chord(plane: Plane, start: Sequence[float] | Floats,

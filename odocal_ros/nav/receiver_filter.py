@@ -20,8 +20,6 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 
 LEAST_LAG2 = 1e-4      # s^2: below, as much in proportion (and of an estimate below zero)
-LAG2_STEP = 1e-4       # relative, of the difference that gives a derivative
-TRACK_BEYOND = 10.0    # s that the way goes on at its last velocity
 
 
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
@@ -39,7 +37,8 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
         rate = late(LEAST_LAG2) / LEAST_LAG2
         return rate * square, rate
     here = late(square)
-    return here, (late(square * (1 + LAG2_STEP)) - here) / (square * LAG2_STEP)
+    lag2_step = 1e-4    # relative, of the difference that gives a derivative
+    return here, (late(square * (1 + lag2_step)) - here) / (square * lag2_step)
 
 
 def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
@@ -49,8 +48,9 @@ def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) ->
     On a cubic the filter's answer is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is
     left of before dies away.
     """
-    t = np.append(t, t[-1] + TRACK_BEYOND)
-    place = np.concatenate([place, place[-1:] + TRACK_BEYOND * velocity[-1:]])
+    track_beyond = 10.0    # s that the way goes on at its last velocity
+    t = np.append(t, t[-1] + track_beyond)
+    place = np.concatenate([place, place[-1:] + track_beyond * velocity[-1:]])
     velocity = np.concatenate([velocity, velocity[-1:]])
     T = np.diff(t)[:, None]
     mean = np.diff(place, axis=0) / T

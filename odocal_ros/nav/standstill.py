@@ -21,8 +21,6 @@ from odocal_ros.nav.odometer import Travel
 REST_GRID = 0.1       # s, grid of the detector
 REST_WINDOW = 0.5     # s, each side
 REST_TRAVEL = 0.03    # m, travel within the window that still counts as standing
-COARSE_COUNT = 0.5    # m, a count beyond which one is motion
-CREEP_SPEED = 0.02    # m/s, mean speed at which a long slow stretch is no standstill
 REST_TURN = 0.02      # rad/s, wander of the gyro that still counts as standing
 MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
 
@@ -63,14 +61,16 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     spans = _spans(quiet, edges, shortest)
     moved = np.abs(travel.at(spans[:, 1]) - travel.at(spans[:, 0])) * metres_per_unit
     allowed = _allowed(travel, metres_per_unit)
-    return spans[moved <= CREEP_SPEED * (spans[:, 1] - spans[:, 0]) + allowed]
+    creep_speed = 0.02    # m/s, mean speed at which a long slow stretch is no standstill
+    return spans[moved <= creep_speed * (spans[:, 1] - spans[:, 0]) + allowed]
 
 
 def _allowed(travel: Travel, metres_per_unit: float) -> float:
     """Return the travel, m, of one that stands: REST_TRAVEL, or a count or so of jitter."""
     count = travel.quantum * metres_per_unit
+    coarse_count = 0.5    # m, a count beyond which one is motion
     # a few counts a turn of the wheel: one of them is motion, not jitter
-    return max(REST_TRAVEL, (1.5 if count <= COARSE_COUNT else 0.5) * count)
+    return max(REST_TRAVEL, (1.5 if count <= coarse_count else 0.5) * count)
 
 
 def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:

@@ -25,9 +25,7 @@ from typing import Any
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.offline.say import say, warn
 from odocal_ros.output.figures import with_sigma
-
-LIMIT = 4.0     # sigmas: by chance in one of 16 000
-DEG = math.degrees(1.0)
+from odocal_ros.output.summary import DEG
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,8 @@ class Row:
             return True
         if self.accept is not None:
             return self.accept[0] <= self.value <= self.accept[1]
-        return self.sigmas_off is not None and abs(self.sigmas_off) <= LIMIT
+        limit = 4.0    # sigmas: by chance in one of 16 000
+        return self.sigmas_off is not None and abs(self.sigmas_off) <= limit
 
 
 def rows(calibration: dict[str, Any], truth: dict[str, dict[str, Any]]) -> list[Row]:

@@ -32,7 +32,6 @@ COMMANDS = {
     'doctor': ('odocal_ros.offline.doctor', 'what is installed: one screen to paste'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
-LONGEST = 2000       # characters of a sentence: a bag may hold a name of any length
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -81,7 +80,8 @@ def main(argv: list[str] | None = None) -> int:
         return code
     except OdocalError as error:
         text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
-        warn(text if len(text) <= LONGEST else f'{text[:LONGEST]} ...')
+        longest = 2000    # characters of a sentence: a bag may hold a name of any length
+        warn(text if len(text) <= longest else f'{text[:longest]} ...')
         return WRONG_USE
     except KeyboardInterrupt as stopped:
         warn(f'odocal: interrupted, {str(stopped) or "nothing written"}')

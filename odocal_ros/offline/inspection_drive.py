@@ -35,8 +35,6 @@ from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.nominal import nominal_scale
 
-CLOSED = 0.2            # chord over way: below, a leg ends where it began
-
 
 def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
          findings: list[Reason]) -> list[str]:
@@ -169,7 +167,8 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
 
 
 def closed(leg: dict[str, Any]) -> bool:
-    return bool(leg['chord'] < CLOSED * leg['way'])
+    """Tell whether a leg ends where it began: by its chord over its way."""
+    return bool(leg['chord'] < 0.2 * leg['way'])
 
 
 def _from_rest(stops: Floats, start: float, stop: float) -> tuple[float, float]:

@@ -14,10 +14,9 @@ import math
 import textwrap
 from typing import Any
 
+from odocal_ros.output.summary import WIDTH
 from odocal_ros.outside.names import one_line
 
-WIDTH = 98
-FEW = 3        # legs told in a line each
 QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
 
@@ -183,7 +182,8 @@ def _legs(legs: list[dict[str, Any]]) -> list[str]:
     if not legs:
         return []
     whose = 'marked by the node' if legs[0]['marked'] else 'that replay takes'
-    if len(legs) <= FEW:
+    few = 3    # legs told in a line each
+    if len(legs) <= few:
         return [f'  leg {whose}: {_leg(leg)}' for leg in legs]
     return [f'  {len(legs)} legs {whose}, s and m', f'    {"leg":>3}{"from":>10}{"to":>10}'
             f'{"way":>8}{"start to end":>14}'] + [

@@ -13,7 +13,6 @@ from shutil import get_terminal_size
 import sys
 import threading
 
-TICK_S = 0.5      # the clock of a phase goes on while nothing is told
 BAR = '{desc:<26} {percentage:3.0f} % |{bar:24}| {elapsed}'
 CLOCK = '{desc:<26} {elapsed}'
 
@@ -63,5 +62,6 @@ class Phase:
             self._bar.close()
 
     def _tick(self) -> None:
-        while not self._over.wait(TICK_S):
+        tick_s = 0.5    # the clock of a phase goes on while nothing is told
+        while not self._over.wait(tick_s):
             self._bar.refresh()

@@ -21,7 +21,6 @@ from odocal_ros.planning.methods import NOT_PREDICTED, Plan
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.smoother import SWAY_RATE
 
-SHOWN = 0.01          # share of the variance from which a source has its row
 WORDS = {SCALE: 'scale', YAW: 'yaw', PITCH: 'pitch'}
 
 
@@ -82,10 +81,11 @@ def _shown(parameter: str, sigma: float | None) -> str:
 def _budgets(before: Plan) -> list[str]:
     """Return the sources that matter of each method that will give something."""
     out = []
+    shown = 0.01    # share of the variance from which a source has its row
     for name in before.giving:
         method = before.methods[name]
         hidden = [p for p in PARAMETERS if method.estimates[p].sigma is None]
-        lines = budget_lines(method.details.get('budget'), 1.0, SHOWN, hidden)
+        lines = budget_lines(method.details.get('budget'), 1.0, shown, hidden)
         if lines and len(before.methods) > 1:
             lines[0] = lines[0].replace(f'{"error budget":<20}', f'{"budget, " + name:<20}')
         out += [*lines, ''] if lines else []

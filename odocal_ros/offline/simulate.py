@@ -19,6 +19,7 @@ from typing import Any, TYPE_CHECKING
 from odocal_ros.errors import BadUsage
 from odocal_ros.offline.say import say
 from odocal_ros.outside.names import for_shell
+from odocal_ros.settings.levels import DAY_NS
 
 if TYPE_CHECKING:
     from odocal_ros.sim.options import SimOptions
@@ -61,8 +62,6 @@ DEGREES = {
     'orientation_sigma': 'the Imu sends its orientation, with a heading error of this size',
     'heading_sigma': 'a topic /heading is sent, with an error of this size',
 }
-DAY_NS = 86_400 * 10**9
-DAYS = 3650          # then the days of the seeds begin anew
 LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
 
 
@@ -139,7 +138,8 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
             given[name] = tuple(getattr(args, name))
     # drives of two seeds are two drives, not one time driven twice
     seed = given.get('seed', SimOptions.seed)
-    given['start_ns'] = SimOptions.start_ns + (seed - 1) % DAYS * DAY_NS
+    days = 3650    # then the days of the seeds begin anew
+    given['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
     if args.mounting_rpy_deg is not None:
         given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
     if args.outages:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from odocal_ros.sim.scenarios import Drive
 
 MANIFEST = 'manifest.csv'
-MOST = 100_000       # vehicles
 
 
 def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
@@ -39,8 +38,9 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     """
     from odocal_ros.sim.fleet import fleet_of
     out = Path(args.out)
-    if not (1 <= args.fleet <= MOST and 1 <= args.bags <= 1000):
-        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: want 1 to {MOST} vehicles with '
+    most = 100_000    # vehicles
+    if not (1 <= args.fleet <= most and 1 <= args.bags <= 1000):
+        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: want 1 to {most} vehicles with '
                        '1 to 1000 bags each')
     if (out / MANIFEST).exists() and not args.force:
         raise BadUsage(f'{out / MANIFEST} is there already; give --force to replace the fleet, or '

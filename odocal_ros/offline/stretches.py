@@ -20,10 +20,6 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
-STRAIGHT = 0.97      # chord over way: a stretch at least this straight suits the two-point method
-POINTS = 600         # fixes looked at for straight stretches, evenly taken
-AT_SPEED = 1.0       # s, over which a speed is taken
-
 
 @dataclass(frozen=True, eq=False)
 class Drive:
@@ -55,9 +51,10 @@ def survey_drive(inputs: Inputs, config: Config) -> Drive:
     if len(inputs.travel.t) > 1 and len(inputs.t_imu) > 3:
         stops = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale or 1.0,
                             config.leg.standstill)
-        t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - AT_SPEED, AT_SPEED / 2)
+        at_speed = 1.0    # s, over which a speed is taken
+        t = np.arange(inputs.travel.t[0], inputs.travel.t[-1] - at_speed, at_speed / 2)
         if scale and len(t):
-            speed = np.abs(inputs.travel.at(t + AT_SPEED) - inputs.travel.at(t)) * scale / AT_SPEED
+            speed = np.abs(inputs.travel.at(t + at_speed) - inputs.travel.at(t)) * scale / at_speed
             slowest, fastest = float(speed.min()), float(speed.max())
     return Drive(scale, sigma, white_noise(fixes_n), stops, inputs.t_fix, fixes_n, slowest,
                  fastest)
@@ -67,7 +64,8 @@ def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tu
     """Return (start, stop) of stretches at least ``shortest`` m long, the longest first; s."""
     if drive.scale is None or len(drive.t_fix) < 3:
         return []
-    pick = np.unique(np.linspace(0, len(drive.t_fix) - 1, POINTS).astype(int))
+    points = 600    # fixes looked at for straight stretches, evenly taken
+    pick = np.unique(np.linspace(0, len(drive.t_fix) - 1, points).astype(int))
     t, p = drive.t_fix[pick], drive.fixes_n[pick, :2]
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
@@ -76,9 +74,11 @@ def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tu
     ratio = chord[far] / np.maximum(travel[far], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
     way = travel * max(drive.scale, min(best, 1.2 * drive.scale))
+    # chord over way: a stretch at least this straight suits the two-point method
+    straight = 0.97
     # fixes are off by sigma at both ends: what that hides is given, not demanded
-    fit = np.triu((chord >= STRAIGHT * way - drive.sigma) & (way >= shortest)
-                  & (chord <= way / STRAIGHT + 4 * drive.sigma))
+    fit = np.triu((chord >= straight * way - drive.sigma) & (way >= shortest)
+                  & (chord <= way / straight + 4 * drive.sigma))
     found: list[tuple[float, float]] = []
     while fit.any():
         i, j = np.unravel_index(np.argmax(np.where(fit, way, 0)), fit.shape)

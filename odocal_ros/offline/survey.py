@@ -21,8 +21,6 @@ from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
 from odocal_ros.settings.grades import G
 
-GAP = 5.0             # in median intervals: longer is a gap
-LEAST_GAP = 0.1       # s, shorter is jitter
 AXES = 'xyz'
 
 
@@ -39,7 +37,9 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     step = np.diff(stamp) * 1e-9
     rising = step[step > 0]
     usual = float(np.median(rising)) if len(rising) else 0.0
-    gaps = np.flatnonzero(step > max(GAP * usual, LEAST_GAP))
+    gap = 5.0    # in median intervals: longer is a gap
+    least_gap = 0.1    # s, shorter is jitter
+    gaps = np.flatnonzero(step > max(gap * usual, least_gap))
     order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
     lag = (received - stamp) * 1e-9
     # mean of what lies between the gaps: bursts and gaps are no rate

@@ -20,10 +20,6 @@ from odocal_ros.messages.odometer_types import JOINTS
 from odocal_ros.messages.tables import columns, tables
 from odocal_ros.screening.glitches import beyond
 
-TURNS = 4 * np.pi      # rad, range of an angle from which on it turns without bound
-ALIKE = 0.3            # of the largest way: what a wheel of the same vehicle rolls at least
-CELL = 0.5             # s, in which sides are told by the gyro
-CLEAR = 0.5            # correlation with the gyro from which on a side is told
 FIELDS = {JOINTS: ('position', 'velocity'), 'std_msgs/msg/Int32MultiArray': ('data',),
           'std_msgs/msg/Int64MultiArray': ('data',)}
 
@@ -71,7 +67,9 @@ class Values:
         t = (stamp_ns - stamp_ns[0]) * 1e-9
         s = _travelled(t, value, field)
         way, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
-        rolls = (span > (TURNS if self.msgtype == JOINTS else 0)) & (span > ALIKE * span.max())
+        turns = 4 * np.pi    # rad, range of an angle from which on it turns without bound
+        alike = 0.3    # of the largest way: what a wheel of the same vehicle rolls at least
+        rolls = (span > (turns if self.msgtype == JOINTS else 0)) & (span > alike * span.max())
         sides = _sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
         return [{'key': key, 'field': field, 'unit': unit, 'way': float(w), 'span': float(d),
@@ -95,8 +93,9 @@ def _sides(t: Floats, s: Floats, rolls: Bools,
     """Return 'left' or 'right' of each wheel that the gyro tells: the outer one runs farther."""
     k = len(rolls)
     none = [''] * k
+    cell = 0.5    # s, in which sides are told by the gyro
     # by damaged stamps a recording may last for years
-    grid = np.arange(t[0], t[-1], CELL) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
+    grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
         return none
     turned = np.append(0.0, np.cumsum((imu[1][1:] + imu[1][:-1]) / 2 * np.diff(imu[0])))
@@ -107,11 +106,12 @@ def _sides(t: Floats, s: Floats, rolls: Bools,
     with np.errstate(invalid='ignore', divide='ignore'):
         step = step / scale
     others = step[rolls].mean(axis=0)
+    clear = 0.5    # correlation with the gyro from which on a side is told
     for j in np.flatnonzero(rolls):
         more = step[j] - others
         power = float(np.sqrt((more @ more) * (turn @ turn)))
         told = float(more @ turn) / power if power else 0.0
-        none[j] = 'right' if told > CLEAR else 'left' if told < -CLEAR else ''
+        none[j] = 'right' if told > clear else 'left' if told < -clear else ''
     return none
 
 

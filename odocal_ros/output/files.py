@@ -29,7 +29,6 @@ from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 
 SCHEMA = 1
-IMU_KEEPS = 0.1      # of what is believed of them: by how much warmth and time change them
 MAIN = 'calibration.json'
 # what every result names, determined or not; a scale's unit is known only with its data
 ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
@@ -72,8 +71,9 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
+        imu_keeps = 0.1    # of what is believed of them: by how much warmth and time change them
         left['imu'] = calibration.carried.only(
-            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), IMU_KEEPS).as_dict()
+            (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
         if config.leg.automatic:
             left['carried'] = calibration.carried.as_dict()
     content: dict[str, Any] = _plain({

@@ -29,7 +29,6 @@ import uuid
 from odocal_ros.errors import BadUsage
 from odocal_ros.outside.whole import disk, locked, PART, sync_folder, uninterrupted, write_text
 
-AT_FDCWD, RENAME_EXCHANGE = -100, 2
 NOT_BY_RENAME = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV)
 ASIDE = '.old'
 LEFT = re.compile(rf'\.(?P<place>.+)\.[0-9a-f]{{32}}\{PART}(?P<aside>\{ASIDE})?')
@@ -158,7 +157,8 @@ def _swap(one: Path, other: Path) -> None:
     rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
     names = [os.fsencode(path) for path in (one, other)]
     if rename is not None:
-        if rename(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE) == 0:
+        at_fdcwd, rename_exchange = -100, 2      # of linux/fcntl.h and linux/fs.h
+        if rename(at_fdcwd, names[0], at_fdcwd, names[1], rename_exchange) == 0:
             return
         code = ctypes.get_errno()
         if code not in (errno.EINVAL, errno.ENOSYS):      # a file system that cannot

@@ -26,16 +26,16 @@ from odocal_ros.settings.config import Config
 
 TRACK = 'track.geojson'
 MOST = 5000          # points of a feature: maps draw no more
-MOST_OF_ALL = 150_000        # of a file: it stays small however many legs there are
 ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
          'values found; as_configured: with the values before; fixes: of the receiver; both '
          'tracks begin at the start mark')
-PLACES, HEIGHT_PLACES = 8, 3     # 1e-8 deg: 1 mm
+PLACES = 8     # 1e-8 deg: 1 mm
 
 
 def geojson(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:
     """Return the file by name, nothing when no leg has a track."""
-    most = max(2, min(MOST, MOST_OF_ALL // (3 * max(1, len(calibration.legs)))))
+    most_of_all = 150_000    # of a file: it stays small however many legs there are
+    most = max(2, min(MOST, most_of_all // (3 * max(1, len(calibration.legs)))))
     features = [feature for n, leg in enumerate(calibration.legs, 1)
                 for feature in _features(n, leg, most)]
     if not features:
@@ -84,7 +84,8 @@ def _positions(rows_n: Floats | None, leg: LegResult, most: int) -> Floats:
     degrees = np.rad2deg(geodetic[:, 1::-1]).round(PLACES)
     if level:
         return degrees
-    return np.column_stack([degrees, geodetic[:, 2].round(HEIGHT_PLACES)])
+    height_places = 3    # mm
+    return np.column_stack([degrees, geodetic[:, 2].round(height_places)])
 
 
 def _points(positions: Floats) -> dict[str, Any]:

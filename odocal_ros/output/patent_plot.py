@@ -21,7 +21,6 @@ from odocal_ros.patent.embodiment import Embodiment, LEVELS, RADIUS_STEP
 MARKS = {'printed as best': ('*', '#D55E00'), 'printed': ('x', 'black'),
          'best of all': ('s', '#009E73'), 'response surface': ('o', '#E69F00'),
          'least squares': ('+', '#CC79A7'), 'truth': ('D', 'none')}
-MM = 1000.0
 
 
 def draw(table: Embodiment, path: Path) -> None:
@@ -35,7 +34,8 @@ def draw(table: Embodiment, path: Path) -> None:
 
 def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
     """Draw the mean distance over the errors of both radii, the heading as each likes it best."""
-    levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * MM
+    mm = 1000.0
+    levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * mm
     mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
                            norm='log')
     figure.colorbar(mesh, ax=axes, label='mean distance of track and fixes, m')
@@ -43,7 +43,7 @@ def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
     for name, (marker, colour) in MARKS.items():
         rows = [r for r in table.rows if r.name.startswith(name) and (
             name != 'printed' or 'best' not in r.name)]
-        x, y = (MM * np.array([getattr(r, side) for r in rows]) for side in ('left', 'right'))
+        x, y = (mm * np.array([getattr(r, side) for r in rows]) for side in ('left', 'right'))
         if (np.abs([x, y]) > edge).any():
             beyond.append(name)
         hollow = colour == 'none'

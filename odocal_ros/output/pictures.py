@@ -15,7 +15,6 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage
 
-DPI = 150
 PICTURES = ('.png', '.svg', '.pdf')
 
 
@@ -54,7 +53,7 @@ def save_figure(figure: Any, path: Path) -> None:
     """
     part = path.with_name(f'.{path.name}.part')
     try:
-        figure.savefig(part, format=path.suffix[1:].lower(), dpi=DPI)
+        figure.savefig(part, format=path.suffix[1:].lower(), dpi=150)
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)

@@ -35,7 +35,6 @@ from odocal_ros.output.plots_svg import (
 )
 
 PAUSE = {'no fix used': PINK, 'no Imu': RED, 'no odometer': GREEN}
-GAP = 5.0       # median intervals between fixes: more is marked
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
           1: ('satellite based aid, SBAS (1)', 's', GREEN),
           2: ('ground based aid, GBAS or RTK (2)', '^', PINK)}
@@ -123,8 +122,9 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
     if len(few):
         ax.plot(*at(few), 'x', color=RED, markersize=5, zorder=4, label='fix not used')
     step = np.diff(found.t_fix)
+    gap = 5.0    # median intervals between fixes: more is marked
     gaps = [('no fix used', found.t_fix[k], found.t_fix[k + 1]) for k in np.flatnonzero(
-        step > max(GAP * np.median(step), 1.0))] if len(step) else []
+        step > max(gap * np.median(step), 1.0))] if len(step) else []
     gaps += [(f'no {name}', begin, end) for name, begin, end in found.gaps]
     said = set()
     for label, begin, end in gaps:

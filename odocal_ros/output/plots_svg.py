@@ -24,8 +24,6 @@ from odocal_ros.data.arrays import Floats, Ints
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, what it says, SVG
-WIDTH = 5.6          # inch
-GRID = {'color': '0.90', 'linewidth': 0.6}
 MOST_POINTS = 1200   # of a line
 MOST_MARKS = 400     # of single marks
 LOOK: dict[Any, Any] = {
@@ -52,12 +50,14 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
     heights : of the axes, in any unit; None: all alike.
     """
     from matplotlib.figure import Figure
-    figure = Figure(figsize=(WIDTH, height))
+    width = 5.6    # inch
+    figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False, height_ratios=heights)[:, 0]
     figure.subplots_adjust(left=0.135, right=0.975, top=1 - 0.32 / height,
                            bottom=0.48 / height, hspace=0.16)
+    grid = {'color': '0.90', 'linewidth': 0.6}
     for ax in axes:
-        ax.grid(**GRID)
+        ax.grid(**grid)
     return figure, axes
 
 

@@ -17,7 +17,6 @@ from typing import Any
 from odocal_ros.calib.result import LegResult
 from odocal_ros.reasons import Reason, Verdict
 
-FEW = 2      # reasons of a code that differ from leg to leg, told one by one
 OF_LEG = re.compile(r'leg (\d+): (.*)', re.DOTALL)
 
 
@@ -38,7 +37,8 @@ def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
     """Return the reasons of a code with their legs; of many that differ, the first one."""
     if not found[0][1][0]:
         return [found[0][0]]
-    if len(found) <= FEW:
+    few = 2    # reasons of a code that differ from leg to leg, told one by one
+    if len(found) <= few:
         return [replace(reason, text=f'{_legs(numbers)}: {reason.text}')
                 for reason, numbers in found]
     reason, first = found[0]

@@ -29,8 +29,6 @@ LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nomi
                     'scale_factor_left': 'scale factor, left wheel',
                     'scale_factor_right': 'scale factor, right wheel'}
 LOST = 'not determined'
-SMALL = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}      # of a budget's figures
-WORTH_A_ROW = 0.005      # share of a variance
 OF_DATA = {Code.BAD_ROWS_DROPPED, Code.STAMPS_NOT_RISING, Code.IMU_GAP, Code.TOPIC_GAP,
            Code.COUNTER_RESET, Code.COUNTER_ROLLOVER, Code.FIXES_UNUSABLE, Code.BAG_TRUNCATED,
            Code.COVARIANCE_UNKNOWN, Code.WHEEL_SLIP, Code.NO_IMU, Code.NO_ODOMETER, Code.NO_FIX,
@@ -130,12 +128,13 @@ def budget_table(method: MethodResult) -> dict[str, Any] | None:
                          strict=True) if names else ((), ())
     wholes = [sum(_number(row, n)**2 for row in table.values()) for n in names]
     rows, small = [], []
+    worth_a_row = 0.005    # share of a variance
     for source, row in table.items():
         shares = [_number(row, n)**2 / w if w else 0.0 for n, w in zip(names, wholes, strict=True)]
-        if max(shares, default=0.0) < WORTH_A_ROW:
+        if max(shares, default=0.0) < worth_a_row:
             small.append(label(source))
             continue
-        cells = [None if part < WORTH_A_ROW else (two_digits(_number(row, n) * factor), part)
+        cells = [None if part < worth_a_row else (two_digits(_number(row, n) * factor), part)
                  for n, factor, part in zip(names, factors, shares, strict=True)]
         rows.append((label(source), bool(row.get('shared')), cells))
     totals = [two_digits(math.sqrt(w) * f) for w, f in zip(wholes, factors, strict=True)]
@@ -153,7 +152,8 @@ def _column(name: str, estimate: Estimate) -> tuple[str, float]:
         return f'{label(name)}, ppm', 1e6 / abs(estimate.value or 1.0)
     if estimate.unit == 'rad':
         return f'{label(name)}, deg', DEG
-    factor, unit = SMALL.get(estimate.unit, (1.0, estimate.unit))
+    small = {'m': (1e3, 'mm'), 's': (1e3, 'ms')}    # of a budget's figures
+    factor, unit = small.get(estimate.unit, (1.0, estimate.unit))
     return f'{label(name)}, {unit}', factor
 
 

@@ -25,7 +25,6 @@ from odocal_ros.settings.config import Config, flat
 T = TypeVar('T')
 # what the Imu's constants are of
 SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade')
-BIGGEST = 2**28      # bytes; a day of legs is a thousandth of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +74,8 @@ def read_stored(path: Path) -> Stored:
     name = str(path)
     try:
         path = path / MAIN if path.is_dir() else path
-        if path.stat().st_size > BIGGEST:
+        biggest = 2**28    # bytes; a day of legs is a thousandth of it
+        if path.stat().st_size > biggest:
             raise BadUsage(f'{name}: too large for a calibration.json')
         content = json.loads(path.read_text(encoding='utf-8'), parse_constant=_no_constant)
         return stored_from(content, name)

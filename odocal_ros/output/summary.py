@@ -26,8 +26,6 @@ from odocal_ros.reasons import Verdict
 
 MOSTLY = 'mostly', 'above all'      # more than half of the variance, or the most of all
 WIDTH = 98
-FAR_SCALE = 0.005    # of a gyro's scale from 1
-SHOWN = 0.01     # share of a variance from which a source is worth a line
 DEG = math.degrees(1.0)
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
@@ -37,7 +35,6 @@ DEG_PER_HOUR = DEG * 3600
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
-COLOURS = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
 ORDER = list(Verdict)
 NONE = Estimate(None, None, '')
 
@@ -127,7 +124,8 @@ def _head(calibration: Calibration, styled: bool) -> list[str]:
     distance, duration = sum(g.distance for g in legs), sum(g.duration for g in legs)
     verdict = calibration.verdict.value.upper()
     if styled:
-        verdict = f'\x1b[1;{COLOURS[calibration.verdict]}m{verdict}\x1b[0m'
+        colours = {Verdict.ACCEPTED: 32, Verdict.CAUTION: 33, Verdict.REJECTED: 31}
+        verdict = f'\x1b[1;{colours[calibration.verdict]}m{verdict}\x1b[0m'
     return [f'{verdict}: {MEANING[calibration.verdict]}',
             f'{len(legs)} leg{"s" * (len(legs) != 1)}, {length(distance)} in '
             f'{time_span(duration)}']
@@ -173,7 +171,8 @@ def _gyro_scale(calibration: Calibration) -> str:
     """Return by what the gyro's turns are to be multiplied, '' where that is near 1."""
     method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
-    if not error or abs(error['value']) < max(FAR_SCALE, 3 * error['sigma']):
+    far_scale = 0.005    # of a gyro's scale from 1
+    if not error or abs(error['value']) < max(far_scale, 3 * error['sigma']):
         return ''
     return _line('gyro scale z', with_sigma(1 - error['value'], error['sigma']))
 
@@ -265,5 +264,6 @@ def _budget(calibration: Calibration, width: int, small: bool) -> list[str]:
     if method is None or not scale.value:
         return []
     hidden = {name for name in estimates if known(estimates, name).value is None}
-    return budget_lines(method.details.get('budget'), scale.value, SHOWN, hidden,
+    shown = 0.01    # share of a variance from which a source is worth a line
+    return budget_lines(method.details.get('budget'), scale.value, shown, hidden,
                         width, small)

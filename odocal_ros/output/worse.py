@@ -18,7 +18,6 @@ from odocal_ros.output.figures import with_sigma
 from odocal_ros.output.stored import read_stored, Stored
 from odocal_ros.reasons import Code, Verdict
 
-CLEARLY = 2.0     # times the sigma: four times as many such legs would be needed
 JUDGED = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounting_angle')
 
 
@@ -53,7 +52,8 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
         return ''
     if new is None or new.value is None:
         return f'the new one has no {label}, the old one has {said(old)}'
-    if new.unit == old.unit and new.sigma and new.sigma > CLEARLY * old.sigma:
+    clearly = 2.0    # times the sigma: four times as many such legs would be needed
+    if new.unit == old.unit and new.sigma and new.sigma > clearly * old.sigma:
         return (f'the {label} is {new.sigma / old.sigma:.1f} times less certain: {said(new)}, '
                 f'the old one has {said(old)}')
     return ''

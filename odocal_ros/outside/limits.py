@@ -19,9 +19,6 @@ from typing import Any
 from odocal_ros.errors import BadBag
 
 RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
-UNPACKED = 2**26             # bytes that a bag may always unpack to, and
-RATIO = 40                   # more for each of its own; sensors' messages pack to a tenth
-TEXT = 2**19                 # bytes of a YAML file
 DEFINITION = 2**16           # characters of a message definition
 ELEMENTS = 100_000           # values in the fixed arrays of one message
 SECONDS = 20                 # to understand a definition
@@ -62,7 +59,9 @@ class Allowance:
     def __init__(self, path: Path, total: int) -> None:
         packed = path.stat().st_size
         self._what = f'{path}: unpacked, it'
-        self.most = int(UNPACKED * packed / max(total, packed, 1) + RATIO * packed)
+        unpacked = 2**26    # bytes that a bag may always unpack to
+        ratio = 40    # more for each of its own; sensors' messages pack to a tenth
+        self.most = int(unpacked * packed / max(total, packed, 1) + ratio * packed)
         self._used = 0
 
     def again(self) -> None:
@@ -143,8 +142,9 @@ def read_text(path: Path) -> str:
     LimitReached, OSError, UnicodeDecodeError
 
     """
-    most = int(TEXT * factor())
+    size = 2**19    # bytes of a YAML file
+    most = int(size * factor())
     with path.open('rb') as file:
         data = file.read(most + 1)
-    check(len(data), TEXT, f'{path}: the text')
+    check(len(data), size, f'{path}: the text')
     return data.decode()

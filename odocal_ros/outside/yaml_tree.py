@@ -14,8 +14,6 @@ from typing import Any
 
 from odocal_ros.errors import BadConfig
 
-DEPTH = 30       # of mappings and lists in each other
-
 
 @cache
 def loader(aliases: bool = False) -> Any:
@@ -33,9 +31,10 @@ def loader(aliases: bool = False) -> Any:
             if not aliases and self.check_event(yaml.AliasEvent):
                 raise yaml.composer.ComposerError(
                     None, None, 'links (*name) are not taken here, nor by ROS', mark)
-            if self.depth >= DEPTH:
+            deepest = 30    # of mappings and lists in each other
+            if self.depth >= deepest:
                 raise yaml.composer.ComposerError(
-                    None, None, f'nested deeper than {DEPTH} levels', mark)
+                    None, None, f'nested deeper than {deepest} levels', mark)
             self.depth += 1
             try:
                 node = super().compose_node(parent, index)

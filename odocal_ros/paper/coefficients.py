@@ -14,8 +14,6 @@ import numpy as np
 from odocal_ros.paper.cells import Cell, TABLE_1, TABLE_2
 from odocal_ros.paper.error_model import coefficients, PAPER_RADIUS, STATES
 
-LATITUDE = np.deg2rad(40.0)
-VELOCITY_N = (14.0, 14.0, 0.0)     # m/s, east, north, up
 DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
 LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # 0.5', 3.6'
 # sizes of the errors that table 2 multiplies with: rad, rad/s
@@ -40,7 +38,9 @@ CUT = 'cut, not rounded'
 
 def table_1() -> dict[str, dict[str, Cell]]:
     """Return the coefficient of each error in the rate of each state: {rate of: {by: Cell}}."""
-    F = coefficients(LATITUDE, 0.0, VELOCITY_N, PAPER_RADIUS)
+    latitude = np.deg2rad(40.0)
+    velocity_n = (14.0, 14.0, 0.0)    # m/s, east, north, up
+    F = coefficients(latitude, 0.0, velocity_n, PAPER_RADIUS)
 
     def entry(row: str, column: str) -> float:
         return -1.0 if OWN_DRIFT.get(row) == column else float(

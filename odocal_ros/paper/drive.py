@@ -36,8 +36,6 @@ from odocal_ros.sim.scenarios import Drive, SimOptions, simulate
 from odocal_ros.sim.sensors import imu_rotation
 
 GYRO_NOISE = np.deg2rad(0.001) / 60     # rad/s/sqrt(Hz), 0.001 deg/sqrt(h)
-# pulses of a micrometre: a count hides 1e-10 of the distance, less than the errors looked for
-PULSE = 1e-6      # m
 # phi at the end of the standstill, ENU; drift in x right, y forward, z up: in units of the paper's
 SOURCES = {
     'none': ((0, 0, 0), (0, 0, 0)),
@@ -49,13 +47,13 @@ SOURCES = {
     'phi_U0': ((0, 0, 1), (0, 0, 0)),
     'all': ((1, 1, 1), (1, 1, 1)),
 }
-RIGHT_FORWARD_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def errors_of(source: str) -> tuple[Floats, Floats]:
     """Return phi_n (3,), rad, and eps_b (3,), rad/s in forward-left-up, of a row of table 3."""
     phi, eps = SOURCES[source]
-    return np.multiply(phi, (LEVEL, LEVEL, HEADING)), RIGHT_FORWARD_UP @ eps * DRIFT
+    right_forward_up = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.multiply(phi, (LEVEL, LEVEL, HEADING)), right_forward_up @ eps * DRIFT
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +85,10 @@ class PaperDrive:
     """The simulated drive of section 3, to be calibrated with any source of error."""
 
     def __init__(self) -> None:
+        # m; a count hides 1e-10 of the distance, less than the errors looked for
+        pulse = 1e-6
         self.drive: Drive = simulate(SimOptions(
-            scenario='paper', imu_grade='perfect', fix_sigma=0.0, scale=PULSE))
+            scenario='paper', imu_grade='perfect', fix_sigma=0.0, scale=pulse))
         truth, options = self.drive.truth, self.drive.options
         self.config: Config = with_settings(Config(), {
             'method': 'two_point',

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 
-# Krassovsky's ellipsoid as in eq. (1)-(5): m, m, m
-C, C0, C1 = 6399698.9018, 6367558.49686, 32005.79642
+C = 6399698.9018      # m, polar radius of curvature of Krassovsky's ellipsoid, eq. (1)-(5)
 
 
 def plane_error(latitude: Floats | float, longitude: Floats | float, central_meridian: float,
@@ -35,7 +34,8 @@ def plane_error(latitude: Floats | float, longitude: Floats | float, central_mer
     """
     s, c = np.sin(latitude), np.cos(latitude)
     off = central_meridian - longitude
-    dx = ((C0 + C1 * (s * s - c * c) + C / 2 * np.cos(2 * latitude) * off**2) * dL
+    c0, c1 = 6367558.49686, 32005.79642    # m, of the arc of meridian
+    dx = ((c0 + c1 * (s * s - c * c) + C / 2 * np.cos(2 * latitude) * off**2) * dL
           - C * s * c * off * dlam)
     return dx, C * s * off * dL + C * c * dlam
 

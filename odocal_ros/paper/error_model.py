@@ -47,8 +47,6 @@ from odocal_ros.paper.path import Path
 
 STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
 E, N, U, LAT, LON, H = range(6)
-BLOCK = 64        # steps that a scan multiplies up one after the other
-CHUNK = 4096      # steps made at a time
 PAPER_RADIUS = 6378137.0    # m, R_e of Shi et al. 2015
 
 
@@ -169,9 +167,10 @@ def _steps(path: Path, radius: float | None, drift_b: Floats) -> Floats:
     S = np.zeros((len(path.t), 6, 6 + drift_b.shape[-1]))
     S[:1, range(6), range(6)] = 1.0
     drift_b = np.broadcast_to(drift_b, (len(S) - 1, *drift_b.shape[-2:]))
-    for first in range(0, len(S) - 1, CHUNK):      # what fits a cache is three times as fast
-        own = slice(first, first + CHUNK)
-        _fill(S[1:][own], path, slice(first, first + CHUNK + 1), own, radius, drift_b[own])
+    chunk = 4096    # steps made at a time
+    for first in range(0, len(S) - 1, chunk):      # what fits a cache is three times as fast
+        own = slice(first, first + chunk)
+        _fill(S[1:][own], path, slice(first, first + chunk + 1), own, radius, drift_b[own])
     return S
 
 
@@ -198,7 +197,8 @@ def _scan(S: Floats) -> None:
 
     Blocks are multiplied up side by side, their last rows by the same scan, and carried in.
     """
-    width = min(BLOCK, max(2, int(np.sqrt(len(S)))))
+    block = 64    # steps that a scan multiplies up one after the other
+    width = min(block, max(2, int(np.sqrt(len(S)))))
     for k in range(1, min(width, len(S))):
         now = S[k::width]
         now[:] = _after(now, S[k - 1::width][:len(now)])

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Ints
 from odocal_ros.errors import BadUsage
 
-FULL_UP_TO = 2    # levels for which all combinations are taken
-
 
 @dataclass(frozen=True, eq=False)
 class Design:
@@ -187,7 +185,7 @@ def design_for(levels: tuple[int, ...]) -> Design:
     many = [n for n in levels if n > 1]
     everything = math.prod(levels)
     q = max(levels)
-    if q > FULL_UP_TO and len(many) > 2:
+    if q > 2 and len(many) > 2:
         if len(set(levels)) == 1 and prime_power(q) and len(levels) <= q + 1:
             return Design(f'L{q * q}({q}^{q + 1})', bose(q, len(levels)), levels, 0.0)
         folded = nearly_balanced(levels)

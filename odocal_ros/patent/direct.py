@@ -24,7 +24,6 @@ from odocal_ros.patent.criteria import loss, weights
 from odocal_ros.patent.planar import coefficients, PlanarLeg
 from odocal_ros.patent.space import sets_of, Space
 
-MOST = 200           # rounds; reweighting converges by a digit in a few
 SETTLED = 1e-11      # relative, rad: the last step
 HALVINGS = 40
 DIFFERENCE = np.array([-1.0, 1.0, 0.0])
@@ -83,7 +82,8 @@ def least_squares(leg: PlanarLeg, x: Floats, space: Space, robust: bool = False)
     iterations, settled = 0, False
     r, J = _linear(leg, space.T @ q)
     value = _value(leg, r, robust)
-    while not settled and iterations < MOST:
+    most = 200    # rounds; reweighting converges by a digit in a few
+    while not settled and iterations < most:
         iterations += 1
         root = np.sqrt(np.tile(weights(_d2(r), leg.sigma, robust), 2))
         step = _solve(root[:, None] * (J @ space.T), -root * r)

@@ -32,7 +32,7 @@ from odocal_ros.patent.space import sets_of, Space
 from odocal_ros.patent.surface import refine, Refined
 
 LEVELS = (7, 7, 9)
-RADIUS_STEP, HEADING_STEP = 0.01, np.deg2rad(0.25)      # m, rad
+RADIUS_STEP = 0.01      # m
 # left radius, right radius, m; heading, deg: as printed
 PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
            (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
@@ -117,7 +117,8 @@ def embodiment(leg: PlanarLeg, radius: float = RADIUS,
         True errors, m and deg, for a line of their own.
 
     """
-    half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * HEADING_STEP])
+    heading_step = np.deg2rad(0.25)
+    half = np.array([3 * RADIUS_STEP / radius, 3 * RADIUS_STEP / radius, 4 * heading_step])
     design = nearly_balanced(LEVELS)     # 81 rows
     small, whole = (_levels(rows, half) for rows in (design.rows, full_factorial(LEVELS)))
     (x_small, _), (x_whole, means) = (_best(leg, x) for x in (small, whole))

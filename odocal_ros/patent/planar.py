@@ -27,8 +27,6 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 
 CHUNK = 500_000          # distances held at once: 4 MB, which stays in the cache
-COURSE_BASELINE = 10.0   # m, least way between two fixes that give a course
-COURSE_CLEAR = 20.0      # fix sigmas, the same: the course is then good to 4 deg
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +116,9 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
-    need = max(COURSE_BASELINE, COURSE_CLEAR * float(np.median(sigma)))
+    course_baseline = 10.0    # m, least way between two fixes that give a course
+    course_clear = 20.0    # fix sigmas, the same: the course is then good to 4 deg
+    need = max(course_baseline, course_clear * float(np.median(sigma)))
     x, y = fixes_n.T.tolist()
     ends = [0]
     for k in range(1, len(x)):

@@ -18,8 +18,6 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.patent.arrays import Design, next_prime_power
 from odocal_ros.settings.config import WheelsConfig
 
-SCALE_RANGE, HEADING_RANGE = 0.05, np.deg2rad(10.0)    # where no error is stated
-
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
@@ -61,13 +59,15 @@ def ranges_of(wheels: WheelsConfig, heading_sigma: float | None = None) -> Range
     if wheels.radius_range > 0:
         scale, why = wheels.radius_range, 'wheels.radius_range'
     else:
-        scale, why = SCALE_RANGE, 'no error of the wheels is stated: 5 %'
+        scale_range = 0.05    # where no error is stated
+        scale, why = scale_range, 'no error of the wheels is stated: 5 %'
     if wheels.heading_range > 0:
         heading, reason = wheels.heading_range, 'wheels.heading_range'
     elif heading_sigma:
         heading, reason = min(2 * heading_sigma, np.pi), 'twice the sigma of the heading'
     else:
-        heading, reason = HEADING_RANGE, ('heading and mounting angle turn the track alike, and '
+        heading_range = np.deg2rad(10.0)    # where no error is stated
+        heading, reason = heading_range, ('heading and mounting angle turn the track alike, and '
                                           'the angle is not stated: 10 deg')
     # an odd number has zero among its levels
     n = wheels.levels if wheels.levels < 3 else next_prime_power(wheels.levels, odd=True)

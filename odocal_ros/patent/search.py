@@ -35,8 +35,6 @@ from odocal_ros.reasons import Code, Reason
 
 HEADING_MEANS = ('counter-clockwise turn of the track: error of the configured heading less the '
                  'yaw mounting angle, which positions cannot tell apart')
-FEWEST = 4           # fixes
-AGREE = 1e-3         # of the range: surface and least squares are one
 MOST_ROWS = 100      # of an array kept in calibration.json
 
 
@@ -137,10 +135,10 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
 
     Returns
     -------
-    SearchResult; None where there are fewer than FEWEST fixes.
+    SearchResult; None where there are fewer than four fixes.
 
     """
-    if len(leg.t) < FEWEST:
+    if len(leg.t) < 4:
         return None
     design = design_for(ranges.levels)
     x = ranges.values(design)
@@ -210,7 +208,8 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
         apart = np.abs(refined.x - direct.x)
         apart[2] = abs(wrap(apart[2]))
         share = float((apart / ranges.half).max())
-        if share > AGREE or not direct.settled:
+        agree = 1e-3    # of the range: surface and least squares are one
+        if share > agree or not direct.settled:
             found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares part '
                                 f'by {100 * share:.2g} % of the range'))
     return tuple(found)

@@ -27,8 +27,6 @@ from odocal_ros.patent.planar import PlanarLeg
 NAMES = ('left', 'right', 'heading')
 # columns: mean, difference (right less left), heading; held: mean, heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
-HELD = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-WIDEST = np.array([0.9, 0.9, 1.5 * np.pi])     # of a half range: no scale turns negative
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,7 @@ class Space:
     @property
     def T(self) -> NDArray[np.float64]:     # noqa: N802
         """Return the matrix of x = T q."""
-        return HELD if self.held else FREE
+        return FREE[:, [0, 2]] if self.held else FREE
 
     @property
     def S(self) -> NDArray[np.float64]:     # noqa: N802
@@ -58,9 +56,10 @@ class Space:
         return np.array([min(half[:2]), half[2]]) if self.held else np.array(half)
 
     def widened(self, half: Floats, on_edge: Bools) -> Floats:
-        """Return the half range of x doubled where v lies on its edge, to WIDEST at most."""
+        """Return the half range of x doubled where v is on its edge; no scale turns negative."""
         edge = np.array([on_edge[0], *on_edge]) if self.held else np.asarray(on_edge)
-        return np.where(edge, np.minimum(2 * np.asarray(half), WIDEST), half)
+        widest = np.array([0.9, 0.9, 1.5 * np.pi])    # of a half range
+        return np.where(edge, np.minimum(2 * np.asarray(half), widest), half)
 
 
 def sets_of(leg: PlanarLeg, x: Floats) -> Floats:

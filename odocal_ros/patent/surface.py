@@ -25,13 +25,6 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.patent.space import Space
 
-SHRINK, GROW = 0.25, 2.0
-SETTLED = 1e-6       # of the half range first asked for, the last step
-NARROW = 1e-3        # of it, the box to which the last surface is fitted
-DROWNED = 1e-6       # of the criterion: a box is not shrunk to where less than this is left of it
-ROUNDING = 1e-12     # of the criterion, by which equal values may differ
-MOST = 300           # surfaces; a range widened as far as it goes takes a hundred
-
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -134,6 +127,7 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
     first = last = walk.surface()
     settled = False
     iterations = 1
+    most = 300    # surfaces; a range widened as far as it goes takes a hundred
     while True:
         settled = walk.step(last)
         if settled and walk.on_edge.any():
@@ -142,7 +136,7 @@ def refine(value: Callable[..., Any], x: Floats, width: Floats, half: Floats, sp
             settled = False
         elif settled:
             break
-        if iterations == MOST:
+        if iterations == most:
             break
         last = walk.surface()
         iterations += 1
@@ -181,16 +175,22 @@ class _Walk:
         self.on_edge = (u <= low) | (u >= high)
         move = np.linalg.solve(S, u * bound)
         there = float(self.value((self.space.T @ (self.q + move))[None])[0])
-        small = np.abs(S @ move) <= SETTLED * self.space.bounds(self.asked)
-        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < DROWNED * self.least)
-        done = bool(small.all() and (~shrinks | (self.w <= NARROW * self.first_width)).all())
+        settled = 1e-6    # of the half range first asked for, the last step
+        small = np.abs(S @ move) <= settled * self.space.bounds(self.asked)
+        # of the criterion: a box is not shrunk to where less than this is left of it
+        drowned = 1e-6
+        shrinks = ~(0.5 * np.abs(np.diag(surface.hessian)) < drowned * self.least)
+        narrow = 1e-3    # of it, the box to which the last surface is fitted
+        done = bool(small.all() and (~shrinks | (self.w <= narrow * self.first_width)).all())
         beyond = np.abs(move) > self.w
-        if there <= self.least * (1 + ROUNDING):
+        rounding = 1e-12    # of the criterion, by which equal values may differ
+        if there <= self.least * (1 + rounding):
             self.q, self.least = self.q + move, there
         else:
             beyond = self._to_best_of_grid(bound)
-        grown = np.minimum(GROW * self.w, self.first_width)
-        self.w = np.where(beyond, grown, np.where(shrinks, SHRINK * self.w, self.w))
+        grow, shrink = 2.0, 0.25
+        grown = np.minimum(grow * self.w, self.first_width)
+        self.w = np.where(beyond, grown, np.where(shrinks, shrink * self.w, self.w))
         return done
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:

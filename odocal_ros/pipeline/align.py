@@ -43,11 +43,6 @@ from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
 
-COURSE_TIME = 300.0       # s within which the way for a course must be driven
-NOISIER_AT_REST = 10.0    # times the noise of the grade at rest: another gyro, or another unit
-NO_EARTH_SIGMAS = 4.0     # sigmas: a gyro with such a bias is no compass
-HEADING_REACH = 0.5       # s: a heading sample this near to a moving start is taken
-
 Found = tuple[tuple[float, float] | None, str]      # yaw and sigma, rad; or None and why
 
 
@@ -141,7 +136,8 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
 def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
     """Return a caution where the gyro at rest is far noisier than its grade: walks will be too."""
     times = noise / max(grade.gyro_noise, 1e-12)
-    if times <= NOISIER_AT_REST:
+    noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
+    if times <= noisier_at_rest:
         return ()
     unit = ', as one that sends deg/s would be' if 30 < times < 120 else ''
     return (Reason(Code.IMU_WORSE_THAN_GRADE, f'at rest the gyro is {times:.0f} times as noisy as '
@@ -217,14 +213,15 @@ def _heading_topic(inputs: Inputs, level: Level, latitude: float, grade: Grade,
 def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, config: Config,
                       to_b: Callable[[Floats], Floats], offset: float) -> Found:
     """Return (yaw, sigma) at the level's epoch from orientations as sent, or None and why."""
+    heading_reach = 0.5    # s: a heading sample this near to a moving start is taken
     # of hours only the rows that are looked at
-    begin, end = level.standstill or (level.t - HEADING_REACH, level.t + HEADING_REACH)
+    begin, end = level.standstill or (level.t - heading_reach, level.t + heading_reach)
     near = slice(np.searchsorted(t, begin), np.searchsorted(t, end, side='right'))
     t, q, variance = t[near], q[near], variance[near]
     pick = ~np.isnan(variance) & (np.linalg.norm(q, axis=-1) > 0.5)
     if not level.standstill:
         away = np.where(pick, np.abs(t - level.t), np.inf)
-        pick = (away <= HEADING_REACH) & (away == away.min(initial=np.inf))
+        pick = (away <= heading_reach) & (away == away.min(initial=np.inf))
     if not pick.any():
         return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
     C = to_b(matrix_from_quat(q[pick]))
@@ -245,7 +242,8 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
         return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
                       f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
     off = off_the_earth(level, latitude, grade)
-    if off > NO_EARTH_SIGMAS:
+    no_earth_sigmas = 4.0    # sigmas: a gyro with such a bias is no compass
+    if off > no_earth_sigmas:
         return None, (f'at rest the gyro does not show the turn of the Earth, by {off:.0f} sigma: '
                       f'its bias is not that of the {config.imu.grade} grade')
     return (yaw, sigma), ''
@@ -259,7 +257,8 @@ def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Float
             grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
-    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + COURSE_TIME)
+    course_time = 300.0    # s within which the way for a course must be driven
+    pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
                        earth_rate_n(origin.latitude))
     track = dead_reckon(t, q_nb, inputs.travel)
@@ -275,4 +274,4 @@ def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Float
             yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
             return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
     return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course either: the fixes do not move '
-                               f'{COURSE_DISTANCE:.0f} m within {COURSE_TIME:.0f} s'),)
+                               f'{COURSE_DISTANCE:.0f} m within {course_time:.0f} s'),)

@@ -35,7 +35,6 @@ SECOND = 10**9
 LEG_END_REST_NS = 10 * SECOND    # of the standstill that ends a leg: it tells place and biases
 PARKED_NS = 120 * SECOND         # a longer standstill ends a leg of any length
 STOOD_NS = 1 * SECOND            # of the first count of a drive-off the vehicle stood
-MOST_WAITING = 200_000           # odometer rows that wait for the Imu
 
 
 @dataclass
@@ -64,8 +63,9 @@ class LegSearch:
         surveyed = config.reference.start and config.reference.end
         self._first_ns = dict.fromkeys(('imu', 'odometer') + (() if surveyed else ('fix',)), 0)
         self.spans: deque[Span] = deque()
+        most_waiting = 200_000    # odometer rows that wait for the Imu
         # stamp and travel of odometer rows
-        self._waiting: deque[tuple[int, float]] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[tuple[int, float]] = deque(maxlen=most_waiting)
         self._gaps: deque[tuple[int, int]] = deque()         # of the Imu: both edges
         self._imu_ns = 0
         self._travel = 0.0

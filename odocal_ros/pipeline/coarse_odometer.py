@@ -21,8 +21,6 @@ from odocal_ros.screening.screen import Inputs
 
 NAME = 'speed_truncation'
 ADDED_UP = ('two_point', 'wheels')      # methods whose travel is the sum of the speeds
-COARSE_WORTH = 5e-4     # of the scale: half a step that is worth a word
-COARSE_COUNT_M = 0.2    # m, a count that is
 
 
 def half_step(inputs: Inputs) -> float:
@@ -52,11 +50,13 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     """Say that speed or counts come in coarse steps."""
     K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
-    if count > COARSE_COUNT_M:
+    coarse_count_m = 0.2    # m, a count that is
+    if count > coarse_count_m:
         return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '
                        'by up to that')]
     coarse = _coarse(inputs)
-    if coarse is None or size < COARSE_WORTH:
+    coarse_worth = 5e-4    # of the scale: half a step that is worth a word
+    if coarse is None or size < coarse_worth:
         return []
     metres = coarse.step * K
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \

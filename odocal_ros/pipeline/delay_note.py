@@ -17,8 +17,6 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-LEAST_DELAY_WAY = 0.1    # m: a lever arm need not be known better either
-HIDDEN_BY_FIX = 0.25     # of a fix's sigma: what a delay makes of less, no fix shows
 WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
 
 
@@ -39,9 +37,11 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     """
     speed = _speed(prepared) * scale
     notes = []
+    least_delay_way = 0.1    # m: a lever arm need not be known better either
+    hidden_by_fix = 0.25    # of a fix's sigma: what a delay makes of less, no fix shows
     for name, (late, sigma) in seen.items():
         way = abs(late) * speed
-        worth = max(LEAST_DELAY_WAY, HIDDEN_BY_FIX * prepared.fix_sigma)
+        worth = max(least_delay_way, hidden_by_fix * prepared.fix_sigma)
         if not (abs(late) > REMARK_SIGMAS * sigma and way > worth):
             continue
         set_to = getattr(prepared.config, name).time_offset

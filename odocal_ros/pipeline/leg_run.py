@@ -29,11 +29,9 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import Inputs
 
-DISTANCE_SIGMA = 0.05    # relative sigma up to which a scale gives the distance
 # of the time that methods take, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
 TRACKS = 2
-USUAL_PASSES = 6.0    # of a fit, in which it comes to two thirds of its way: 10 are usual
 
 
 def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
@@ -73,8 +71,9 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> Le
     if scale is None or paths is None:
         return leg_result(leg, inputs, (*prepared.reasons, *_once(found)), methods,
                           distance=prepared.distance, deciding=deciding(asked))
+    distance_sigma = 0.05    # relative sigma up to which a scale gives the distance
     # truer than the rough scale
-    if scale.value and scale.sigma is not None and scale.sigma < DISTANCE_SIGMA * scale.value:
+    if scale.value and scale.sigma is not None and scale.sigma < distance_sigma * scale.value:
         prepared = judged_by(prepared, scale.value)
     shown, said = tracks(prepared, paths)
     found += said
@@ -117,6 +116,7 @@ def _teller(names: Iterable[str],
         begin, width = done, METHOD_EFFORT[name] / _effort(names)
         progress(begin, name)
         done += width
+        usual_passes = 6.0    # of a fit, in which it comes to two thirds of its way: 10 are usual
         return lambda passes: progress(
-            begin + width * (1 - float(np.exp(-passes / USUAL_PASSES))), name)
+            begin + width * (1 - float(np.exp(-passes / usual_passes))), name)
     return begun

@@ -16,7 +16,6 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, with_scale_error
 from odocal_ros.reasons import Code
 
-HILLS = 5e-4         # of the scale: half the mean square of slopes of 3 %, which make a way longer
 NAME = 'hills'
 
 
@@ -24,7 +23,8 @@ def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
     if prepared.inputs.felt:
         return method
-    method = with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, HILLS))
+    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a way longer
+    method = with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, hills))
     # what NO_ACCELEROMETER says of the angles, with another remedy
     said = {Code.PITCH_NOT_DETERMINED} | (
         set() if prepared.alignment.heading_separable else {Code.YAW_NOT_SEPARABLE})

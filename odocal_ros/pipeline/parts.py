@@ -22,30 +22,29 @@ from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
-SHORTEST_NS = 10**9           # of a part: less is lost with the gap
-MOST_PARTS = 20               # an Imu with more gaps stutters: its leg is rejected
-GAP_MARGIN_NS = 1000          # below the limit: more than seconds in floating point are off
-NEAR_START_NS = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
-
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
     """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
     gaps = _gaps(leg, limit_s)
-    if not 0 < len(gaps) < MOST_PARTS:
+    most_parts = 20    # an Imu with more gaps stutters: its leg is rejected
+    if not 0 < len(gaps) < most_parts:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
     ends = [*gaps[:, 0].tolist(), leg.stop_ns]
     spans = [(max(first or leg.start_ns, leg.start_ns), last, first)
              for first, last in zip(begins, ends, strict=True)]
-    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= SHORTEST_NS] or [leg]
+    shortest_ns = 10**9    # of a part: less is lost with the gap
+    return [part_of(leg, *span) for span in spans if span[1] - span[0] >= shortest_ns] or [leg]
 
 
 def _gaps(leg: Leg, limit_s: float) -> Ints:
     """Return begin and end of the gaps of the Imu, ns: (k, 2); one up to a mark is one, too."""
-    near = _near(leg.imu.stamp_ns, leg.start_ns - NEAR_START_NS, leg.stop_ns)
+    near_start_ns = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
+    near = _near(leg.imu.stamp_ns, leg.start_ns - near_start_ns, leg.stop_ns)
     if len(near) < 2:
         return np.empty((0, 2), np.int64)
-    least_ns = round(limit_s * 1e9) - GAP_MARGIN_NS
+    gap_margin_ns = 1000    # below the limit: more than seconds in floating point are off
+    least_ns = round(limit_s * 1e9) - gap_margin_ns
     k = np.flatnonzero(by_step(lambda stamps: np.diff(stamps) > least_ns, near))
     begin, end = np.append(near[k], near[-1]), np.append(near[k + 1], leg.stop_ns)
     if ((begin < leg.start_ns) & (leg.start_ns < end)).any():

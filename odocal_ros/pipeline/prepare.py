@@ -33,7 +33,6 @@ from odocal_ros.screening.placed import place, Placed
 from odocal_ros.screening.screen import imu_gap, Inputs
 from odocal_ros.settings.config import Config
 
-FEWEST_ROWS = 4         # of the Imu between the marks, for an attitude
 BY_SCALE = {Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW}     # what is judged in metres
 BROKEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED}
 
@@ -121,7 +120,8 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
     if still or not placed.rough:
         return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little for a scale'),)
     covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
-    if covered.sum() < FEWEST_ROWS:
+    fewest_rows = 4    # of the Imu between the marks, for an attitude
+    if covered.sum() < fewest_rows:
         return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
     return None
 

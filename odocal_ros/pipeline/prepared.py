@@ -30,9 +30,6 @@ from odocal_ros.screening.placed import Placed
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
-EPOCH_RATE = 50.0       # Hz, least rate of attitude epochs
-AT_MARK = 0.05          # s from a mark at which a surveyed point still holds
-
 
 @dataclass(frozen=True, eq=False)
 class PreparedLeg(Placed):
@@ -100,7 +97,8 @@ class PreparedLeg(Placed):
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop
         span = standing_at(t_mark, self.spans)
-        if abs(t - t_mark) <= AT_MARK or (span and span == standing_at(t, self.spans)):
+        at_mark = 0.05    # s from a mark at which a surveyed point still holds
+        if abs(t - t_mark) <= at_mark or (span and span == standing_at(t, self.spans)):
             point: tuple[float, ...] = getattr(self.config.reference, name)
             return point
         return ()
@@ -122,5 +120,6 @@ def attitude_of(inputs: Inputs, latitude: float, t_begin: float, q_nb: Floats,
                  np.searchsorted(inputs.t_imu, inputs.t_stop + 1.0, side='right'))
     t = inputs.t_imu[rows]
     rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
+    epoch_rate = 50.0    # Hz, least rate of attitude epochs
     return attitude(t, inputs.w_b[rows], q_nb, earth_rate_n(latitude),
-                    max(1, int(rate / EPOCH_RATE)), gyro_bias)
+                    max(1, int(rate / epoch_rate)), gyro_bias)

@@ -24,7 +24,6 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.scale_error import SCALES, WHEELS, with_scale_error
 
 NAME = 'slow_wheel_slip'
-LONGEST_STEP = 8.0    # s: method wheels takes a slip for a step, which a longer one is not
 
 
 def held(method: MethodResult, prepared: PreparedLeg, slips: WheelSlips) -> MethodResult:
@@ -46,7 +45,8 @@ def held(method: MethodResult, prepared: PreparedLeg, slips: WheelSlips) -> Meth
 
 def _not_held(method: MethodResult, slips: WheelSlips) -> Floats:
     """Return the sizes, m, of the slips of one wheel that are not in the method's sigmas yet."""
-    long = slips.end - slips.begin > LONGEST_STEP
+    longest_step = 8.0    # s: method wheels takes a slip for a step, which a longer one is not
+    long = slips.end - slips.begin > longest_step
     own = [(s['t'], s['t'] + s['duration']) for s in method.details.get('slips', ())]
     seen = np.array([any(a <= end and b >= begin for a, b in own)
                      for begin, end in zip(slips.begin, slips.end, strict=True)], bool)

@@ -29,7 +29,6 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
 NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
-ONWARD = 0.2     # s, whose motion goes on beyond the data, by the delay
 
 
 def smoother(ready: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
@@ -82,8 +81,9 @@ def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
         inside = np.clip(t, track.t[0], track.t[-1])
         beyond = np.clip(t - inside, -abs(late), abs(late))
         P = track.at(inside)
-        before = track.at(inside - np.copysign(ONWARD, beyond))
-        P = P + (P - before) * (np.abs(beyond) / ONWARD)[..., None, None]
+        onward = 0.2    # s, whose motion goes on beyond the data, by the delay
+        before = track.at(inside - np.copysign(onward, beyond))
+        P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
         at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
         return at
     return path

@@ -26,7 +26,6 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
 FEWEST_TRACK_FIXES = 3    # for a check of the track
-TRACK_OUTLIER = 20.0      # times the usual distance from the track: an outlier beyond doubt
 
 
 def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:
@@ -56,10 +55,11 @@ def near(ready: PreparedLeg, path: Path, pin: MarkFix,
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
     usual = max(float(np.median(off[between])), ready.fix_sigma)
-    far = off > TRACK_OUTLIER * usual
+    track_outlier = 20.0    # times the usual distance from the track: an outlier beyond doubt
+    far = off > track_outlier * usual
     found = (Reason(
         Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes '
-        f'lie more than {TRACK_OUTLIER * usual:.0f} m off the track; not used in the check'),)
+        f'lie more than {track_outlier * usual:.0f} m off the track; not used in the check'),)
     return ~far, found if (far & between).any() else ()
 
 

@@ -21,7 +21,6 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 
 REST_SPEED = 1e-6     # m/s
 DRIVE_STEP = 0.1      # s, of drives made here
-LEAST_MOTION = 1.0    # m: less is no drive
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +54,8 @@ class PlannedDrive:
         for name, row in rows.items():
             row.setflags(write=False)
             object.__setattr__(self, name, row)
-        if self.distance < LEAST_MOTION:
+        least_motion = 1.0    # m: less is no drive
+        if self.distance < least_motion:
             raise BadUsage(f'the planned drive never moves ({self.distance:.2f} m between the '
                            'marks); give it a speed and a distance')
 

@@ -19,8 +19,6 @@ from odocal_ros.screening.placed import place, Placed
 from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
-PROFILE_WINDOW = 0.5    # s each side that a speed is taken over
-
 
 def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     """
@@ -46,8 +44,9 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
     resting = np.any([(t >= a) & (t <= b) for a, b in spans], axis=0) if len(spans) \
         else np.zeros(len(t), bool)
-    way = inputs.travel.at(t + PROFILE_WINDOW) - inputs.travel.at(t - PROFILE_WINDOW)
-    speed = np.where(resting, 0.0, way * scale / (2 * PROFILE_WINDOW))
+    profile_window = 0.5    # s each side that a speed is taken over
+    way = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
+    speed = np.where(resting, 0.0, way * scale / (2 * profile_window))
     speed[~resting & (np.abs(speed) <= REST_SPEED)] = 2 * REST_SPEED   # too short to count as rest
     yaw = _yaw(inputs, spans, t)
     return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, placed.fixes_n),

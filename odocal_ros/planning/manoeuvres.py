@@ -18,25 +18,20 @@ from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 
 BRAKING = 1.5    # m/s^2, as in a town
 QUARTER = np.pi / 2
-TURN_TIME = 8.0         # s of a turn of 90 deg,
-SIDEWAYS_FORCE = 2.0    # m/s^2: longer where that is more to the side
-TURNS_APART = 5.0       # s straight between the two turns
-STOP_TIME = 5.0         # s of a stop
-NEAR_TOP = 0.9          # of the greatest speed: where there is room for a manoeuvre
 # a minute of town: still, up, cruise with a turn, down, still (docs/method.md section 3)
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
-TOWN_TURN = 22.0, 30.0               # s, begin and end
 TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
 
 
 def stop_and_start(drive: PlannedDrive) -> PlannedDrive:
-    """Return the drive with a stop on the way: braked, stood for STOP_TIME, up to speed again."""
+    """Return the drive with a stop on the way: braked, stood for 5 s, up to speed again."""
     k = _amid(drive)
     v = drive.speed[k]
     ramp = abs(v) / BRAKING
-    t = _grid(2 * ramp + STOP_TIME, ramp, ramp + STOP_TIME)
-    return inserted(drive, k, t, np.interp(t, [0.0, ramp, ramp + STOP_TIME, 2 * ramp + STOP_TIME],
+    stop_time = 5.0    # s of a stop
+    t = _grid(2 * ramp + stop_time, ramp, ramp + stop_time)
+    return inserted(drive, k, t, np.interp(t, [0.0, ramp, ramp + stop_time, 2 * ramp + stop_time],
                                            [v, 0.0, 0.0, v]), np.zeros_like(t))
 
 
@@ -44,11 +39,13 @@ def turns_both_ways(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
     k = _amid(drive)
     v = drive.speed[k]
-    turn = max(TURN_TIME, QUARTER * abs(v) / SIDEWAYS_FORCE)
-    whole = 2 * turn + TURNS_APART
-    t = _grid(whole, turn, turn + TURNS_APART)
+    turn_time, sideways_force = 8.0, 2.0    # s of 90 deg; m/s^2 to the side that make it longer
+    turn = max(turn_time, QUARTER * abs(v) / sideways_force)
+    turns_apart = 5.0    # s straight between the two turns
+    whole = 2 * turn + turns_apart
+    t = _grid(whole, turn, turn + turns_apart)
     return inserted(drive, k, t, np.full_like(t, v), np.interp(
-        t, [0.0, turn, turn + TURNS_APART, whole], [0.0, QUARTER, QUARTER, 0.0]))
+        t, [0.0, turn, turn + turns_apart, whole], [0.0, QUARTER, QUARTER, 0.0]))
 
 
 def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
@@ -61,12 +58,13 @@ def town_driving(drive: PlannedDrive, minutes: int) -> PlannedDrive:
     if brake > DRIVE_STEP:          # it ends in motion
         own = _grid(brake)
         t, speed, turned = [own], [v * (1 - own / brake)], [np.zeros_like(own)]
+    town_turn = 22.0, 30.0    # s, begin and end in the minute
     for minute in range(minutes):
-        own = _grid(TOWN_T[-1], *TOWN_T[1:-1], *TOWN_TURN)
+        own = _grid(TOWN_T[-1], *TOWN_T[1:-1], *town_turn)
         angle = QUARTER * TOWN_SIDES[minute % len(TOWN_SIDES)]
         t.append(own + brake + minute * TOWN_T[-1])
         speed.append(np.interp(own, TOWN_T, TOWN_SPEED))
-        turned.append(yaw + np.interp(own, TOWN_TURN, [0.0, angle]))
+        turned.append(yaw + np.interp(own, town_turn, [0.0, angle]))
         yaw += angle
     return inserted(drive, k, *(np.concatenate(x) for x in (t, speed, turned)))
 
@@ -97,7 +95,8 @@ def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
 def _amid(drive: PlannedDrive) -> int:
     """Return the row nearest to the middle of the way among those near the greatest speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
-    fast = np.flatnonzero(speed >= NEAR_TOP * speed.max())
+    near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
+    fast = np.flatnonzero(speed >= near_top * speed.max())
     way = np.cumsum(np.abs(np.diff(drive.travel, prepend=drive.travel[0])))
     return int(fast[np.argmin(np.abs(way[fast] - way[-1] / 2))])
 

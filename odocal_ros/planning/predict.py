@@ -37,9 +37,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY
 
-CORRELATION_TIME = 60.0     # s over which fixes of one receiver stay alike where nothing is said
 SLIP = 0.01                 # m/sqrt(s), what the smoother believes at first
-FORWARD = np.array([1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +85,9 @@ class Sigmas:
     def correlation_time(self) -> float:
         """Return the time over which fix errors stay alike, s; 0: white."""
         asked = self.config.gnss.correlation_time
-        return CORRELATION_TIME if np.isnan(asked) else asked
+        # s over which fixes of one receiver stay alike where nothing is said
+        correlation_time = 60.0
+        return correlation_time if np.isnan(asked) else asked
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +204,8 @@ def _mark(t: float, track: Track, drive: PlannedDrive, sigmas: Sigmas,
           spans: Sequence[tuple[float, float]], surveyed: tuple[float, ...]) -> MarkFix:
     """Return the reference position there will be at a mark, by the fixes that fall to it."""
     span = standing_at(t, spans)
-    position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ FORWARD
+    forward = np.array([1.0, 0.0, 0.0])
+    position_n = (track.at(np.array(t)) - track.at(np.array(0.0))) @ forward
     if surveyed:
         return MarkFix(t, position_n, np.eye(3) * surveyed[3]**2, span is not None, 0, 0,
                        surveyed=True)

@@ -28,8 +28,6 @@ from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.settings.config import Config
 
-SAMPLE_RATE = 20.0     # Hz: the noise of a second does not hang on how often it is sampled
-SAMPLES_ENOUGH = 50    # samples between keyframes that lie far apart
 SENT = ('heading_topic', 'imu_orientation')
 
 
@@ -81,7 +79,9 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = max(min(0.0, float(before[-1][0])), -config.leg.preroll) if before else 0.0
     origin = Origin(drive.latitude, drive.longitude, drive.height)
-    rate = min(SAMPLE_RATE, SAMPLES_ENOUGH / spacing)
+    sample_rate = 20.0    # Hz: the noise of a second does not hang on how often it is sampled
+    samples_enough = 50    # samples between keyframes that lie far apart
+    rate = min(sample_rate, samples_enough / spacing)
     t = np.linspace(t_begin, drive.duration,
                     max(2, round((drive.duration - t_begin) * rate) + 1))
     motion = _motion(drive, t, origin, config)

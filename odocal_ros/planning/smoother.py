@@ -29,9 +29,6 @@ from odocal_ros.planning.samples import Ideal, ideal
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
 
-# keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at
-# WIDEST_SPACING, more beyond two hours, which is more than a live leg may last; never too small
-ENOUGH_INTERVALS, MOST_INTERVALS = 600, 1440
 WIDEST_SPACING = 5.0    # s
 SWAY_RATE = 10.0        # Hz of the white noise that sigmas.sway is said for
 
@@ -75,8 +72,11 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
 
 def spacing_for(drive: PlannedDrive) -> float:
     """Return the seconds between keyframes that a drive is predicted with."""
-    usual = np.clip(drive.duration / ENOUGH_INTERVALS, SPACING, WIDEST_SPACING)
-    return float(max(usual, drive.duration / MOST_INTERVALS))
+    # keyframes lie farther apart in longer drives: sigmas come out 5 to 10 % too large at
+    # WIDEST_SPACING, more beyond two hours, longer than a live leg may last; never too small
+    enough_intervals, most_intervals = 600, 1440
+    usual = np.clip(drive.duration / enough_intervals, SPACING, WIDEST_SPACING)
+    return float(max(usual, drive.duration / most_intervals))
 
 
 def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) -> Levels:

@@ -23,7 +23,6 @@ from odocal_ros.reasons import Code, Reason
 CLOCK_APART = 0.5      # s, between topics
 OFFSET_REACH = 1.0     # s, what a time_offset setting holds
 CLOCK_SET = 0.02       # s, a clock set by more than this is named
-LAG_NEIGHBOURS = 50    # rows each side that tell the lag there
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock: no time_offset reaches so far. Of a bag that is '
@@ -128,8 +127,9 @@ def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
         return []
     first, last = int(odd[0]), int(odd[-1])
     lag = _lag(samples)
-    before = lag[max(0, first + 1 - LAG_NEIGHBOURS):first + 1]
-    after = lag[last + 1:][:LAG_NEIGHBOURS]
+    lag_neighbours = 50    # rows each side that tell the lag there
+    before = lag[max(0, first + 1 - lag_neighbours):first + 1]
+    after = lag[last + 1:][:lag_neighbours]
     moved = float(np.median(before) - np.median(after))      # of the stamps, against arrival
     at = int(odd[np.argmin(np.abs(step[odd] - moved))])
     if abs(moved) < CLOCK_SET or abs(step[at] - moved) > 0.3 * abs(moved) + np.median(step):

@@ -32,12 +32,6 @@ if TYPE_CHECKING:
 
 BIN_S = 1.0                        # s, accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins
-BINS_AT_A_TIME = 64                    # bins worked on at a time
-FACING_SIGMA = np.deg2rad(10.0)        # 1 sigma of where the Imu faces, to speak of it
-PUSH_GAIN = 0.5, 2.0    # of the push by what the wheels say: else it is something else
-FAR_FACING = np.deg2rad(75.0)          # off the nominal: no mounting is meant so
-NEAR_FACING = np.deg2rad(10.0)         # off what a method takes for forward: no matter for slips
-OTHER_WAY_ROUND = np.deg2rad(150.0)    # an odometer that runs the other way looks so too
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 
 
@@ -91,7 +85,8 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     first = np.searchsorted(t, edges, side='right')
     count = np.diff(first)
     means = np.empty((len(count), 4))
-    for bins in (slice(k, k + BINS_AT_A_TIME) for k in range(0, len(count), BINS_AT_A_TIME)):
+    bins_at_a_time = 64    # bins worked on at a time
+    for bins in (slice(k, k + bins_at_a_time) for k in range(0, len(count), bins_at_a_time)):
         rows = slice(first[bins.start], first[bins.start + len(count[bins])])
         cell = np.repeat(np.arange(len(count[bins])), count[bins])
         for k, column in enumerate((*f[rows].T, w[rows] @ up)):
@@ -144,7 +139,9 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     # only half of the residual lies across, only every other change (they share bins) is a draw
     variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
     sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
-    if sigma > FACING_SIGMA or not PUSH_GAIN[0] < abs(gain[0]) < PUSH_GAIN[1]:
+    facing_sigma = np.deg2rad(10.0)    # 1 sigma of where the Imu faces, to speak of it
+    push_gain = 0.5, 2.0    # of the push by what the wheels say: else it is something else
+    if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
     forward = gain[0].real * found.e1 + gain[0].imag * found.e2
     return Facing(float(-np.arctan2(forward[1], forward[0])), sigma)
@@ -153,7 +150,8 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
 def toward(found: Facing | None, f: Floats) -> Floats:
     """Return scale times forward axis, (3,), turned to where the Imu faces if that is far off."""
     yaw, pitch = mounting_from_forward(f)
-    if found is None or abs(float(wrap(found.yaw - yaw))) < max(NEAR_FACING, 3 * found.sigma):
+    near_facing = np.deg2rad(10.0)    # off what a method takes for forward: no matter for slips
+    if found is None or abs(float(wrap(found.yaw - yaw))) < max(near_facing, 3 * found.sigma):
         return f
     return np.linalg.norm(f) * forward_b(found.yaw, pitch)
 
@@ -168,11 +166,13 @@ def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]
     seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
         seen += f', nominal {np.rad2deg(nominal):+.0f}'
-    if off > OTHER_WAY_ROUND:
+    other_way_round = np.deg2rad(150.0)    # an odometer that runs the other way looks so too
+    if off > other_way_round:
         return (Reason(Code.ODOMETER_REVERSED, f'speeding up pushes the Imu {way} (yaw mounting '
                        f'{seen}): positive counts mean backwards, the Imu faces the other way, or '
                        'all was driven in reverse and the counter does not tell'),)
-    if off < FAR_FACING + 3 * found.sigma:
+    far_facing = np.deg2rad(75.0)    # off the nominal: no mounting is meant so
+    if off < far_facing + 3 * found.sigma:
         return ()
     return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu {way} (yaw mounting {seen}): the '
                    'body frame is not forward-left-up'),)

@@ -18,14 +18,6 @@ from odocal_ros.nav.earth import ecef_from_geodetic
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import GnssConfig
 
-MOST_HEIGHT = 1e5          # m, beyond it a fix is at no real position
-ASYMMETRY = 1e-3           # correlations above and below the diagonal
-ABOUT_START = 11           # fixes about the start mark that the origin is amid
-AWAY_FROM_MOST = 1e6       # m from where most fixes are, the same
-SMALLEST_SIGMA = 1e-6      # m, a sigma below it, and
-LARGEST_SIGMA = 1e8        # m, beyond it, says nothing
-LEAST_EIGENVALUE = 1e-6    # least eigenvalue of the correlations: below it an axis adds nothing
-
 
 def usable_fixes(fix: FixSamples, sent: int,
                  gnss: GnssConfig) -> tuple[Bools, Floats, tuple[Reason, ...]]:
@@ -47,7 +39,8 @@ def usable_fixes(fix: FixSamples, sent: int,
 
     """
     no_fix = fix.status < gnss.min_status
-    lost = ~placed(fix) | (abs(fix.height) > MOST_HEIGHT)
+    most_height = 1e5    # m, beyond it a fix is at no real position
+    lost = ~placed(fix) | (abs(fix.height) > most_height)
     lost = lost | _away(fix, ~(lost | no_fix))
     covariance, unknown = covariances(fix, gnss.default_sigma)
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
@@ -85,7 +78,8 @@ def _away(fix: FixSamples, good: Bools) -> Bools:
     away = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
-        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > AWAY_FROM_MOST
+        away_from_most = 1e6    # m from where most fixes are: at no real position
+        away[good] = np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1) > away_from_most
     return away
 
 
@@ -109,23 +103,29 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
 def _proper(matrices: Floats) -> Bools:
     """Tell which matrices are covariances that can be inverted: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
+    largest_sigma = 1e8    # m, a sigma beyond it says nothing
     # products and roots of what is beyond any receiver would overflow
-    small = np.abs(matrices) < LARGEST_SIGMA**2
+    small = np.abs(matrices) < largest_sigma**2
     sane: Bools = np.all(np.isfinite(matrices) & small, axis=(1, 2))
-    sane &= (variance > SMALLEST_SIGMA**2).all(axis=1)
+    smallest_sigma = 1e-6    # m, a sigma below it says nothing
+    sane &= (variance > smallest_sigma**2).all(axis=1)
     with np.errstate(all='ignore'):
         sigma = np.sqrt(variance)
         unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
     unit[~sane] = np.eye(matrices.shape[1])
+    asymmetry = 1e-3    # correlations above and below the diagonal
     # one that is not symmetric is damaged: which half holds, nobody knows
-    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < ASYMMETRY).all(axis=(1, 2))
-    sane &= np.linalg.eigvalsh(unit)[:, 0] > LEAST_EIGENVALUE
+    sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < asymmetry).all(axis=(1, 2))
+    # least eigenvalue of the correlations: below it an axis adds nothing
+    least_eigenvalue = 1e-6
+    sane &= np.linalg.eigvalsh(unit)[:, 0] > least_eigenvalue
     return sane
 
 
 def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
     """Return where n is fixed: the fix amid those about the start, so that no outlier is it."""
-    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:ABOUT_START])
+    about_start = 11    # fixes about the start mark that the origin is amid
+    near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
     r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)
     amid = near[np.argmin(np.linalg.norm(r_e - np.median(r_e, axis=0), axis=1))]
     latitude, longitude, height = geodetic[amid]

@@ -25,29 +25,14 @@ from odocal_ros.settings.config import ImuConfig
 
 # far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
-LARGEST_VALUE = 1e300     # of any other value: sums and products with it stay finite
-UNIT_LENGTH = 2.0         # times one, either way: a quaternion of another length is no attitude
-WIDEST_VARIANCE = 1e12    # rad^2, no driver's way of saying unknown is beyond it
-LEAST_VALUE = 1e-50       # nor does any mean less than a float32 can hold, but zero
 # rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
 CLUMP_ROWS = 5
 CLUMP_REACH = 50          # rows: a page or a packed block of a recording is about so many
 DAMAGED_SHARE = 0.01      # of the rows beyond any sensor: so many are a damaged recording, or
 SEVERAL_ROWS = 4          # rows, wherever: about as many are wrong beside them and do not show
-TURN_STEP = 0.8           # rad/s, least bound from row to row that may be a glitch
-FORCE_STEP = 50.0         # m/s^2, the same: potholes stay
-SPEED_STEP = 0.3          # of the top speed, the same
-USUAL_STEPS = 20.0        # times the usual step from row to row
-GLITCH_TIME = 0.4         # s within which a glitch is over: longer, and motion itself may do it
-BACK_SHARE = 0.5          # of the bound: nearer to the row before it, the glitch is over
 ROWS_BESIDE = 5          # rows to either side that are still where a single row is false
-SINGLE_TIMES = 10.0    # times as far from its neighbours as any of those beside it is from theirs
-NEIGHBOURS_ALIKE = 0.3    # of that: so near to each other are the neighbours of a false row
-SINGLE_TURN = 0.03        # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
-SINGLE_FORCE = 2.0        # m/s^2, the same
 GLITCH_SHARE = 0.002      # of the rows: more of them are no glitches
 ROLLS = 0.1               # of the top speed: slower on the mean, a vehicle may as well stand
-MOST_BOUNDS = 2000        # bounds looked at
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
@@ -56,11 +41,13 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
-    most = BEYOND_SENSOR.get(name, LARGEST_VALUE)
+    largest_value = 1e300    # of what no sensor bounds: sums and products with it stay finite
+    most = BEYOND_SENSOR.get(name, largest_value)
 
     def odd(x: NDArray[Any]) -> Bools:
         size = np.abs(x)
-        usable = (size <= most) & ((size >= LEAST_VALUE) | (size == 0))
+        least_value = 1e-50    # no driver means less than a float32 can hold, but zero
+        usable = (size <= most) & ((size >= least_value) | (size == 0))
         odd: Bools = ~(usable if x.ndim == 1 else across(np.logical_and, usable))
         return odd
     with np.errstate(invalid='ignore'):
@@ -71,8 +58,10 @@ def oriented(samples: Oriented) -> Oriented:
     """Return Imu or heading rows without the orientations that are none; variance NaN there."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
-        none: Bools = ((length < 1 / UNIT_LENGTH) | (length > UNIT_LENGTH)
-                       | (np.abs(variance) > WIDEST_VARIANCE))
+        unit_length = 2.0    # times one, either way: a quaternion of another length is no attitude
+        widest_variance = 1e12    # rad^2, no driver's way of saying unknown is beyond it
+        none: Bools = ((length < 1 / unit_length) | (length > unit_length)
+                       | (np.abs(variance) > widest_variance))
         return none
 
     wild = beyond('q_ni', samples.q_ni)
@@ -126,13 +115,17 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     if not len(far):
         return found
     size = bound[far]
-    clear = size > USUAL_STEPS * float(np.median(bound, overwrite_input=True))
+    usual_steps = 20.0    # times the usual step from row to row
+    clear = size > usual_steps * float(np.median(bound, overwrite_input=True))
     done = -1
-    for i, bound in zip(far[clear][:MOST_BOUNDS], size[clear], strict=False):
+    glitch_time = 0.4    # s within which a glitch is over: longer, and motion itself may do it
+    back_share = 0.5    # of the bound: nearer to the row before it, the glitch is over
+    most_bounds = 2000    # bounds looked at
+    for i, bound in zip(far[clear][:most_bounds], size[clear], strict=False):
         if i < done:
             continue
-        within = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
-        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= BACK_SHARE * bound
+        within = np.searchsorted(t, t[i] + glitch_time, side='right')
+        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= back_share * bound
         if home.any():
             done = i + 2 + int(np.argmax(home))
             found[i + 1:done] = True
@@ -158,8 +151,11 @@ def single(x: Floats, least: float) -> Bools:
                                      for d in range(2, edge) for k in (-d, d)))
         at = far[ROWS_BESIDE:][:m]
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
-        is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
-                         & (apart < NEIGHBOURS_ALIKE * at))
+        # times as far from its neighbours as any of those beside it is from theirs
+        single_times = 10.0
+        neighbours_alike = 0.3    # of that, at which its neighbours are from each other at most
+        is_off: Bools = ((at > np.maximum(least, single_times * beside))
+                         & (apart < neighbours_alike * at))
         alone: Bools = across(np.logical_or, is_off)
         return alone
 
@@ -173,8 +169,12 @@ def single(x: Floats, least: float) -> Bools:
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
     """Return which Imu rows hold a spike that no vehicle makes, by the imu settings' factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
-    return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
-            | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
+    turn_step = 0.8    # rad/s, least bound from row to row that may be a glitch
+    force_step = 50.0    # m/s^2, the same bound: potholes stay
+    single_turn = 0.03    # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
+    single_force = 2.0    # m/s^2, the same
+    return (alone(t, w_i, turn_step / gyro) | single(w_i, single_turn / gyro)
+            | alone(t, f_i, force_step / accel) | single(f_i, single_force / accel))
 
 
 def speed_glitches(t: Floats, speed: Floats) -> Bools:
@@ -182,7 +182,8 @@ def speed_glitches(t: Floats, speed: Floats) -> Bools:
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
-    return alone(t, speed[:, None], max(SPEED_STEP * top, 1e-12))
+    speed_step = 0.3    # of the top speed, least bound from row to row that may be a glitch
+    return alone(t, speed[:, None], max(speed_step * top, 1e-12))
 
 
 def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, ...]:

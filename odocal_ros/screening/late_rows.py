@@ -26,23 +26,11 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, within which some row comes on time
-LEAST_LATE = 0.004        # s of lateness, and
-LATE_SHARE = 0.1          # of an interval, that matter
-NAMED_LATE = 0.02         # s, and
-NAMED_LATE_SHARE = 0.3    # of an interval, that are worth a word
-INTERVAL_SPAN = 5.0       # s over which the interval is taken
-STEADY_SHARE = 0.005      # by which it is another than the median: rows are lost
-EVEN_SHARE = 0.3          # share of the intervals that are within a quarter of the median
 EVEN_BESIDE = 5           # rows to either side that tell where a row should be
 LINE = (-EVEN_BESIDE, EVEN_BESIDE)
 CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])     # a line takes half the acceleration for lateness
-FITTING_SHARE = 0.4       # of what rows are off as sent
-EVENER_SHARE = 0.9        # of it, where all rows that are not late are put on the rhythm
 LEAST_JITTER = 1e-4       # s off the rhythm that is worth it
-MIDDLE_WINDOW = 20.0      # s of rows whose median is the middle: jitter over sqrt(600)
 ROUNDING_COUNTS = 2.5     # by which a row may be off: rounding
-EVEN_TRAVEL = 1.0         # s within which travel is as good as even
-CATCHING_UP = 3.0         # times the speed beside: no wheel, so rows that catch up
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -59,11 +47,13 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
     travel = np.concatenate([[0.0], np.cumsum(step)])
     whole = np.issubdtype(samples.value.dtype, np.integer)
     usual = interval(t)
-    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < EVEN_SHARE:
+    even_share = 0.3    # share of the intervals that are within a quarter of the median
+    if np.mean(np.abs(np.diff(t) - usual) < usual / 4) < even_share:
         return t
     true = _put_back(t, travel, usual, ROUNDING_COUNTS if whole else 0.0)
     late = t - true
-    named = late > max(NAMED_LATE, NAMED_LATE_SHARE * usual)
+    named_late, named_late_share = 0.02, 0.3    # s, of an interval: the more is worth a word
+    named = late > max(named_late, named_late_share * usual)
     if named.any():
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
         found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
@@ -76,9 +66,11 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 def interval(t: Floats) -> float:
     """Return the sender's interval, s, lost and late rows notwithstanding."""
     usual = float(np.median(np.diff(t)))
-    n = min(max(int(INTERVAL_SPAN / usual), 1), len(t) - 1) if usual > 0 else 1
+    interval_span = 5.0    # s over which the interval is taken
+    n = min(max(int(interval_span / usual), 1), len(t) - 1) if usual > 0 else 1
     mean = float(np.median(t[n:] - t[:-n])) / n
-    return mean if abs(mean - usual) < STEADY_SHARE * usual else usual
+    steady_share = 0.005    # by which it is another than the median: rows are lost
+    return mean if abs(mean - usual) < steady_share * usual else usual
 
 
 def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
@@ -88,13 +80,15 @@ def _put_back(t: Floats, travel: Floats, usual: float, least: float) -> Floats:
     # those to come, not those before: a lost row sets the rhythm back
     even = rows + _least_of_next(t - rows, ahead)
     even += np.median(t - even)         # what all have is a delay, and no lateness
-    late = t - even > max(LEAST_LATE, LATE_SHARE * usual)
+    least_late, late_share = 0.004, 0.1    # s, of an interval: the more of both matters
+    late = t - even > max(least_late, late_share * usual)
     true = t.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]]).astype(int)))
+    fitting_share = 0.4    # of what rows are off as sent
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         about = np.arange(max(begin - EVEN_BESIDE, 0), min(end + EVEN_BESIDE, len(t)))
         sent, put = (_off(x, travel, LINE, about) for x in (t, even))
-        fits = np.linalg.norm(put) < FITTING_SHARE * np.linalg.norm(sent)
+        fits = np.linalg.norm(put) < fitting_share * np.linalg.norm(sent)
         if np.abs(put).max() <= least or fits:
             true[begin:end] = even[begin:end]
         elif begin > 0 and end < len(t):
@@ -113,12 +107,13 @@ def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
     both ways, by a sender's clock that ticks seldom.
     """
     best, least = true, 1.0
+    evener_share = 0.9    # of it, where all rows that are not late are put on the rhythm
     for even in rhythms:
         left = np.abs(true - even)
         jitters = (left > LEAST_JITTER) & (left < usual)
         rows = np.flatnonzero(jitters)
         sent, put = (np.linalg.norm(_off(x, travel, CUBIC, rows)) for x in (t, even))
-        if put < EVENER_SHARE * least * sent:
+        if put < evener_share * least * sent:
             best, least = np.where(jitters, even, true), float(put / sent)
     return best
 
@@ -126,7 +121,8 @@ def _on_rhythm(true: Floats, t: Floats, travel: Floats, rhythms: list[Floats],
 def _middle(t: Floats, usual: float) -> list[Floats]:
     """Return the rhythm in the middle of rows, some of them early; none where rows are lost."""
     rows = usual * np.arange(len(t))
-    blocks = np.array_split(t - rows, max(1, int(len(t) * usual / MIDDLE_WINDOW)))
+    middle_window = 20.0    # s of rows whose median is the middle: jitter over sqrt(600)
+    blocks = np.array_split(t - rows, max(1, int(len(t) * usual / middle_window)))
     ends = np.cumsum([len(block) for block in blocks])
     at = [end - len(block) / 2 for end, block in zip(ends, blocks, strict=True)]
     off = [float(np.median(block)) for block in blocks]
@@ -170,7 +166,9 @@ def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Float
         return size
 
     beside = max(speed(a - EVEN_BESIDE, a), speed(b, b + EVEN_BESIDE))
-    if t[b] - t[a] > EVEN_TRAVEL or not beside or speed(a + 1, b) < CATCHING_UP * beside:
+    even_travel = 1.0    # s within which travel is as good as even
+    catching_up = 3.0    # times the speed beside: no wheel, so rows that catch up
+    if t[b] - t[a] > even_travel or not beside or speed(a + 1, b) < catching_up * beside:
         return t[rows]
     # some rows of the burst are lost, so that its rhythm tells nothing
     by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])

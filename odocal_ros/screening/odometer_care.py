@@ -27,11 +27,7 @@ from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import speed_glitches
 
-EXCURSION_TIME = 30.0     # s after which a counter that comes back is no longer taken for the same
-MOST_JUMPS = 200          # beyond it the counter is not mended, but judged by the check
 STEPS_BESIDE = 5    # steps beside a jump or a gap that tell the speed there
-DEAD_BAND_WAY = 1.5   # times what rows tell: as long a way at speeds sent as zero is a dead band's
-GOES_ON_SHARE = 0.5       # of the travel expected by the speed beside: what still goes on
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -80,14 +76,17 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
     jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
-    if len(jumps) > MOST_JUMPS:
+    most_jumps = 200    # beyond it the counter is not mended, but judged by the check
+    if len(jumps) > most_jumps:
         return false
     done = -1
+    # s after which a counter that comes back is no longer taken for the same
+    excursion_time = 30.0
     for j in jumps:
         if j <= done:
             continue
         stall = _stall(step, j)
-        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= EXCURSION_TIME]
+        ends = [k for k in jumps if k > j and t[k + 1] - t[j] <= excursion_time]
         for a, b in [(stall, j)] * int(stall < j) + [(j, k) for k in ends]:
             net = counter_steps(value[[a, b + 1]], modulus)[0]     # exact, unlike a sum of steps
             if _goes_on(t, net, rate, a, b) or a == j and _comes_back(t, net, step, a, b, top):
@@ -102,7 +101,8 @@ def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
     length = t[b + 1] - t[a]
     ways = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
                                          rate[b + 1:b + 1 + STEPS_BESIDE])]
-    slack = GOES_ON_SHARE * max(abs(w) for w in ways) + 3
+    goes_on_share = 0.5    # of the travel expected by the speed beside: what still goes on
+    slack = goes_on_share * max(abs(w) for w in ways) + 3
     return bool(min(ways) - slack <= net <= max(ways) + slack)
 
 
@@ -159,6 +159,8 @@ def _hidden(way: Travel, value: Values) -> Floats:
     """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
     least = 2 * way.coarse.step if way.coarse else 0.0
+    # times what rows tell: as long a way at speeds sent as zero is a dead band's
+    dead_band_way = 1.5
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
         rows = np.arange(edge, edge - STEPS_BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
@@ -169,7 +171,7 @@ def _hidden(way: Travel, value: Values) -> Floats:
         if v > least and change > 0 and took > 0:
             told = v * (way.t[edge + 1] - way.t[edge]) / 2
             whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
-            hidden[edge] = whole - told if whole > DEAD_BAND_WAY * told else 0.0
+            hidden[edge] = whole - told if whole > dead_band_way * told else 0.0
     return hidden
 
 

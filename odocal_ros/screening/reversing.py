@@ -29,16 +29,9 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 
 REVERSING_STEP = 0.1          # s, grid
 PUSH_TIME = 0.6            # s each side that accelerations are taken over
-LONGEST_START = 12.0          # s after a stop that are looked at: longer, and the tilt wanders
 STOP_BEFORE = 1.0             # s of the stop that belong to it
-STANDS_OF_TOP = 0.02          # of the top speed: below it is a stop
-COUNTS_AT_TOP = 20.0    # counts a second at top speed, below which a counter shows no acceleration
-LEAST_BACKWARDS = 1.0         # m of way
-TWICE_THE_WAY = (0.8, 1.2)    # of twice the way, that a stretch slips by
 BY_IMU = 'the Imu is pushed the other way than at the other starts'
 BY_FIT = 'Imu and fixes go back'
-MOST_TOLD = 3         # stretches told in the sentence
-USUAL_RATIO = (0.5, 2.0)    # of the usual ratio: a start that is like the others
 
 
 def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
@@ -82,8 +75,9 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     if not onward or not usual.any():
         return none
     level = np.median(np.abs(ratio[usual]))
-    back = clear & ~usual & (np.abs(ratio) > USUAL_RATIO[0] * level) & (
-        np.abs(ratio) < USUAL_RATIO[1] * level)
+    usual_ratio = (0.5, 2.0)    # of the usual ratio: a start that is like the others
+    back = clear & ~usual & (np.abs(ratio) > usual_ratio[0] * level) & (
+        np.abs(ratio) < usual_ratio[1] * level)
     back &= (t[ends] > between[0]) & (t[begins] < between[1])
     # the grid's last step still moves
     return np.stack([t[begins[back]] - PUSH_TIME, t[ends[back]] + PUSH_TIME], -1)
@@ -103,8 +97,10 @@ def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: fl
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
     slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
-    twice = slipped / np.maximum(2 * way, LEAST_BACKWARDS)
-    return spans[(way > LEAST_BACKWARDS) & (twice > TWICE_THE_WAY[0]) & (twice < TWICE_THE_WAY[1])]
+    least_backwards = 1.0    # m of way
+    twice = slipped / np.maximum(2 * way, least_backwards)
+    twice_the_way = (0.8, 1.2)    # of twice the way, that a stretch slips by
+    return spans[(way > least_backwards) & (twice > twice_the_way[0]) & (twice < twice_the_way[1])]
 
 
 def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
@@ -121,10 +117,11 @@ def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: 
     way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
     each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
             for (a, b), m in zip(spans.tolist(), way.tolist(), strict=True)]
-    more = f' and {len(each) - MOST_TOLD} more' if len(each) > MOST_TOLD else ''
+    most_told = 3    # stretches told in the sentence
+    more = f' and {len(each) - most_told} more' if len(each) > most_told else ''
     times = f'{len(each)} time{"s" * (len(each) > 1)}'
     return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen}, and the odometer counts on: the '
-                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:MOST_TOLD])}'
+                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:most_told])}'
                    f'{more}'),)
 
 
@@ -132,9 +129,12 @@ def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
     """Return the first and the last step of each stretch between stops that begins with one."""
     speed = np.abs(travel.at(t + PUSH_TIME / 2) - travel.at(t - PUSH_TIME / 2)) / PUSH_TIME
     top = np.percentile(speed, 95)
-    if top == 0.0 or top < COUNTS_AT_TOP * travel.quantum:
+    # counts a second at top speed, below which a counter shows no acceleration
+    counts_at_top = 20.0
+    if top == 0.0 or top < counts_at_top * travel.quantum:
         return np.empty(0, int), np.empty(0, int)
-    stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, STANDS_OF_TOP * top)
+    stands_of_top = 0.02    # of the top speed: below it is a stop
+    stands = speed <= max(1.01 * travel.quantum / PUSH_TIME, stands_of_top * top)
     edge = np.flatnonzero(np.diff(stands.astype(int)))
     begins = edge[stands[edge]] + 1
     ends = np.append(edge[~stands[edge]], len(t) - 1)
@@ -168,7 +168,8 @@ class _Forces:
 def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
     """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
     low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
-    high = min(len(t), b + 1, a + round(LONGEST_START / REVERSING_STEP))
+    longest_start = 12.0    # s after a stop that are looked at: longer, and the tilt wanders
+    high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))
     span = t[low:high]
     # which way is up, at rest: as the vehicle pitches, gravity goes into x or out of it
     rest = force.speed_before[low], force.speed[max(a - round(PUSH_TIME / REVERSING_STEP), 0)]

@@ -22,8 +22,6 @@ RAD_PER_DEG = float(np.deg2rad(1.0))
 # nothing follows from such an Imu; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
 MAX_RATE = 8.0                  # rad/s: no road vehicle turns so fast
-NO_GRAVITY = 0.01               # m/s^2, far below what gravity is in any unit
-MOST_TILT = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
 
 
 def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
@@ -55,7 +53,8 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
     if not any(w_b[some].any() for some in chunks(len(w_b))):   # what messages hold that have none
         reasons.append(Reason(Code.NO_IMU, 'every turn rate is zero: the Imu sends none, or '
                               'imu.gyro_scale is 0'))
-    if size < NO_GRAVITY:
+    no_gravity = 0.01    # m/s^2, far below what gravity is in any unit
+    if size < no_gravity:
         reasons.append(Reason(Code.NO_IMU, 'there is no gravity in the acceleration: the Imu '
                               'sends none, or without gravity, or imu.accel_scale is 0'))
         return tuple(reasons), False
@@ -71,11 +70,12 @@ def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,
                               'vehicle turns, as deg/s would: set imu.gyro_scale to '
                               f'{imu.gyro_scale * RAD_PER_DEG!r}'))
     up = mean / size
-    if up[2] > np.cos(MOST_TILT):
+    most_tilt = np.deg2rad(30.0)    # a body frame more tilted than this is not forward-left-up
+    if up[2] > np.cos(most_tilt):
         return tuple(reasons), False
     axis = int(np.argmax(np.abs(up)))
     seen = f'gravity shows on {"+" if up[axis] > 0 else "-"}{AXES[axis]} (up should be +z)'
-    if up[2] < -np.cos(MOST_TILT) and np.allclose(C_bi, np.eye(3)):
+    if up[2] < -np.cos(most_tilt) and np.allclose(C_bi, np.eye(3)):
         reasons.append(Reason(Code.IMU_LOOKS_Z_DOWN, f'{seen}: taken as forward-right-down'))
         return tuple(reasons), True
     reasons.append(Reason(Code.IMU_AXES, f'{seen}: the body frame is not forward-left-up'))

@@ -25,11 +25,6 @@ from odocal_ros.data.samples import OdometerSamples
 from odocal_ros.nav.odometer import FEWEST_STEPS
 from odocal_ros.reasons import Code, Reason
 
-MEDIAN_REACH = 7    # steps each side of the running median that tells the step a jump replaced
-LEAST_JUMP = 8.0         # counts, smallest jump against the way
-FEWEST_JUMPS = 3         # jumps of one size that make a span which is no power of two
-POWER_SLACK = 0.01       # of the span, slack up to which one jump makes a power of two
-SAME_SPAN_SHARE = 0.8    # share of the jumps that must agree
 SPANS = {'whole': 2.0 ** np.arange(6, 54), 'angle': np.array([2 * np.pi, 4 * np.pi, 360.0])}
 NAMED_SPANS = {float(2 * np.pi): '2 pi', float(4 * np.pi): '4 pi'}
 
@@ -56,7 +51,8 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     whole = np.issubdtype(value.dtype, np.integer)
     off = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
-    far = np.abs(off) > np.maximum(2 * np.abs(usual) + LEAST_JUMP * whole, 1.5 * top)
+    least_jump = 8.0    # counts, smallest jump against the way
+    far = np.abs(off) > np.maximum(2 * np.abs(usual) + least_jump * whole, 1.5 * top)
     rows = np.flatnonzero(far & (off * usual <= 0))      # a hung counter catches up along the way
     if not len(rows):
         return None
@@ -67,23 +63,27 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     known = float(spans[np.argmin(np.abs(spans - middle))])
     typical = float(np.median(slack))
     sigma = 0.0
-    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < POWER_SLACK * known):
+    fewest_jumps = 3    # jumps of one size that make a span which is no power of two
+    power_slack = 0.01    # of the span, slack up to which one jump makes a power of two
+    if abs(known - middle) <= typical and (len(rows) > 1 or slack[0] < power_slack * known):
         span = known
-    elif len(rows) >= FEWEST_JUMPS:
+    elif len(rows) >= fewest_jumps:
         span, sigma = _measured(value, rows, middle, typical) if whole else (
             middle, typical / np.sqrt(3 * len(rows)))
     else:
         return None
     agree = np.abs(size - span) <= 2 * slack
-    if agree.mean() < SAME_SPAN_SHARE:
+    same_span_share = 0.8    # share of the jumps that must agree
+    if agree.mean() < same_span_share:
         return None
     rows = rows[agree]
     return Span(span, sigma, rows, -np.sign(off[rows]).astype(np.int64))
 
 
 def _running_median(step: Floats) -> Floats:
-    padded = np.pad(step, MEDIAN_REACH, mode='edge')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_REACH + 1)
+    median_reach = 7    # steps each side of the running median that tells the step a jump replaced
+    padded = np.pad(step, median_reach, mode='edge')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1)
     return np.median(windows, axis=-1)
 
 

@@ -26,10 +26,7 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 
 FAULT_GRID = 0.5          # s
 STILL_SHARE = 0.02        # of the other wheel's way: what still counts as not moving
-HANG_TIME = 2.0           # s without a count while the other wheel rolls; shorter is slip
 OTHER_WHEEL_COUNTS = 8    # the other wheel makes meanwhile, at least
-AGAINST_TIME = 1.5        # s of counting against the other wheel
-BIAS_OF_TOP = 0.02    # of the top speed: what a gyro bias times the track width may be, 1 sigma
 SIDES = ('left', 'right')
 
 
@@ -89,7 +86,9 @@ def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
     rolls = A[:, 0] != 0
     usual = float(np.median(y[rolls] / A[rolls, 0])) if rolls.any() else 1.0
-    drift = BIAS_OF_TOP * float(np.percentile(np.abs(y), 95)) / FAULT_GRID
+    # of the top speed: what a gyro bias times the track width may be, 1 sigma
+    bias_of_top = 0.02
+    drift = bias_of_top * float(np.percentile(np.abs(y), 95)) / FAULT_GRID
     fits = [robust_fit(A, y, floor, (np.inf, np.inf, drift), start)
             for start in (None, (usual, 0.0, 0.0))]
     scale = TUKEY * min(sigma for _, _, sigma in fits)
@@ -109,11 +108,12 @@ def _rolling(steps: Floats, quantum: float) -> Bools:
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
-    """Tell in which cells wheel k stands, for HANG_TIME or longer, while the other one rolls."""
+    """Tell in which cells wheel k stands, for two seconds or longer, while the other one rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
     still: Bools = two.known & (own <= STILL_SHARE * other) & _rolling(steps, two.quantum)[1 - k]
+    hang_time = 2.0    # s without a count while the other wheel rolls; shorter is slip
     for a, b in runs(still):
-        if (b - a) * FAULT_GRID < HANG_TIME or other[a:b].sum() < OTHER_WHEEL_COUNTS * two.quantum:
+        if (b - a) * FAULT_GRID < hang_time or other[a:b].sum() < OTHER_WHEEL_COUNTS * two.quantum:
             still[a:b] = False
     return still
 
@@ -167,7 +167,8 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
         return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is no travel'),)
     rolling = _rolling(np.stack([expected, steps[1]]), two.quantum).all(axis=0)
     against = two.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
-    spans = [(a, b) for a, b in runs(against) if (b - a) * FAULT_GRID >= AGAINST_TIME]
+    against_time = 1.5    # s of counting against the other wheel
+    spans = [(a, b) for a, b in runs(against) if (b - a) * FAULT_GRID >= against_time]
     if ratio <= 0 or not spans:
         return ()
     back = [-step[step < 0].sum() for step in steps]

@@ -23,7 +23,6 @@ from odocal_ros.nav.odometer import Travel
 
 Imu = tuple[Floats, Floats, Floats]     # t s, w_b rad/s, f_b m/s^2
 TUKEY = 4.685    # robust sigmas beyond which a row has no weight
-TUKEY_PASSES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +103,14 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
     weak = np.zeros(A.shape[1]) if prior is None else 1 / (np.asarray(prior) * size)**2
     weight, sigma = np.ones(len(y)), 0.0
     x = np.zeros(A.shape[1]) if start is None else np.asarray(start) * size
-    for turn in range(TUKEY_PASSES):
+    tukey_passes = 20
+    for turn in range(tukey_passes):
         if turn or start is not None:
             residual = y - A @ x
             sigma = max(float(np.median(np.abs(residual))) / 0.6745, floor)
             u = residual / (TUKEY * sigma)
             # absolute values first (Huber): without a start Tukey's weights may settle anywhere
-            huber = start is None and turn < TUKEY_PASSES // 2
+            huber = start is None and turn < tukey_passes // 2
             weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
                 np.abs(u) < 1, (1 - u**2)**2, 0.0)
         H = (A * weight[:, None]).T @ A + np.diag(weak * max(sigma, floor)**2 + 1e-12 * len(y))

@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from odocal_ros.errors import BadConfig
 from odocal_ros.outside.names import is_frame, one_line
 
-LARGEST = 1e9      # no setting in SI units means a number beyond it; sums with it stay finite
 TYPES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 
 
@@ -93,8 +92,10 @@ class Setting:
                 raise BadConfig(f'{self.name}: NaN is not a value')
             if not unset and not math.isfinite(value):
                 raise BadConfig(f'{self.name}: {value} is not finite')
-            if kind is float and abs(value) > LARGEST:
-                raise BadConfig(f'{self.name} = {value:g}: want at most {LARGEST:g}')
+            # no setting in SI units means a number beyond it; sums with it stay finite
+            largest = 1e9
+            if kind is float and abs(value) > largest:
+                raise BadConfig(f'{self.name} = {value:g}: want at most {largest:g}')
             below = self.low is not None and value < self.low
             if below or self.high is not None and value > self.high:
                 unit = '' if self.unit == '1' else self.unit
