@@ -20,6 +20,8 @@ from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LOW_RATES = {'imu_rate': 50.0, 'odometer_rate': 20.0}
+STRAIGHT = {'scenario': 'straight', 'duration': 200.0, 'imu_grade': 'tactical', 'seed': 5}
+TOWN = {'scenario': 'town', 'duration': 300.0, 'imu_grade': 'industrial', 'seed': 4}
 
 
 @cache

@@ -26,6 +26,8 @@ from drives import (
     seconds,
     settings,
     shifted,
+    STRAIGHT,
+    TOWN,
 )
 import numpy as np
 import pytest
@@ -45,12 +47,12 @@ RAD_TO_DEG = 180 / np.pi
 
 @pytest.fixture(scope='module')
 def made():
-    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+    return drive(**STRAIGHT)
 
 
 @pytest.fixture(scope='module')
 def town():
-    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+    return drive(**TOWN)
 
 
 @pytest.fixture(scope='module')
@@ -171,8 +173,7 @@ def test_a_gap_of_increments_or_speeds_widens_the_sigma(made, leg, kind):
                        form=OdometerForm('increment', 0, 'm/pulse'))
         source = made
     else:
-        source = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
-                       odometer='speed')
+        source = drive(**STRAIGHT, odometer='speed')
         base = source.leg()
     t = seconds(base, base.odometer)
     whole, _ = run(base, settings(source))

@@ -31,7 +31,6 @@ from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
 HEADER, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 1, 7, 8, 11, 15
-LEVEL = 1                     # of zstd: a third of the size at a hundredth of a core
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 
@@ -89,7 +88,8 @@ def _zstd() -> Any:
 def _packed(records: bytes) -> tuple[str, bytes]:
     """Return the compression's name and the compressed bytes."""
     zstd = _zstd()
-    return ('zstd', zstd.compress(records, LEVEL)) if zstd else ('', records)
+    level = 1    # a third of the size at a hundredth of a core
+    return ('zstd', zstd.compress(records, level)) if zstd else ('', records)
 
 
 def write_file(path: Path, channels: Mapping[int, Channel], chunks: Iterable[Chunk]) -> int:

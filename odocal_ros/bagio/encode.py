@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 
-CDR_HEADER = (0, 1, 0, 0)
 VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)
 
 
@@ -82,7 +81,7 @@ class _Layout:
 
         def pack(rows: slice) -> NDArray[Any]:
             out = np.zeros(len(range(*rows.indices(n))), dtype)
-            out['cdr'] = CDR_HEADER
+            out['cdr'] = (0, 1, 0, 0)      # little-endian
             for name, raw in texts.items():
                 out[name], out[f'{name} length'] = raw, len(raw)
             fill(out, rows)
@@ -94,6 +93,15 @@ def _stamp(out: NDArray[Any], stamp_ns: Ints) -> None:
     out['sec'], out['nanosec'] = stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000
 
 
+def _imu_layout(frame: str) -> _Layout:
+    """Return the layout of a sensor_msgs/Imu."""
+    layout = _Layout().header(frame)
+    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
+                        ('f', VECTOR), ('f_cov', SQUARE)):
+        layout.add(field, kind)
+    return layout
+
+
 def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Floats | None = None,
         f_variance: Floats | None = None) -> Topic:
     """
@@ -101,10 +109,7 @@ def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Flo
 
     w_variance, f_variance : (n, 3), optional, of turn rates and forces; else zeros: unknown.
     """
-    layout = _Layout().header(frame)
-    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
-                        ('f', VECTOR), ('f_cov', SQUARE)):
-        layout.add(field, kind)
+    layout = _imu_layout(frame)
 
     def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])
@@ -119,10 +124,7 @@ def imu(name: str, samples: ImuSamples, frame: str = 'imu_link', w_variance: Flo
 
 def heading(name: str, samples: HeadingSamples, frame: str = 'imu_link') -> Topic:
     """Return sensor_msgs/Imu of HeadingSamples: an orientation, no rates (covariance -1)."""
-    layout = _Layout().header(frame)
-    for field, kind in (('q', ('<f8', 4)), ('q_cov', SQUARE), ('w', VECTOR), ('w_cov', SQUARE),
-                        ('f', VECTOR), ('f_cov', SQUARE)):
-        layout.add(field, kind)
+    layout = _imu_layout(frame)
 
     def fill(out: NDArray[Any], rows: slice) -> None:
         _stamp(out, samples.stamp_ns[rows])

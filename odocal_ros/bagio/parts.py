@@ -27,8 +27,7 @@ from odocal_ros.errors import BadBag
 from odocal_ros.messages.raws import Raws
 from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
-BLOCK = 20_000         # messages taken at a time, and
-BLOCK_BYTES = 2**24    # bytes of them
+BLOCK = 20_000         # messages taken at a time
 ZSTD = b'\x28\xb5\x2f\xfd'
 
 
@@ -109,7 +108,7 @@ def group(stream: Iterator[tuple[Any, ...]]) -> Batch:
     # lists of bytes and numbers only, which the garbage collector does not look at (a list of
     # tuples takes as long as the reading itself)
     found: dict[str, tuple[list[int], list[bytes]]] = {}
-    messages, size = BLOCK, BLOCK_BYTES
+    messages, size = BLOCK, 2**24      # bytes of them
     for channel, time_ns, raw in stream:
         try:
             times, raws = found[channel.topic]

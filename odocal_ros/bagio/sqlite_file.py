@@ -25,9 +25,6 @@ from odocal_ros.bagio.sqlite_leaves import Leaves
 from odocal_ros.errors import BadBag
 from odocal_ros.outside.limits import Damaged, factor, LATEST_NS
 
-STEPS = 10_000            # of sqlite's machine between two looks at how many it took
-MOST_STEPS = 20_000_000   # for any file, and
-STEPS_A_BYTE = 20         # more for each byte: a row of ten takes about 30 to read
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
 BY_TIME = 'SELECT rowid FROM messages ORDER BY timestamp'
@@ -71,13 +68,15 @@ class SqliteFile(Recording):
 
     def _query(self, sql: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query, or raise Damaged."""
-        left = int((MOST_STEPS + STEPS_A_BYTE * self._size) * factor()) // STEPS
+        steps = 10_000    # of sqlite's machine between two looks at how many it took
+        # for any file, and more for each byte: a row of ten takes about 30 to read
+        left = int((20_000_000 + 20 * self._size) * factor()) // steps
 
         def stop() -> bool:
             nonlocal left
             left -= 1
             return left < 0
-        self._db.set_progress_handler(stop, STEPS)
+        self._db.set_progress_handler(stop, steps)
         try:
             for row in self._db.execute(sql, values):  # noqa: UP028 that would close the cursor
                 yield row

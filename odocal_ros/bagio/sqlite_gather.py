@@ -24,16 +24,14 @@ from numpy.typing import NDArray
 
 from odocal_ros.bagio.channels import Batch, Channel
 from odocal_ros.bagio.file_bytes import FileBytes
+from odocal_ros.bagio.sqlite_leaves import INTEGERS, LEAF
 from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import Raws
 
 SCHEMA = ('createtablemessages(idintegerprimarykey,topic_idintegernotnull,'
           'timestampintegernotnull,datablobnotnull)')
-INNER, LEAF = 0x05, 0x0D
-DEEPEST = 20             # levels of a tree, as sqlite has it
+INNER = 0x05             # kind of page of pages
 BLOCK = 2**21            # bytes of pages looked at in one go
-FAR = 8                  # pages not asked for that are read rather than passed over
-WIDTH = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}     # of integers, by serial type
 Table = NDArray[np.uint8]
 
 
@@ -74,7 +72,8 @@ class Pages:
         if not len(numbers) or numbers[0] < 0 or numbers[-1] >= self.count or (
                 np.diff(numbers) <= 0).any():
             raise Odd('pages')
-        runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > FAR) + 1)
+        far = 8    # pages not asked for that are read rather than passed over
+        runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > far) + 1)
         parts = []
         for run in runs:
             first, last = int(run[0]), int(run[-1])
@@ -113,7 +112,8 @@ def rows_of(file: FileBytes, root: int) -> Rows | None:
 def _leaves(pages: Pages, root: int) -> Ints:
     """Return the leaves of a tree in their order."""
     level = np.array([root], np.int64)
-    for _ in range(DEEPEST):
+    deepest = 20    # levels of a tree, as sqlite has it
+    for _ in range(deepest):
         kind = {int(k) for _, table in pages.blocks(level[:1]) for k in table[:, 0]}
         if kind == {LEAF}:
             return level
@@ -194,9 +194,9 @@ def _integer(data: Table, at: Ints, kind: Ints) -> tuple[Ints, Ints]:
     value, end = np.empty(len(at), np.int64), at.copy()
     kinds = [int(kind[0])] if (kind == kind[0]).all() else np.unique(kind).tolist()
     for each in kinds:
-        if each not in WIDTH:
+        if each not in INTEGERS:
             raise Odd('serial type')
-        mine, width = np.flatnonzero(kind == each), WIDTH[each]
+        mine, width = np.flatnonzero(kind == each), INTEGERS[each]
         raw = data[at[mine, None] + np.arange(width)]
         sign = raw[:, 0] >> 7 if width else np.zeros(len(mine), np.uint8)
         wide = np.empty((len(mine), 8), np.uint8)

@@ -16,8 +16,6 @@ from odocal_ros.bagio.definitions import parsed, within
 from odocal_ros.errors import BadData
 from odocal_ros.outside.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 
-DEPTH = 50       # of messages in messages
-
 
 class Types:
     """Deserialises messages; a type is looked up when its first message is."""
@@ -83,7 +81,8 @@ class Types:
 
 def _elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
     """Return how many values the fixed arrays of a message make, at least."""
-    if depth > DEPTH:
+    deepest = 50    # of messages in messages
+    if depth > deepest:
         raise ValueError('it holds itself')
 
     def of(field: tuple[Any, Any]) -> int:

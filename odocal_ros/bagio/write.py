@@ -25,8 +25,6 @@ from odocal_ros.errors import BadUsage
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
 COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
 BLOCK = 20_000         # messages packed at a time, to bound memory
-BLOCK_BYTES = 2**26    # the same for topics of large messages
-CRC_AT = 9 + 24        # in a chunk record of mcap
 LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 
@@ -143,7 +141,7 @@ def _with_checksums(storage: Any) -> None:
         crc, begin = zlib.crc32(storage.chunk.bio.getbuffer()), storage.bio.tell()
         close_chunk()
         end = storage.bio.tell()
-        storage.bio.seek(begin + CRC_AT)
+        storage.bio.seek(begin + 9 + 24)     # of the checksum in a chunk record of mcap
         storage.bio.write(crc.to_bytes(4, 'little'))
         storage.bio.seek(end)
     storage.close_chunk = close_with_checksum
@@ -168,7 +166,7 @@ def _merged(topics: Sequence[Topic],
     order = np.argsort(np.concatenate([t.time_ns for t in topics]), kind='stable')
     which = which[order]
     widest = max((t.pack(slice(0, 1)).itemsize for t in topics if len(t.time_ns)), default=1)
-    block = int(np.clip(BLOCK_BYTES // widest, 1, BLOCK))
+    block = int(np.clip(2**26 // widest, 1, BLOCK))      # bytes, where messages are large
     done = [0] * len(topics)
     for first in range(0, len(which), block):
         turn = which[first:first + block]

@@ -77,7 +77,7 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     config = with_settings(done[-1].config(), job.settings)
     histories = {name: history_of(name, driven, config) for name in (
         'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')}
-    starts = _periods(histories, driven)
+    starts = _periods(histories)
     now = driven[starts[-1]:]
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
     lost = driven[rejected_from(driven):]
@@ -110,7 +110,7 @@ def _undriven(row: dict[str, Any], decision: str) -> dict[str, Any]:
              'verdict': Verdict.REJECTED.value, 'reasons': []})}
 
 
-def _periods(histories: dict[str, Any], driven: Sequence[Driven]) -> list[int]:
+def _periods(histories: dict[str, Any]) -> list[int]:
     """Return with which leg each period begins in which nothing changed, the first at 0."""
     return sorted({0} | {number[change.leg] for number, found, _ in histories.values()
                          for change in found.changes})

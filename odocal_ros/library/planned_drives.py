@@ -192,8 +192,8 @@ def _smooth(x: Floats, wide: int) -> Floats:
     return mean
 
 
-def from_bag(path: Path, config: Config, topics: dict[str, str],
-             quiet: bool = True) -> tuple[PlannedDrive, dict[str, float]]:
+def from_bag(path: Path, config: Config,
+             topics: dict[str, str]) -> tuple[PlannedDrive, dict[str, float]]:
     """Return the drive of a recorded bag's first leg, and the figures of its own fixes."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.data.leg import LegRecorder

@@ -162,8 +162,8 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
                  float(rate_sigma), (float(span[0]), float(span[1])))
 
 
-def level_in_motion(t: Floats, w_b: Floats, f_b: Floats, q_0b: Floats, speed: Floats,
-                    latitude: float, grade: Grade) -> Level:
+def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitude: float,
+                    grade: Grade) -> Level:
     """
     Level from the mean specific force of a stretch of driving, the odometer's speed taken out.
 
@@ -172,8 +172,8 @@ def level_in_motion(t: Floats, w_b: Floats, f_b: Floats, q_0b: Floats, speed: Fl
 
     Parameters
     ----------
-    t, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        Imu rows of the stretch.
+    t, f_b : (n,), (n, 3) arrays
+        Imu rows of the stretch: s, m/s^2.
     q_0b : (n, 4) array
         Attitude against the first row, from the gyro.
     speed : (2,) array

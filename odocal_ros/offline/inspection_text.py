@@ -17,7 +17,6 @@ from typing import Any
 from odocal_ros.output.summary import WIDTH
 from odocal_ros.outside.names import one_line
 
-QUIET = ('diagnostic_msgs', 'rcl_interfaces', 'tf2_msgs', 'rosgraph_msgs')
 STATUS = {'-1': 'no fix', '0': 'fix', '1': 'SBAS', '2': 'GBAS/RTK'}
 
 

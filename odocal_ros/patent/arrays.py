@@ -145,11 +145,6 @@ def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
     return worst
 
 
-def is_balanced(rows: Ints) -> bool:
-    """Tell whether each pair of columns holds each pair of its levels equally often."""
-    return imbalance(rows, tuple(int(n) + 1 for n in rows.max(axis=0))) == 0.0
-
-
 def least_rows(levels: tuple[int, ...]) -> int:
     """Return the number of rows that an orthogonal array's must be a multiple of."""
     return math.lcm(*(a * b for a, b in combinations(levels, 2))) if len(levels) > 1 \

@@ -125,7 +125,7 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
     speed = (inputs.travel.at(ends + 0.5) - inputs.travel.at(ends - 0.5)) * metres_per_unit
     inside = np.clip(ends + 0.5, *inputs.travel.t[[0, -1]]) - np.clip(
         ends - 0.5, *inputs.travel.t[[0, -1]])
-    level = level_in_motion(t[pick], inputs.w_b[pick], inputs.f_b[pick], q_0b,
+    level = level_in_motion(t[pick], inputs.f_b[pick], q_0b,
                             speed / np.maximum(inside, 1e-3), latitude, grade)
     found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: levelled over '
                    f'{t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '

@@ -85,7 +85,7 @@ def _level_in_motion(drive: PlannedDrive, grade: Grade) -> Level:
     velocity_n = C_nb[:, :, 0] * drive.speed[pick][:, None]
     f_n = np.gradient(velocity_n, t, axis=0) + [0.0, 0.0, gravity(drive.latitude, drive.height)]
     q_nb = quat_from_matrix(C_nb)
-    return level_in_motion(t, np.zeros_like(f_n), np.einsum('nij,ni->nj', C_nb, f_n),
+    return level_in_motion(t, np.einsum('nij,ni->nj', C_nb, f_n),
                            quat_multiply(quat_conjugate(q_nb[0]), q_nb),
                            drive.speed[pick][[0, -1]], drive.latitude, grade)
 

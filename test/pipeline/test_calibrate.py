@@ -20,6 +20,8 @@ from drives import (
     rejecting,
     settings,
     shifted,
+    STRAIGHT,
+    TOWN,
 )
 import numpy as np
 import pytest
@@ -36,12 +38,12 @@ SCALE, YAW, PITCH = 'scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle'
 
 @pytest.fixture(scope='module')
 def made():
-    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+    return drive(**STRAIGHT)
 
 
 @pytest.fixture(scope='module')
 def town():
-    return drive(scenario='town', duration=300.0, imu_grade='industrial', seed=4)
+    return drive(**TOWN)
 
 
 def test_the_same_leg_gives_the_same_result_to_the_last_bit(made):

@@ -11,7 +11,7 @@
 
 from dataclasses import replace
 
-from drives import changed, drive, seconds, settings
+from drives import changed, drive, seconds, settings, STRAIGHT
 import numpy as np
 import pytest
 
@@ -26,7 +26,7 @@ MS = 10**6
 
 @pytest.fixture(scope='module')
 def made():
-    return drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5)
+    return drive(**STRAIGHT)
 
 
 @pytest.fixture(scope='module')
@@ -364,8 +364,7 @@ class TestOdometerCare:
         np.testing.assert_allclose(self.travelled(whole).s[-1], self.travelled(leg).s[-1])
 
     def test_a_speed_that_jumps_is_left_out(self):
-        made = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
-                     odometer='speed')
+        made = drive(**STRAIGHT, odometer='speed')
         bad = changed(made.odometer, value=lambda a: a.__setitem__([2500, 2900], [90.0, -40.0]))
         inputs, codes, _ = said(replace(made.leg(), odometer=bad))
         assert codes[Code.BAD_ROWS_DROPPED].startswith('2 of')
@@ -374,8 +373,7 @@ class TestOdometerCare:
 
 
 def test_two_wheels_give_their_mean(made):
-    two = drive(scenario='straight', duration=200.0, imu_grade='tactical', seed=5,
-                two_wheels=True)
+    two = drive(**STRAIGHT, two_wheels=True)
     inputs, codes, _ = said(two.leg(), settings(two))
     assert codes == {}
     np.testing.assert_allclose(
