@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from odocal_ros.bagio.read import Bag, bag_sha256, open_bag
 from odocal_ros.data.leg import Leg, LegRecorder
@@ -20,11 +21,13 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
 from odocal_ros.library.hearer import Hearer
 from odocal_ros.library.journal import journal_notes, JournalNotes
-from odocal_ros.library.legs import LegSpan
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
+
+if TYPE_CHECKING:
+    from odocal_ros.library.legs import LegSpan
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,7 @@ class Recording:
         rows: Samples = self.recorder.rows(slot)
         return rows
 
-    def spans(self, legs: list[LegSpan | str]) -> list[tuple[int, int]]:
+    def spans(self, legs: 'list[LegSpan | str]') -> list[tuple[int, int]]:
         """Return (start, stop) stamps of legs that ``legs_of`` gave; of none, those it holds."""
         from odocal_ros.library.legs import find_legs
         return find_legs(self.recorder, self, legs, [] if legs else list(self.marks), self.config)
