@@ -208,14 +208,3 @@ def test_a_plan_says_what_the_page_quotes(capsys):
     found = [plan['methods']['two_point']['estimates']['scale_factor']['sigma']
              for plan in sigmas]
     assert found == pytest.approx([2000e-6, 30e-6], rel=0.2)
-
-
-def test_equations_have_a_number_each_and_the_code_cites_them():
-    numbered = re.findall(r'\\tag\{(S\d+)\}', page_of('docs/method.md'))
-    assert numbered == [f'S{k}' for k in range(1, len(numbered) + 1)]
-    cited: set[str] = set()
-    for path in (ROOT / 'odocal_ros' / 'calib' / 'smoother').glob('*.py'):
-        text = path.read_text(encoding='utf-8')
-        for first, last in re.findall(r'\(S(\d+)\)(?: to \(S(\d+)\))?', text):
-            cited |= {f'S{k}' for k in range(int(first), int(last or first) + 1)}
-    assert cited == set(numbered)
