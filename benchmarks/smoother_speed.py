@@ -14,7 +14,7 @@ How long the smoother takes, and how much memory, on simulated town drives.
 
 One process, one thread. Printed for each cell: time to simulate and to screen (what reading and
 cleaning a bag costs comes on top), wall and processor time of ``smooth``, iterations, the most
-memory the process has held so far. Goals (issue 5): ten minutes at 100 Hz under 3 s, an hour at
+memory the process has held so far. Goals: ten minutes at 100 Hz under 3 s, an hour at
 200 Hz under 20 s and 1 GiB in all. Run it on an idle machine.
 """
 

@@ -68,7 +68,7 @@ def tilted(alignment, phi_n):
 
 @pytest.mark.parametrize('odometer', ['counts', 'angle', 'speed'])
 def test_error_free_sensors_give_the_truth(odometer):
-    """Issue 2: K0 wrong by 20 %, mounting 1 deg: scale within 1e-6, yaw within 0.001 deg."""
+    """K0 wrong by 20 %, mounting 1 deg: scale within 1e-6, yaw within 0.001 deg."""
     made = drive(scenario='paper', imu_grade='perfect', fix_sigma=0.0, yaw=np.deg2rad(1.0),
                  odometer=odometer, imu_rate=100.0)
     assert made.options.nominal_scale == pytest.approx(1.2 * made.truth.scale)

@@ -26,11 +26,21 @@ import zlib
 import numpy as np
 
 from odocal_ros.bagio.channels import Channel
-from odocal_ros.bagio.mcap_records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, SCHEMA
+from odocal_ros.bagio.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    SCHEMA,
+    STATISTICS,
+)
 from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
-HEADER, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 1, 7, 8, 11, 15
+HEADER, DATA_END = 1, 15      # opcodes, as those of mcap_records
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 

@@ -19,6 +19,7 @@ from odocal_ros.messages.raws import Bytes
 from odocal_ros.outside.limits import Damaged
 
 MAGIC = b'\x89MCAP0\r\n'
+# opcodes of the records: mcap.dev/spec
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = (
     2, 3, 4, 5, 6, 7, 8, 11)
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}

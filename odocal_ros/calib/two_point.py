@@ -14,7 +14,7 @@ Shi et al. 2015 takes the ratio of two chords in a plane and the angle between t
 eq. (6)-(10). The same similarity is solved here in the Earth-fixed Cartesian frame n, where track
 and truth are similar to the last digit: with M the attitude summed over travel and c the chord
 between the reference positions, M f = c gives f = K forward_b, and so scale, yaw and pitch at
-once. The plane and the geodesic of the source are the cross-check.
+once. The plane and the geodesic of the paper are the cross-check.
 """
 
 from collections.abc import Iterable

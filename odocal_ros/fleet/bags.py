@@ -25,7 +25,6 @@ from odocal_ros.outside.names import said_by
 COLUMNS = ('vehicle', 'bag', 'config', 'legs', 'model', 'odometer_km')
 ENDINGS = ('*.mcap', '*.db3', '*.bag')
 META = 'metadata.yaml'       # what makes a folder a rosbag2
-MOST_ROWS = 10_000_000
 
 
 @dataclass(frozen=True)

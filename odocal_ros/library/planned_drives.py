@@ -22,7 +22,7 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.planning.drive import DRIVE_STEP, from_rates, marked, PlannedDrive
 from odocal_ros.settings.config import Config
 
-MOST_SECONDS = 36_000.0
+MOST_SECONDS = 36_000.0      # of a planned drive, judgement: ten hours
 
 
 def from_figures(speed: float, distance: float, standstill: float, turns: int,

@@ -10,7 +10,6 @@
 """Messages of the Imu, GNSS and heading: where the values lie in each type, and what they mean."""
 
 from collections.abc import Callable, Sequence
-import math
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,8 @@ from odocal_ros.data.samples import (
 )
 from odocal_ros.errors import BadData
 from odocal_ros.messages.fields import array, Column, fixed, STAMP, stamp_ns, View, xyz
+from odocal_ros.settings.levels import RAD_PER_DEG
 
-RAD_PER_DEG = math.pi / 180
 IMU = 'sensor_msgs/msg/Imu'
 FIX = 'sensor_msgs/msg/NavSatFix'
 VELOCITY = ('geometry_msgs/msg/TwistStamped', 'geometry_msgs/msg/TwistWithCovarianceStamped')

@@ -18,7 +18,7 @@ from odocal_ros.nav.angles import arctan2
 A = 6378137.0                  # m, semi-major axis
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
-OMEGA = 7.292115e-5            # rad/s, Earth rate
+OMEGA = 7.292115e-5            # rad/s, Earth rate; all of WGS 84 (NIMA TR8350.2)
 
 
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:

@@ -20,7 +20,7 @@ from odocal_ros.data.arrays import Floats
 # semi-major axis m, inverse flattening
 ELLIPSOIDS = {'WGS84': (6378137.0, 298.257223563), 'CGCS2000': (6378137.0, 298.257222101),
               'Krassovsky': (6378245.0, 298.3)}
-ZONE_WIDTH = 6.0       # deg
+ZONE_WIDTH = 6.0       # deg, of UTM and of Gauss-Krueger's wide zones: format
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,10 @@ from odocal_ros.offline.stretches import (
     survey_drive,
 )
 from odocal_ros.reasons import Code, Reason
-from odocal_ros.screening.sanity import imu_sanity, MAX_RATE, RAD_PER_DEG
+from odocal_ros.screening.sanity import imu_sanity, MAX_RATE
 from odocal_ros.screening.screen import Inputs, screen
 from odocal_ros.settings.config import Config
+from odocal_ros.settings.levels import RAD_PER_DEG
 from odocal_ros.settings.nominal import nominal_scale
 
 

@@ -37,7 +37,7 @@ RADIUS_STEP = 0.01      # m
 PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
            (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
 FOUND = (-0.01, 0.01, 0.25)     # printed as best, with 21.76 m at most and 13.24 m in the mean
-RADIUS = 0.3                    # m; the source states none
+RADIUS = 0.3                    # m; the patent states none
 
 
 @dataclass(frozen=True)

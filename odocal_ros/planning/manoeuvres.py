@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 
-BRAKING = 1.5    # m/s^2, as in a town
+BRAKING = 1.5    # m/s^2, judgement: as in a town
 QUARTER = np.pi / 2
 # a minute of town: still, up, cruise with a turn, down, still (docs/method.md section 3)
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])

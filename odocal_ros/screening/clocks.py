@@ -20,9 +20,9 @@ from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
 
-CLOCK_APART = 0.5      # s, between topics
+CLOCK_APART = 0.5      # s between topics, judgement: no driver is as late
 OFFSET_REACH = 1.0     # s, what a time_offset setting holds
-CLOCK_SET = 0.02       # s, a clock set by more than this is named
+CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
 TOO_FAR = ('Stamp all sensors with one clock: no time_offset reaches so far. Of a bag that is '

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from odocal_ros.screening.screen import Inputs
 
 BIN_S = 1.0                        # s, accelerations are compared as means over it
-FEWEST_BINS_FACING = 20                # bins
+FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 
 

@@ -27,7 +27,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G
 
-TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis
+TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
 def felt(f_i: Floats) -> bool:

@@ -16,12 +16,12 @@ from odocal_ros.data.pieces import by_row, chunks, lengths, medians
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 from odocal_ros.settings.grades import G
+from odocal_ros.settings.levels import RAD_PER_DEG
 
 AXES = 'xyz'
-RAD_PER_DEG = float(np.deg2rad(1.0))
 # nothing follows from such an Imu; what is computed all the same says it in other words
 UNUSABLE = {Code.NO_IMU, Code.IMU_AXES, Code.IMU_UNITS}
-MAX_RATE = 8.0                  # rad/s: no road vehicle turns so fast
+MAX_RATE = 8.0                  # rad/s, physical: no vehicle on wheels turns so fast
 
 
 def imu_sanity(mean: Floats, w_b: Floats, C_bi: Floats,

@@ -16,6 +16,8 @@ Beside a number stands where it is from: physical, with its source; statistical,
 chance does so; tuned, with the benchmark that shows it; or judgement, where nothing was measured.
 """
 
+import math
+
 REMARK_SIGMAS = 3.0     # to say that something is there: once in 370
 FAULT_SIGMAS = 5.0      # to call a sensor or a setting wrong: once in 1.7 million
 OUTLIER_SIGMAS = 5.0    # robust sigmas from which one value of many is not of them: the same
@@ -32,3 +34,4 @@ SWAY = 0.05             # m/s to the side and up, of a body on its springs, that
 # judgement: stamps further back, so many in turn, are those of a time that began anew
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
 DAY_NS = 86_400 * 10**9
+RAD_PER_DEG = math.pi / 180

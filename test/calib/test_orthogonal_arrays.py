@@ -82,7 +82,7 @@ def test_the_names_of_the_books():
     assert bose(9, 10).shape == (81, 10)
     assert bose(8, 9).shape == (64, 9)
     assert design_for((9, 9, 9)).name == 'L81(9^10)'
-    # L9(3^4) of the source's figure 2, but for the order: three of each level in each column
+    # L9(3^4) of the patent's figure 2, but for the order: three of each level in each column
     assert all((np.bincount(column) == 3).all() for column in bose(3, 4).T)
 
 
