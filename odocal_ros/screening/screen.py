@@ -33,6 +33,7 @@ from odocal_ros.screening.clocks import judge_clocks
 from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
+from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
@@ -110,6 +111,7 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
         return usable_rows(slot, leg, config, offset[slot], found)
 
     imu, t_imu = rows('imu')
+    t_imu = on_rhythm(t_imu, imu.w_i, imu.f_i)
     heading, t_heading = rows('heading')
     if judged:
         imu, heading = oriented(imu), oriented(heading)
