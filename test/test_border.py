@@ -139,6 +139,15 @@ def test_a_room_uses_what_the_table_says(room):
     assert used - COMMON - {room} == set(ROOMS[room].split())
 
 
+def test_the_smoother_is_asked_by_its_face_while_a_leg_runs():
+    from odocal_ros.calib import smoother
+    face = {f'odocal_ros.calib.smoother.{name}' for name in smoother.__all__}
+    asked = {name for path in _modules() if _part(path) in ('live', 'foresee')
+             for name in _imports(path) if name.startswith('odocal_ros.calib.smoother')}
+    assert asked
+    assert asked <= face
+
+
 def test_the_rooms_stand_in_order_and_nothing_else_lies_beside_them():
     order = list(ROOMS)
     for room, used in ROOMS.items():      # so that there is no way back

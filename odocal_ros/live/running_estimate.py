@@ -18,7 +18,7 @@ from odocal_ros.data.leg import LegRecorder, SLOTS
 from odocal_ros.data.samples import join, OdometerForm, take
 from odocal_ros.foresee.forecast import Abandoned, better, Forecast
 from odocal_ros.foresee.foresight import forecast_of
-from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps
+from odocal_ros.foresee.leg_so_far import faults_in_cells, ImuGaps, screened_in_cells
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.thinned_leg import ThinnedLeg
 from odocal_ros.live.answers import one_line
@@ -169,6 +169,8 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
                              lambda: not over.is_set(), smoother)
     except Exception as error:  # whatever is wrong with a look, the leg goes on
         failure = error
+    finally:
+        screened_in_cells.cache_clear()      # of this leg nobody asks again
     return forecast, found, time.thread_time() - begin - smoother.once_s, failure
 
 

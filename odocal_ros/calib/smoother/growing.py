@@ -43,10 +43,10 @@ from odocal_ros.settings.config import Config
 # cost a tenth in sigma and save a fifth of the time
 FINE_SPACING, COARSE_SPACING = 1.0, 2.0
 LONG_LEG = 660.0        # s
-# keyframes of a fit from nothing, which takes ten times the passes (benchmarks/live_looks.py)
+# judgement: keyframes of a fit from nothing, which takes ten times the passes
 FEW_KEYS = 150
-LOOK_PASSES, MORE_PASSES = 2, 6    # from the last fit, and where that was not enough
-ANEW_GROWTH = 1.5       # of the leg, until what is decided once is decided anew
+LOOK_PASSES, MORE_PASSES = 2, 6    # judgement: from the last fit, and where that was not enough
+ANEW_GROWTH = 1.5       # judgement: of the leg, until what is decided once is decided anew
 BEARS_OUT_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
 
 
