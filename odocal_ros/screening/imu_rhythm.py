@@ -16,11 +16,14 @@ vibration a noise many times the sensors' own. Rows are put on an even rhythm wh
 are evener so, as they would not be of an Imu that is asked at uneven times.
 """
 
+from collections.abc import Iterable
 from itertools import product
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.mapped import room
+from odocal_ros.data.pieces import chunks, PIECE_ROWS
 
 BLOCK_TIME = 1.0          # s of rows in whose mean a lost row shows
 WINDOW_BLOCKS = 20        # over which the rhythm is a mean: jitter over sqrt(2000) at 100 Hz
@@ -28,6 +31,7 @@ JITTER_SHARE = 2e-3       # of an interval, the least that is worth it
 TESTED_ROWS = 20_000      # at the most, in as many
 TESTED_GROUPS = 40        # groups, whose sums tell how sure it is
 BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # a row amid those of its cubic
+APART = 1e-9              # s, that rows are apart at least
 SURE_SIGMAS = 4.0         # of that rows are evener on the rhythm: by chance once in 30,000
 
 
@@ -41,14 +45,13 @@ def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
     per = int(BLOCK_TIME / usual) if usual > 0 else 0
     if per < 10 or len(t) < WINDOW_BLOCKS * per:
         return t
-    even = _rhythm(t, usual, per)
-    jitters = np.median(np.abs(t - even)) > JITTER_SHARE * usual
-    if not jitters or not _evener(t, even, w, f):
+    rhythm = _Rhythm(t, usual, per)
+    tested = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))[:, None] + BESIDE
+    sent, even = t[tested], rhythm.at(t, tested)
+    jitters = np.median(np.abs(sent - even)) > JITTER_SHARE * usual
+    if not jitters or not _evener(sent, even, (column[tested] for column in (*w.T, *f.T))):
         return t
-    # where rows that keep their stamps meet the others, none before the one before
-    apart = 1e-9 * np.arange(len(t))
-    rising: Floats = np.maximum.accumulate(even - apart) + apart
-    return rising
+    return rhythm.times(t)
 
 
 def _interval(t: Floats) -> float:
@@ -57,59 +60,89 @@ def _interval(t: Floats) -> float:
     return float(np.median(np.diff(stretch))) / 100 if len(stretch) > 1 else 0.0
 
 
-def _rhythm(t: Floats, usual: float, per: int) -> Floats:
-    """Return even times through the means of rows, where none is lost; elsewhere as they are."""
-    n = len(t) // per * per
-    rows = usual * np.arange(len(t))
-    late = np.sort((t - rows)[:n].reshape(-1, per), axis=1)
-    # without what a busy machine held up
-    mean = late[:, per // 10:per - per // 10].mean(axis=1)
-    lost = np.zeros(len(mean), bool)
-    jump = np.abs(mean[2:] - mean[:-2]) > usual / 2       # a row, over a block that it may be in
-    for shift in range(3):
-        lost[shift:shift + len(jump)] |= jump
-    even = t.copy()
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], lost, [True]]).astype(int)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        here = slice(first * per, len(t) if last * per == n else last * per)
-        even[here] = rows[here] + _smooth(mean[first:last], per, here.stop - here.start)
-    return even
+class _Rhythm:
+    """
+    Even times through the means of rows, where none is lost; elsewhere rows keep their stamps.
+
+    lost : (b,) bool, blocks of ``per`` rows in or beside which one is.   knots, late : (k,) rows,
+    and by how much rows there are later than so many intervals, s.
+    """
+
+    def __init__(self, t: Floats, usual: float, per: int) -> None:
+        self.usual, self.per = usual, per
+        mean = self._means(t)
+        self.lost = np.zeros(len(mean), bool)
+        # a row, over a block that it may be in
+        jump = np.abs(mean[2:] - mean[:-2]) > usual / 2
+        for shift in range(3):
+            self.lost[shift:shift + len(jump)] |= jump
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], self.lost, [True]]).astype(int)))
+        lines = [self._line(mean, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        self.knots, self.late = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
+
+    def _means(self, t: Floats) -> Floats:
+        """Return how late the rows of each block are in the mean, the held up ones left out."""
+        blocks, found = len(t) // self.per, []
+        for some in np.array_split(np.arange(blocks), 1 + len(t) // PIECE_ROWS):
+            rows = np.arange(some[0] * self.per, (some[-1] + 1) * self.per)
+            late = np.sort((t[rows] - self.usual * rows).reshape(-1, self.per), axis=1)
+            found.append(late[:, self.per // 10:self.per - self.per // 10].mean(axis=1))
+        return np.concatenate(found)
+
+    def _line(self, mean: Floats, first: int, last: int) -> Floats:
+        """Return knots of blocks without a loss: a line, and what windows of them differ by."""
+        blocks = np.arange(first, last)
+        middle = (blocks + 0.5) * self.per
+        slope, start = np.polyfit(middle, mean[first:last], 1) if len(blocks) > 1 \
+            else (0.0, mean[first])
+        off = mean[first:last] - start - slope * middle
+        windows = np.array_split(blocks - first, max(1, len(blocks) // WINDOW_BLOCKS))
+        by = np.array([off[window].mean() for window in windows])[[0, *range(len(windows)), -1]]
+        knots = np.array([first * self.per, *(middle[window].mean() for window in windows),
+                          last * self.per - 1])
+        return np.stack([knots, start + slope * knots + by])
+
+    def at(self, t: Floats, rows: Ints) -> Floats:
+        """Return the times of rows: as rows are shaped, s."""
+        if not len(self.knots):
+            return t[rows]
+        even = self.usual * rows + np.interp(rows, self.knots, self.late)
+        lost = self.lost[np.minimum(rows // self.per, len(self.lost) - 1)]
+        return np.where(lost, t[rows], even)
+
+    def times(self, t: Floats) -> Floats:
+        """Return the times of all rows, rising: where both kinds meet, none before the last."""
+        found, last = room(len(t)), -np.inf
+        for rows in chunks(len(t)):
+            own = np.arange(rows.start, rows.stop)
+            part = np.maximum.accumulate(np.maximum(self.at(t, own) - APART * own, last))
+            found[rows], last = part + APART * own, part[-1]
+        return found
 
 
-def _smooth(mean: Floats, per: int, count: int) -> Floats:
-    """Return how late rows are by means of blocks: a line and what windows differ, (count,) s."""
-    middle = (np.arange(len(mean)) + 0.5) * per
-    slope, first = np.polyfit(middle, mean, 1) if len(mean) > 1 else (0.0, mean[0])
-    windows = np.array_split(np.arange(len(mean)), max(1, len(mean) // WINDOW_BLOCKS))
-    off = mean - first - slope * middle
-    rows = np.arange(count)
-    return np.asarray(first + slope * rows + np.interp(
-        rows, [middle[blocks].mean() for blocks in windows],
-        [off[blocks].mean() for blocks in windows]))
+def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
+    """
+    Tell whether rows are surely evener by other times than as sent.
 
-
-def _evener(t: Floats, even: Floats, w: Floats, f: Floats) -> bool:
-    """Tell whether rates and forces are surely evener on the rhythm than by the stamps."""
-    rows = np.arange(2, len(t) - 2, max(1, len(t) // TESTED_ROWS))
-    sent, put = _weights(t, rows), _weights(even, rows)
-    gain = np.zeros(len(rows))
-    for column in (*w.T, *f.T):
-        near = column[rows[:, None] + BESIDE]
+    sent, even : (m, 5) s of rows and those beside.   columns : (m, 5) each, what they measured.
+    """
+    weights = _weights(sent), _weights(even)
+    gain = np.zeros(len(sent))
+    for near in columns:
         # of noise alone both are its variance
-        off, left = (np.einsum('mk,mk->m', near, x)**2 / (x**2).sum(axis=1) for x in (sent, put))
+        off, left = (np.einsum('mk,mk->m', near, x)**2 / (x**2).sum(axis=1) for x in weights)
         rounding = 1e-18 * (near**2).mean() + 1e-30
         gain += np.clip((off - left) / max(np.median(off + left), rounding), -10.0, 10.0)
     sums = np.array([group.sum() for group in np.array_split(gain, TESTED_GROUPS)])
     return bool(sums.mean() > SURE_SIGMAS * sums.std() / np.sqrt(len(sums)))
 
 
-def _weights(t: Floats, rows: Ints) -> Floats:
-    """Return by what rows and those beside make how far rows are off a cubic: (m, 5)."""
-    times = t[rows[:, None] + BESIDE]
+def _weights(times: Floats) -> Floats:
+    """Return what of a row and those beside is how far it is off their cubic: (m, 5) for both."""
     weights = np.full(times.shape, -1.0)
     for i, j in product(NODES, NODES):
         if i != j:
             apart = times[:, i] - times[:, j]
-            weights[:, i] *= (times[:, HERE] - times[:, j]) / np.where(apart == 0, 1e-9, apart)
+            weights[:, i] *= (times[:, HERE] - times[:, j]) / np.where(apart == 0, APART, apart)
     weights[:, HERE] = 1.0
     return weights
