@@ -279,8 +279,7 @@ def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
     if driven is None or not len(stops):
         return first, last
     metres, whole = driven
-    start, stop = first, last
-    opening = 0
+    start, stop, opening = first, last, 0
     if metres[0, 0] < OPENING * whole:       # else it is an intermediate stop, or the last one
         start, opening = int(stops[0, 1]), 1
     after = np.flatnonzero(np.arange(len(stops)) >= opening)
@@ -292,13 +291,10 @@ def _by_standstill(first: int, last: int, known: Stops) -> tuple[int, int]:
 def _each_stop(known: Stops, config: Config) -> Spans:
     """Return a leg from each standstill to the next that is long enough."""
     stops, driven = known
-    legs: Spans = []
-    lengths = []
     if driven is None:
-        return legs
+        return []
     metres, _ = driven
-    for i in range(len(stops) - 1):
-        legs.append((int(stops[i, 1]), int(stops[i + 1, 1])))
-        lengths.append(metres[i + 1, 0] - metres[i, 1])
-    long = [leg for leg, m in zip(legs, lengths, strict=True) if m >= config.leg.min_distance]
-    return long or legs
+    legs = list(zip(stops[:-1, 1].tolist(), stops[1:, 1].tolist(), strict=True))
+    lengths = metres[1:, 0] - metres[:-1, 1]
+    return [leg for leg, m in zip(legs, lengths, strict=True)
+            if m >= config.leg.min_distance] or legs
