@@ -85,5 +85,5 @@ def used(leg: SmootherLeg, t: Floats) -> dict[str, Velocity | Heading]:
     """Return velocity and heading within the keyframes, those that there are."""
     found: dict[str, Velocity | Heading] = {
         'velocity': leg.velocity.between(t[0], t[-1]),
-             'heading': leg.heading.between(t[0], t[-1])}
+        'heading': leg.heading.between(t[0], t[-1])}
     return {name: x for name, x in found.items() if len(x.t)}
