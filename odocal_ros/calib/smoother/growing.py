@@ -25,12 +25,12 @@ from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.failed import told_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive
-from odocal_ros.calib.smoother.estimate import Fit, fit, Trace, WarmStart
+from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
-from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.problem import Problem, SPACING
 from odocal_ros.calib.smoother.remarks import model_floor
 from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit
 from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, State, YAW
@@ -39,13 +39,10 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.settings.config import Config
 
-# s between keyframes of a leg up to LONG_LEG and beyond: tuned, docs/decisions/0005: 2 s for 1 s
-# cost a tenth in sigma and save a fifth of the time
-FINE_SPACING, COARSE_SPACING = 1.0, 2.0
-LONG_LEG = 660.0        # s
+LONG_LEG = 660.0        # s, from which keyframes lie twice SPACING apart: docs/decisions/0005
 # judgement: keyframes of a fit from nothing, which takes ten times the passes
 FEW_KEYS = 150
-LOOK_PASSES, MORE_PASSES = 2, 6    # judgement: from the last fit, and where that was not enough
+LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
 ANEW_GROWTH = 1.5       # judgement: of the leg, until what is decided once is decided anew
 BEARS_OUT_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
 
@@ -108,7 +105,7 @@ class GrowingFit:
     def _fit(self, last: WarmStart | None, view: SmootherLeg, config: Config,
              trace: Trace) -> tuple[Fit, Problem]:
         duration = view.t_stop - view.t_begin
-        spacing = FINE_SPACING if duration < LONG_LEG else COARSE_SPACING
+        spacing = SPACING if duration < LONG_LEG else 2 * SPACING
         problem = Problem.of(view, config, rows_of(view, spacing))
         problem.per_effective = self._per_effective
         begun = None if last is None else carried(last, problem)
@@ -125,7 +122,7 @@ class GrowingFit:
             problem.grade).outline()
         best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
         if not best.settled:
-            best = fit(problem, best.state, best.levels, MORE_PASSES, about=best, trace=trace)
+            best = fit(problem, best.state, best.levels, AGAIN_PASSES, about=best, trace=trace)
         if duration > ANEW_GROWTH * self._judged:
             best = self._borne_out(best, problem, config, trace)
         return best, problem
@@ -135,7 +132,7 @@ class GrowingFit:
         begin = self._cpu_s()
         view = problem.leg
         duration = view.t_stop - view.t_begin
-        other = Problem.of(view, config, rows_of(view, max(FINE_SPACING, duration / FEW_KEYS)))
+        other = Problem.of(view, config, rows_of(view, max(SPACING, duration / FEW_KEYS)))
         anew = likeliest_fit(other, config, trace)
         self._judged = duration
         if anew.settled:
@@ -159,7 +156,7 @@ def _decided_anew(best: Fit, anew: Fit, problem: Problem, config: Config, trace:
     if slow or not unjudged:
         about = replace(best, first=none, priors=with_imperfect(
             best.priors, problem.priors.constants[IMPERFECT]))
-        best = fit(problem, state, levels, MORE_PASSES, about=about, trace=trace)
+        best = fit(problem, state, levels, AGAIN_PASSES, about=about, trace=trace)
     sigma = np.sqrt(np.diag(anew.solved.covariance))
     apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
     if apart.max() > BEARS_OUT_SIGMAS:
