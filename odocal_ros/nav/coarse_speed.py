@@ -88,7 +88,7 @@ class CoarseSpeed:
         The offset is half a cell where the sender truncates, none where it rounds. A change by one
         cell: the speed of its middle is the mean of both values, uniform by what the speed changes
         in the step. A value between changes by more, or in steps so long that the speed changes by
-        much of a cell: it is uniform in its cell, and its rows, however many, count as one.
+        more than a cell: it is uniform in its cell, and its rows, however many, count as one.
         """
         q, t, v = self.step, self.t, self.value
         cell = np.rint(v / q)
@@ -98,10 +98,8 @@ class CoarseSpeed:
         outer = np.maximum(np.abs(cell[at]), np.abs(cell[at + 1]))
         inner = np.minimum(np.abs(cell[at]), np.abs(cell[at + 1]))
         usual = np.median(np.diff(t)) if len(t) > 1 else 0.0
-        # in a long step a cruise ends anywhere, and before it the speed was that of the cruise
-        gained = _gain(middle, edge, q) * h
-        sharp_change = 0.5    # of a cell: a speed that changes by more in a step tells no crossing
-        jump = np.where(gained > sharp_change * q, 2, jump)
+        gained = _rates(middle, edge, q) * h
+        jump = np.where(gained > q, 2, jump)    # there a step may pass two edges, or none
         least_cell = 2    # cells from zero: in the first, a dead band may be at work
         single = (jump == 1) & (outer >= least_cell) & (inner > 0)
         if not self.interpolated:
@@ -119,19 +117,20 @@ class CoarseSpeed:
         return Told(when[order], value[order], np.sign(value[order]), sigma[order])
 
 
-def _gain(t: Floats, edge: Floats, q: float) -> Floats:
+def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     """
-    Return how fast the speed changes at its crossings (m,): between those before and after.
+    Return how fast a speed may change at its crossings (m,): the faster of both sides.
 
-    Where it turns about, both are the same edge: there the faster of both sides is taken, within
-    which the speed may have changed by a cell.
+    As fast as three quarters of the drive's do at least: a small step between two cruises is made
+    as quickly as a large one, though no other edge is near to show it; and by its own neighbours
+    alone a crossing weighs the more, the later it falls in its step, which is its error.
     """
-    dt, rise = np.maximum(np.diff(t), 1e-9), np.diff(edge)
-    side = np.maximum(np.abs(rise), q) / dt
-    gain: Floats = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
-    on = np.flatnonzero(rise[:-1] * rise[1:] > 0)
-    gain[on + 1] = np.abs(rise[on] + rise[on + 1]) / (dt[on] + dt[on + 1])
-    return gain
+    if len(t) < 2:
+        return np.full(len(t), np.inf)      # one change alone shows no rate
+    side = np.maximum(np.abs(np.diff(edge)), q) / np.diff(t)
+    rate = np.maximum(np.r_[0.0, side], np.r_[side, 0.0])
+    floored: Floats = np.maximum(rate, np.percentile(rate, 75))
+    return floored
 
 
 def coarse_speed(t: Floats, value: Floats) -> CoarseSpeed | None:

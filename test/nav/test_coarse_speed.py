@@ -78,8 +78,9 @@ def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
     z = (told.value + offset - np.interp(told.t, T, SPEED)) / told.sigma
     # uniform: sqrt(3) sigma at most, but for what the change in a step is known by
     assert np.abs(z).max() < 2.6
-    # uniform: 1; some hundred rows tell it to a tenth
-    assert np.sqrt((z**2).mean()) == pytest.approx(1.0, abs=0.2)
+    # uniform: 1, some hundred rows tell it to a tenth; a slow change is stated with the rate of
+    # quicker ones, of which the fit's level takes off up to a half
+    assert 0.5 < np.sqrt((z**2).mean()) < 1.2
     assert np.abs(told.value).min() > KMH
 
 
@@ -119,6 +120,24 @@ def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
     assert len(told.t) > 800
     assert abs((error / told.sigma).mean()) < 3.3 / np.sqrt(len(told.t))
     assert np.sqrt(((error / told.sigma)**2).mean()) < 1.1
+
+
+@pytest.mark.parametrize('rate', [1.0, 2.0, 5.0, 10.0])
+def test_small_steps_between_cruises_of_a_motorway_are_within_the_sigma(rate):
+    # each new cruise is reached at 0.3 to 1.2 m/s^2: within a row or two of a slow bus
+    rng = np.random.default_rng(3)
+    cruise = 28 + rng.uniform(-1.5, 1.5, 600)
+    rise = np.abs(np.diff(cruise, append=cruise[-1])) / rng.uniform(0.3, 1.2, 600) + 0.1
+    end = np.cumsum(rng.uniform(5, 40, 600) + rise)
+    corners = np.c_[np.r_[0.0, end[:-1]], end - rise].ravel()
+    t = np.arange(0.0, corners[-1], 1 / rate)
+    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, np.interp(t, corners, cruise.repeat(2)))).told
+    z = (told.value + KMH / 2 - np.interp(told.t, corners, cruise.repeat(2))) / told.sigma
+    assert len(z) > 600
+    # uniform: sqrt(3) at most, but for crossings whose rate is known to a whole step
+    assert np.abs(z).max() < 2.6
+    weight = told.value / told.sigma
+    assert abs(weight @ z) < 3.3 * np.linalg.norm(weight)
 
 
 def test_a_cruise_keeps_its_rounding_and_a_ramp_loses_it():
