@@ -7,11 +7,16 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""One name, one number: a threshold's name says of what it is, so it stands in one module."""
+"""
+One name, one number: a threshold's name says of what it is, so it stands in one module.
+
+Beside it, or above its group, stands where the number is from, in a word of settings/levels.py.
+"""
 
 import ast
 from collections import defaultdict
 from pathlib import Path
+import re
 
 import odocal_ros
 
@@ -22,14 +27,44 @@ ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'planning'
 LAYOUTS = ('calib/smoother/state.py', 'calib/wheels/model.py', 'apply/errors.py')
 
 
-def _numbers(tree):
-    """Yield the names that a module gives to a number, or to some of them, at its top level."""
+# '# s, judgement: ...', '# statistical: ...', 'a sentence. Physical'; what is tuned says by what
+MARK = re.compile(r'(?:^|[,;:.] )(?:physical|statistical|judgement|format|definition)(?=[,;:.]|$)'
+                  r'|(?:^|[,;:.] )tuned\b.*\b(?:benchmarks|docs/decisions)/', re.IGNORECASE)
+
+
+def _assignments(tree):
+    """Yield the top-level assignments of a number, or of some; dicts are tables of their own."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(
                 isinstance(x, ast.Constant) and type(x.value) in (int, float)
                 for x in ast.walk(node.value)) and not isinstance(node.value, ast.Dict):
-            for target in node.targets:
-                yield from (x.id for x in ast.walk(target) if isinstance(x, ast.Name))
+            yield node
+
+
+def _numbers(tree):
+    """Yield the names that a module gives to a number, or to some of them, at its top level."""
+    for node in _assignments(tree):
+        for target in node.targets:
+            yield from (x.id for x in ast.walk(target) if isinstance(x, ast.Name))
+
+
+def _unmarked(text):
+    """Return the lines whose number has no mark beside it, or in the comment above its group."""
+    lines, tree = text.splitlines(), ast.parse(text)
+    begin = {node.end_lineno: node.lineno for node in tree.body if isinstance(node, ast.Assign)}
+    lacks = []
+    for node in _assignments(tree):
+        beside = [line.partition('#')[2] for line in lines[node.lineno - 1:node.end_lineno]]
+        first = node.lineno
+        while first - 1 in begin:
+            first = begin[first - 1]
+        above = first - 1
+        while above and lines[above - 1].startswith('#'):
+            above -= 1
+        comments = beside, [line[1:] for line in lines[above:first - 1]]
+        if not any(MARK.search(' '.join(' '.join(c).split())) for c in comments):
+            lacks.append(f'{node.lineno}: {lines[node.lineno - 1]}')
+    return lacks
 
 
 def test_no_two_modules_give_one_name_to_two_numbers():
@@ -42,3 +77,10 @@ def test_no_two_modules_give_one_name_to_two_numbers():
                     homes[name].append(where)
     assert len(homes) > 100
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
+def test_each_number_says_where_it_is_from():
+    lacks = {path.relative_to(PACKAGE).as_posix(): _unmarked(path.read_text(encoding='utf-8'))
+             for path in PACKAGE.rglob('*.py')}
+    assert len(lacks) > 300
+    assert {where: lines for where, lines in lacks.items() if lines} == {}

@@ -22,6 +22,7 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import skew
 from odocal_ros.settings.grades import Grade
 
+# definition: where the unknowns stand in the error state
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
 BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # what it tells, of a body that is nearly level: no heading

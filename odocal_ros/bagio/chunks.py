@@ -40,7 +40,7 @@ from odocal_ros.bagio.mcap_records import (
 from odocal_ros.outside.limits import zstd_module
 from odocal_ros.outside.whole import whole_file, WholeFile
 
-HEADER, DATA_END = 1, 15      # opcodes, as those of mcap_records
+HEADER, DATA_END = 1, 15      # format: opcodes, beside those of mcap_records: mcap.dev/spec
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 

@@ -16,7 +16,7 @@ import signal
 import threading
 from typing import Any
 
-BAR = '=' * 80 + '\n'
+BAR = '=' * 80 + '\n'    # format: between definitions, of ros2msg in mcap.dev/spec/registry
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
 

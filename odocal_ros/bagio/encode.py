@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
 
-VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)
+VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)    # format: of sensor_msgs and geometry_msgs
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-LET_GO = 2**23      # bytes
+LET_GO = 2**23      # judgement: bytes
 
 
 class FileBytes:

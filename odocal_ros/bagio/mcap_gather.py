@@ -30,10 +30,10 @@ from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.messages.raws import Raws, Rows
 from odocal_ros.outside.limits import Damaged, LATEST_NS
 
-BLOCK = 2**21          # bytes of chunks unpacked at a time
+BLOCK = 2**21          # judgement: bytes of chunks unpacked at a time
 HEAD = np.dtype([('op', 'u1'), ('size', '<i8'), ('channel', '<u2'), ('sequence', '<u4'),
                  ('time_ns', '<i8'), ('published_ns', '<i8')])
-BODY = 22              # of those bytes, what a record's size counts
+BODY = 22              # format: of those bytes, what a record's size counts: mcap.dev/spec
 
 
 class Columns(NamedTuple):

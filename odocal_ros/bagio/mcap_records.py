@@ -19,15 +19,15 @@ from odocal_ros.messages.raws import Bytes
 from odocal_ros.outside.limits import Damaged
 
 MAGIC = b'\x89MCAP0\r\n'
-# opcodes of the records: mcap.dev/spec
+# format: opcodes of the records, mcap.dev/spec
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = (
     2, 3, 4, 5, 6, 7, 8, 11)
 USED = {SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS}
 INDEX_DAMAGED = 'a damaged index'
-MOST_CUT = 2**26        # bytes taken of a chunk that the file ends in
+MOST_CUT = 2**26        # judgement: bytes taken of a chunk that the file ends in
 RECORD, MESSAGE_HEAD, CHUNK_HEAD = (struct.Struct(s) for s in ('<BQ', '<HIQQ', '<QQQI'))
 INDEX_HEAD, TIMES = struct.Struct('<QQQQ'), struct.Struct('<QQ')
-END = 9 + 20 + len(MAGIC)      # of the footer
+END = 9 + 20 + len(MAGIC)      # format: of the footer
 
 
 class Place(NamedTuple):

@@ -27,7 +27,7 @@ from odocal_ros.errors import BadBag
 from odocal_ros.messages.raws import Raws
 from odocal_ros.outside.limits import Allowance, Damaged, LimitReached
 
-BLOCK = 20_000         # messages taken at a time
+BLOCK = 20_000         # judgement: messages taken at a time
 ZSTD = b'\x28\xb5\x2f\xfd'
 
 

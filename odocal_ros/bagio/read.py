@@ -29,7 +29,7 @@ from odocal_ros.messages.decode import Feed, RowReader
 from odocal_ros.outside.limits import is_file
 from odocal_ros.reasons import Code, Reason
 
-MISSING = 0.5   # s, less is not worth a word
+MISSING = 0.5   # s, judgement: less is not worth a word
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from odocal_ros.bagio.chunks import Chunk, read_chunks, write_file
 from odocal_ros.bagio.numbered import part_name, whole_name
 from odocal_ros.outside.whole import disk, write_text
 
-TOGETHER = 60        # files joined while the bag still grows: an hour is then 60 + 60 files
+TOGETHER = 60        # judgement: files joined while the bag grows: an hour is then 60 + 60
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ from odocal_ros.messages.raws import Raws
 
 SCHEMA = ('createtablemessages(idintegerprimarykey,topic_idintegernotnull,'
           'timestampintegernotnull,datablobnotnull)')
-INNER = 0x05             # kind of page of pages
-BLOCK = 2**21            # bytes of pages looked at in one go
+INNER = 0x05             # format: kind of page of pages, sqlite.org/fileformat2
+BLOCK = 2**21            # judgement: bytes of pages looked at in one go
 Table = NDArray[np.uint8]
 
 

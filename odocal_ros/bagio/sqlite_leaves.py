@@ -21,9 +21,10 @@ from typing import Any
 
 from odocal_ros.bagio.file_bytes import FileBytes
 
-LEAF = 0x0D                       # kind of page of rows; the format: sqlite.org/fileformat2
-COLUMNS = 4                       # id (NULL: it is the row number), topic_id, timestamp, data
-INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}      # bytes, by serial type
+LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
+# format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
+COLUMNS = 4
+INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}      # format: bytes, by serial type
 
 
 class Leaves:

@@ -24,7 +24,7 @@ from odocal_ros.errors import BadUsage
 
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
 COMPRESSIONS = ('none', 'message', 'file', 'storage')   # all zstd
-BLOCK = 20_000         # messages packed at a time, to bound memory
+BLOCK = 20_000         # judgement: messages packed at a time, to bound memory
 LEFT_JOINT, RIGHT_JOINT = 'left_wheel_joint', 'right_wheel_joint'
 
 

@@ -28,7 +28,7 @@ from odocal_ros.screening.screen import Inputs
 # round. Judgement: nobody mounts an Imu 20 deg askew unawares, and quarter turns are set
 FAR_YAW, BACKWARDS_YAW = np.deg2rad(20.0), np.deg2rad(160.0)
 # rad within which an axis is meant to be another: a third of a quarter turn, to its sigma of half
-# of that an axis is named at all
+# of that an axis is named at all. Judgement
 MEANT_AXIS = np.deg2rad(30.0)
 
 

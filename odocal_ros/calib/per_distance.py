@@ -18,8 +18,8 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, as KITTI's benchmark has them, for a road
-PIECE_STARTS = 10                       # of pieces, on the length of one, as there
+PIECE_LENGTHS = 100.0, 500.0, 1000.0    # m, definition: as KITTI's benchmark has them, for a road
+PIECE_STARTS = 10                       # definition: of pieces, on the length of one, as there
 
 
 def per_distance(way: Floats, before: Floats, after: Floats) -> tuple[PerDistance, ...]:

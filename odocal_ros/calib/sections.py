@@ -21,7 +21,7 @@ from odocal_ros.data.arrays import Complexes, Floats
 # that white noise on top does not hide
 BLOCK_LAGS = (1, 3)
 Stretch = tuple[np.complexfloating, Complexes, float]      # turn and stretch, what is left, spread
-# correlation of errors from block to block: a grid, finer where a stretch's sigma grows faster
+# judgement: correlation of errors from block to block, a grid, finer where a stretch's sigma grows
 MEMORIES = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.88, 0.93, 0.96, 0.98, 0.99])
 
 

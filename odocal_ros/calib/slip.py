@@ -35,7 +35,7 @@ PIN_STEPS = 2        # rows each side that the speed at an end is taken over: ju
 # rad in a window: in more of a turn the level's error is another axis'. Judgement
 SPIN_TURN = 0.1
 # odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
-# window, its own ends 1 more; the rest is margin
+# window, its own ends 1 more; the rest is margin: judgement
 PIN_COUNTS = 8.0
 
 

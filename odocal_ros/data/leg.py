@@ -45,8 +45,8 @@ EMPTY: dict[str, Callable[[], Samples]] = {
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
-MOST_DAYS = 7          # of a leg
-COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')
+MOST_DAYS = 7          # judgement: of a leg
+COUNTER = OdometerForm('cumulative', 2**64, 'm/pulse')    # definition: 64 bit
 
 
 @dataclass(frozen=True, eq=False)

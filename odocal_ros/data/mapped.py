@@ -26,7 +26,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-ROOM_BYTES = 2**24      # bytes of an array to work in from which it lies in a file
+ROOM_BYTES = 2**24      # judgement: bytes of an array to work in from which it lies in a file
 _maps: WeakSet[mmap.mmap] = WeakSet()
 _lock = Lock()
 

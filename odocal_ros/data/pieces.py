@@ -25,7 +25,7 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go, room
 
 Array = NDArray[Any]
-PIECE_ROWS = 2**16    # rows
+PIECE_ROWS = 2**16    # judgement: rows
 
 
 def chunks(n: int) -> Iterator[slice]:

@@ -27,6 +27,7 @@ from odocal_ros.data.arrays import Bools, Floats, Ints, Values
 from odocal_ros.errors import BadData
 
 Stamps = Ints
+# definition: of no rows
 NO_STAMPS = np.empty(0, np.int64)
 NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 

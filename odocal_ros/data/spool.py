@@ -27,11 +27,11 @@ from odocal_ros.data.arrays import Bools
 from odocal_ros.data.mapped import mapped, nameless
 from odocal_ros.data.samples import columns_of, join, of_columns, Samples, take
 
-MEMORY_BYTES = 2**24    # bytes of a topic's rows from which they go to the file
-TAIL_BYTES = 2**23      # bytes after those of the file, the same
-MERGED_BYTES = 2**20    # bytes: so much of small blocks is made one
-LARGE_BYTES = 2**17     # bytes of a block that is not small
-MOVED_BYTES = 2**20     # bytes moved at a time
+MEMORY_BYTES = 2**24    # judgement: bytes of a topic's rows from which they go to the file
+TAIL_BYTES = 2**23      # judgement: bytes after those of the file, the same
+MERGED_BYTES = 2**20    # judgement: bytes, so much of small blocks is made one
+LARGE_BYTES = 2**17     # judgement: bytes of a block that is not small
+MOVED_BYTES = 2**20     # judgement: bytes moved at a time
 
 
 class Rows:

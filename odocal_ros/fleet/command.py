@@ -22,8 +22,8 @@ from odocal_ros.offline.say import say, warn
 if TYPE_CHECKING:
     from odocal_ros.fleet.bag_task import BagJob
 
-TIMEOUT = 3600.0      # s for a bag
-GIB = 2**30
+TIMEOUT = 3600.0      # s, judgement: for a bag
+GIB = 2**30    # definition: bytes
 
 
 def _bytes(text: str) -> int:

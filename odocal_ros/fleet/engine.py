@@ -20,8 +20,8 @@ from odocal_ros.errors import BadUsage, OdocalError
 
 NEEDS = ('dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 INSTALL = "pip install 'odocal_ros[fleet]'"
-MEMORY = 2 * 2**30       # bytes for a task, unless said
-FEWEST = 50              # of them, least: workers may be on their way
+MEMORY = 2 * 2**30       # judgement: bytes for a task, unless said
+FEWEST = 50              # judgement: of them, least: workers may be on their way
 LOST = ('the Dask scheduler is gone; start it again and give the same command: what is done is '
         'kept')
 

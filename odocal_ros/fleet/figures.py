@@ -19,7 +19,7 @@ import numpy as np
 from odocal_ros.fleet.second_stage import COMPARED, flagged
 from odocal_ros.output.summary import DEG
 
-MOST_POINTS = 3000       # of a picture: more are thinned, but for those far off
+MOST_POINTS = 3000       # judgement: of a picture: more are thinned, but for those far off
 TITLES = {'scale_factor': 'Scale factor', 'yaw_mounting_angle': 'Yaw mounting angle',
           'pitch_mounting_angle': 'Pitch mounting angle'}
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
-FAR = 4.0            # sigmas of a vehicle from its model: by chance one in 16,000
-LEAST = 3            # vehicles of which a spread can be told
+FAR = 4.0            # statistical: sigmas of a vehicle from its model: by chance one in 16,000
+LEAST = 3            # judgement: vehicles of which a spread can be told
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, with_settings
 
-GONE = 2             # last legs that are all rejected: one may be but a drive gone wrong
+GONE = 2             # judgement: last legs, all rejected: one may be but a drive gone wrong
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from odocal_ros.planning.smoother import spacing_for
 from odocal_ros.settings.config import GRADES, with_settings
 
 SCALE, YAW = 'scale_factor', 'yaw_mounting_angle'
-RTK = 0.02                        # m, of a fix, as receivers' data sheets have it
+RTK = 0.02                        # m, physical: of a fix, as receivers' data sheets have it
 
 
 @dataclass(frozen=True)

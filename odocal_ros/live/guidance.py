@@ -19,7 +19,7 @@ from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Reason, Verdict
 
-KMH = 3.6
+KMH = 3.6    # definition: km/h in a m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
 DRIVE = 'drive '
 STRAIGHT = 'go straight on at speed until left and right wheel are told apart'

@@ -30,14 +30,14 @@ from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
 NAME = 'calibrator: calibration'  # replay finds marks by this name
-# key: result.* parameter
-# decimals that mean something
+# judgement: decimals that mean something
 PLACES = dict.fromkeys((
     'distance_m', 'duration_s', 'imu_rate_hz', 'odometer_rate_hz', 'fix_rate_hz', 'standstill_s',
     'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
     'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
         'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4}
+# key: result.* parameter
 VALUES = {
     'scale_factor': 'scale_factor', 'scale_factor_sigma': 'scale_factor_sigma',
     'yaw_mounting_angle_rad': 'yaw_mounting_angle',

@@ -37,7 +37,7 @@ def _twist(prefix: str) -> tuple[str, ...]:
 
 
 _HEADER = ('int32 header.stamp.sec', 'uint32 header.stamp.nanosec', 'string header.frame_id')
-FRAME_AT = 16       # where the text of _HEADER stands
+FRAME_AT = 16       # format: where CDR has the text of _HEADER
 _LAYOUT = ('dim[] layout.dim', 'uint32 layout.data_offset')
 _DIM = ('string label', 'uint32 size', 'uint32 stride')
 

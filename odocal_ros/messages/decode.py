@@ -31,7 +31,8 @@ from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan
 from odocal_ros.messages.tables import tables
 from odocal_ros.settings.config import Config
 
-HOPELESS = 20_000    # messages that gave nothing, after which odd ones are not looked at
+# judgement: messages that gave nothing, after which odd ones are not looked at
+HOPELESS = 20_000
 Deserialize = Callable[[bytes], object]
 Feed = Callable[[str, Samples], None]
 

@@ -98,6 +98,7 @@ def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
     return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
 
 
+# format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
 _ORIENTATION = (xyz('orientation', 'xyzw'), array('orientation_covariance', 0),
                 array('orientation_covariance', 8))
 SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {

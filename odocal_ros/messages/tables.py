@@ -24,7 +24,8 @@ from odocal_ros.messages import cdr
 from odocal_ros.messages.cdr import Layout
 from odocal_ros.messages.raws import Raws, Rows, Table
 
-MAX_LAYOUTS = 16   # per call; a stream with more is odd enough to be read message by message
+# judgement: per call; a stream with more is odd enough to be read message by message
+MAX_LAYOUTS = 16
 
 
 def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None, Rows, Table]]:

@@ -25,11 +25,12 @@ from odocal_ros.nav.earth import earth_rate_n, gravity, OMEGA
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_matrix, transpose
 
 # what a leg is aligned by, recorded or planned
-MOTION_LEVEL = 30.0       # s of driving that a level without standstill is taken from
-COURSE_DISTANCE = 30.0    # m of track for a course
-HEADING_LIMIT = 0.5      # rad: an orientation worse than this is no heading
-COMPASS_LIMIT = 0.05      # rad: a gyrocompass worse than this is no heading
-REST_EDGE = 0.3    # s cut off each end of a standstill: a slow start leans the specific force
+MOTION_LEVEL = 30.0       # s, judgement: of driving that a level without standstill is taken from
+COURSE_DISTANCE = 30.0    # m, judgement: of track for a course
+HEADING_LIMIT = 0.5      # rad, judgement: an orientation worse than this is no heading
+COMPASS_LIMIT = 0.05      # rad, judgement: a gyrocompass worse than this is no heading
+# s, judgement: cut off each end of a standstill: a slow start leans the specific force
+REST_EDGE = 0.3
 
 
 @dataclass(frozen=True, eq=False)

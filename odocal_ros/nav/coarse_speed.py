@@ -24,9 +24,10 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.gaps import MISSING_INTERVALS
 
-LEAST_CELLS = 3.0          # cells that the values must span
-GRID_COHERENCE = 0.9       # |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
-# of the values' span, and with zeros: frequencies between; those that rule out a grid
+LEAST_CELLS = 3.0          # judgement: cells that the values must span
+# judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
+GRID_COHERENCE = 0.9
+# judgement: of the values' span, and with zeros: frequencies between; those that rule out a grid
 GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 
 

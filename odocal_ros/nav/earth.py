@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike
 from odocal_ros.data.arrays import FloatOrFloats, Floats
 from odocal_ros.nav.angles import arctan2
 
+# physical: all of WGS 84 (NIMA TR8350.2)
 A = 6378137.0                  # m, semi-major axis
 F = 1 / 298.257223563          # flattening
 E2 = F * (2 - F)               # first eccentricity squared
-OMEGA = 7.292115e-5            # rad/s, Earth rate; all of WGS 84 (NIMA TR8350.2)
+OMEGA = 7.292115e-5            # rad/s, Earth rate
 
 
 def radii(latitude: FloatOrFloats) -> tuple[FloatOrFloats, FloatOrFloats]:

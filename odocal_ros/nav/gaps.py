@@ -14,8 +14,8 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.pieces import by_step
 
-MISSING_INTERVALS = 2.5  # median intervals: a message or more is missing
-GAP_INTERVALS = 5.0      # of the median interval: what is longer is a gap
+MISSING_INTERVALS = 2.5  # judgement: median intervals, a message or more is missing
+GAP_INTERVALS = 5.0      # judgement: of the median interval: what is longer is a gap
 
 
 def gaps_longer(t: Floats, limit: float) -> Floats:

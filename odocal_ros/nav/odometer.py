@@ -19,8 +19,9 @@ from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
 from odocal_ros.reasons import Code, Reason
 
-RESET_FACTOR = 5.0    # a step this many times the 95th percentile of the moving rate is no motion
-FEWEST_STEPS = 20     # steps below which no reset is looked for
+# judgement: a step this many times the 95th percentile of the moving rate is no motion
+RESET_FACTOR = 5.0
+FEWEST_STEPS = 20     # judgement: steps below which no reset is looked for
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 
-LEAST_LAG2 = 1e-4      # s^2: below, as much in proportion (and of an estimate below zero)
+# s^2, judgement: below, as much in proportion (and of an estimate below zero)
+LEAST_LAG2 = 1e-4
 
 
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,

@@ -18,11 +18,11 @@ from odocal_ros.data.pieces import across, by_step
 from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 
-REST_GRID = 0.1       # s, grid of the detector
-REST_WINDOW = 0.5     # s, each side
-REST_TRAVEL = 0.03    # m, travel within the window that still counts as standing
-REST_TURN = 0.02      # rad/s, wander of the gyro that still counts as standing
-MOST_BIAS = 0.12      # rad/s, each axis: no gyro at rest says more (cheap phones: 0.1)
+REST_GRID = 0.1       # s, judgement: grid of the detector
+REST_WINDOW = 0.5     # s, judgement: each side
+REST_TRAVEL = 0.03    # m, judgement: travel in the window that still counts as standing
+REST_TURN = 0.02      # rad/s, judgement: wander of the gyro that still counts as standing
+MOST_BIAS = 0.12      # rad/s, each axis, physical: no gyro at rest says more (cheap phones: 0.1)
 
 
 def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: float,

@@ -22,8 +22,9 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.data.pieces import by_row
 
 Pairs = tuple[Complexes, Complexes]      # quaternions: w + x i, y + z i
-SCAN_BLOCK = 64    # quaternions a scan multiplies up in step; 40 to 800 make no difference
-SAMPLES_AT_A_TIME = 16384    # intervals worked on at a time: their arrays stay in the cache
+# judgement: quaternions a scan multiplies up in step; 40 to 800 make no difference
+SCAN_BLOCK = 64
+SAMPLES_AT_A_TIME = 16384    # judgement: intervals at a time, whose arrays stay in the cache
 
 
 def rotation_increments(t: Floats, w_b: Floats, begin: int = 0, end: int | None = None) -> Floats:

@@ -32,7 +32,7 @@ COMMANDS = {
     'doctor': ('odocal_ros.offline.doctor', 'what is installed: one screen to paste'),
     'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
 }
-OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130
+OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
 
 
 class _Parser(argparse.ArgumentParser):

@@ -19,7 +19,7 @@ from odocal_ros.output.figures import two_digits
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 LABELS = {'legs': "the legs' own errors"}
 HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
-NAME, WIDTHS = 24, (13, 15, 15)      # with 'shared' within 80 columns
+NAME, WIDTHS = 24, (13, 15, 15)      # judgement: with 'shared' within 80 columns
 
 
 def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:

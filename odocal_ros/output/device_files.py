@@ -19,7 +19,7 @@ from odocal_ros.output.summary import inverse, known
 from odocal_ros.settings.config import Config
 
 DEVICES = 'wheel_input.txt'
-MICRO = 1e6
+MICRO = 1e6    # definition: millionths in 1
 
 
 def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -> dict[str, str]:

@@ -28,7 +28,7 @@ from odocal_ros.output.track_table import in_pieces, overall
 from odocal_ros.pipeline.acceptance import accept
 from odocal_ros.settings.config import Config, flat
 
-SCHEMA = 1
+SCHEMA = 1    # format: version of calibration.json
 MAIN = 'calibration.json'
 # what every result names, determined or not; a scale's unit is known only with its data
 ALWAYS = {'scale_factor': None, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',

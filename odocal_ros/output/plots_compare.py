@@ -16,7 +16,7 @@ from odocal_ros.output.plots_svg import BAND, BLUE, GREEN, GREY, PINK, RED, rela
 from odocal_ros.output.summary import ANGLES, DEG, known
 
 STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))
-MOST_LEGS = 40
+MOST_LEGS = 40    # judgement: bars of a picture that can be told apart
 # title, (text, method, value, sigma) of what has one, band of the result: middle and half width
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 

@@ -24,8 +24,8 @@ from odocal_ros.data.arrays import Floats, Ints
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, what it says, SVG
-MOST_POINTS = 1200   # of a line
-MOST_MARKS = 400     # of single marks
+MOST_POINTS = 1200   # judgement: of a line
+MOST_MARKS = 400     # judgement: of single marks
 LOOK: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'odocal', 'font.family': ['DejaVu Sans'],
     'font.size': 9.0, 'axes.labelsize': 9.0, 'legend.fontsize': 8.5, 'axes.axisbelow': True,

@@ -27,7 +27,7 @@ from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
-MOST_BYTES = 2_600_000     # of figures; a page stays under 3 MB with its tables
+MOST_BYTES = 2_600_000     # judgement: of figures; a page stays under 3 MB with its tables
 TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Take care',
           Verdict.ACCEPTED: 'Notes'}
 

@@ -25,13 +25,13 @@ from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
 MOSTLY = 'mostly', 'above all'      # more than half of the variance, or the most of all
-WIDTH = 98
-DEG = math.degrees(1.0)
+WIDTH = 98    # judgement: columns
+DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 WHEELS = {'scale_factor_left': 'left', 'scale_factor_right': 'right', 'track_width': 'track width'}
 ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
-DEG_PER_HOUR = DEG * 3600
+DEG_PER_HOUR = DEG * 3600    # definition
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
 MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
            Verdict.REJECTED: 'do not use these values'}

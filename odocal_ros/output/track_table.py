@@ -15,7 +15,7 @@ from odocal_ros.calib.result import LegResult, PerDistance, TrackCheck
 from odocal_ros.output.figures import length
 
 SIDES = 'before', 'after'
-LABEL, CELL = 22, 9      # columns
+LABEL, CELL = 22, 9      # judgement: columns
 
 
 def overall(checks: list[tuple[TrackCheck | None, int]]) -> TrackCheck | None:

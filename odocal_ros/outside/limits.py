@@ -19,10 +19,10 @@ from typing import Any
 from odocal_ros.errors import BadBag
 
 RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
-DEFINITION = 2**16           # characters of a message definition
-ELEMENTS = 100_000           # values in the fixed arrays of one message
-SECONDS = 20                 # to understand a definition
-LATEST_NS = 2**62            # the year 2116: a later time of a message is none
+DEFINITION = 2**16           # judgement: characters of a message definition
+ELEMENTS = 100_000           # judgement: values in the fixed arrays of one message
+SECONDS = 20                 # judgement: to understand a definition
+LATEST_NS = 2**62            # judgement: the year 2116: a later time of a message is none
 
 
 class LimitReached(BadBag):

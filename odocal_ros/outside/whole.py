@@ -23,7 +23,7 @@ import signal
 import threading
 from typing import Any, BinaryIO
 
-MOST_ALIKE = 1000             # folders of one name
+MOST_ALIKE = 1000             # judgement: folders of one name
 PART = '.part'                # of files being written: no ending that a result's or a bag's have
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from odocal_ros.paper.cells import Cell, TABLE_1, TABLE_2
 from odocal_ros.paper.error_model import coefficients, PAPER_RADIUS, STATES
 
+# definition: the errors as Shi et al. 2015 has them
 DRIFT = np.deg2rad(0.01) / 3600    # rad/s, 0.01 deg/h
 LEVEL, HEADING = np.deg2rad(0.5 / 60), np.deg2rad(3.6 / 60)    # 0.5', 3.6'
 # sizes of the errors that table 2 multiplies with: rad, rad/s

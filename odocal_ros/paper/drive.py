@@ -35,7 +35,7 @@ from odocal_ros.sim.motion import attitude
 from odocal_ros.sim.scenarios import Drive, SimOptions, simulate
 from odocal_ros.sim.sensors import imu_rotation
 
-GYRO_NOISE = np.deg2rad(0.001) / 60     # rad/s/sqrt(Hz), 0.001 deg/sqrt(h)
+GYRO_NOISE = np.deg2rad(0.001) / 60     # definition: rad/s/sqrt(Hz), 0.001 deg/sqrt(h)
 # phi at the end of the standstill, ENU; drift in x right, y forward, z up: in units of the paper's
 SOURCES = {
     'none': ((0, 0, 0), (0, 0, 0)),

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
 
-C = 6399698.9018      # m, polar radius of curvature of Krassovsky's ellipsoid, eq. (1)-(5)
+# m, physical: polar radius of curvature of Krassovsky's ellipsoid, eq. (1)-(5)
+C = 6399698.9018
 
 
 def plane_error(latitude: Floats | float, longitude: Floats | float, central_meridian: float,

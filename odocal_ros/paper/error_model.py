@@ -46,8 +46,8 @@ from odocal_ros.nav.rotations import transpose
 from odocal_ros.paper.path import Path
 
 STATES = ('phi_E', 'phi_N', 'phi_U', 'dL', 'dlam', 'dh')
-E, N, U, LAT, LON, H = range(6)
-PAPER_RADIUS = 6378137.0    # m, R_e of Shi et al. 2015
+E, N, U, LAT, LON, H = range(6)    # definition: where the states stand
+PAPER_RADIUS = 6378137.0    # m, physical: R_e of Shi et al. 2015
 
 
 def coefficients(latitude: Floats | float, height: Floats | float,

@@ -23,9 +23,9 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.patent.planar import coefficients, PlanarLeg, squared_distances
 
-# sigmas of an axis at which a fix's pull stops growing: one in seven white fixes is beyond
+# statistical: sigmas at which a fix's pull stops growing; one in seven white fixes is beyond
 HUBER = 2.0
-LEAST_SIGMA = 1e-4       # m, what a stated sigma is taken for at least
+LEAST_SIGMA = 1e-4       # m, judgement: what a stated sigma is taken for at least
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,10 @@ from odocal_ros.patent.criteria import loss, weights
 from odocal_ros.patent.planar import coefficients, PlanarLeg
 from odocal_ros.patent.space import sets_of, Space
 
-SETTLED = 1e-11      # relative, rad: the last step
-HALVINGS = 40
-DIFFERENCE = np.array([-1.0, 1.0, 0.0])
-BENT = 1e-4          # of the way from the start: what gyro, slip and tyres bend any track by
+SETTLED = 1e-11      # judgement: relative, rad, the last step
+HALVINGS = 40    # judgement: of a step, at most
+DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right less left
+BENT = 1e-4          # judgement: of the way, what gyro, slip and tyres bend any track by
 
 
 @dataclass(frozen=True, eq=False)

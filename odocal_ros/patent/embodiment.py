@@ -31,13 +31,13 @@ from odocal_ros.patent.planar import PlanarLeg
 from odocal_ros.patent.space import sets_of, Space
 from odocal_ros.patent.surface import refine, Refined
 
-LEVELS = (7, 7, 9)
-RADIUS_STEP = 0.01      # m
-# left radius, right radius, m; heading, deg: as printed
+LEVELS = (7, 7, 9)    # definition: of the patent's embodiment
+RADIUS_STEP = 0.01      # m, definition: of the patent's embodiment
+# definition: left radius, right radius, m; heading, deg: as printed
 PRINTED = ((-0.03, -0.03, 1.0), (0.0, 0.0, 0.25), (0.02, 0.02, -1.0), (0.0, -0.03, 0.25),
            (0.03, -0.03, -1.0), (0.03, 0.0, 0.25), (-0.03, 0.03, -1.0))
 FOUND = (-0.01, 0.01, 0.25)     # printed as best, with 21.76 m at most and 13.24 m in the mean
-RADIUS = 0.3                    # m; the patent states none
+RADIUS = 0.3                    # m, judgement: the patent states none
 
 
 @dataclass(frozen=True)

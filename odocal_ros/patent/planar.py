@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.dead_reckoning import forward_b, Track
 
-CHUNK = 500_000          # distances held at once: 4 MB, which stays in the cache
+CHUNK = 500_000          # judgement: distances held at once: 4 MB, which stays in the cache
 
 
 @dataclass(frozen=True, eq=False)

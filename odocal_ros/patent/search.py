@@ -35,7 +35,7 @@ from odocal_ros.reasons import Code, Reason
 
 HEADING_MEANS = ('counter-clockwise turn of the track: error of the configured heading less the '
                  'yaw mounting angle, which positions cannot tell apart')
-MOST_ROWS = 100      # of an array kept in calibration.json
+MOST_ROWS = 100      # judgement: of an array kept in calibration.json
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.patent.planar import PlanarLeg
 
 NAMES = ('left', 'right', 'heading')
-# columns: mean, difference (right less left), heading; held: mean, heading
+# definition: columns mean, difference (right less left), heading; held: mean, heading
 FREE = np.array([[1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
 
 

@@ -27,7 +27,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
-LIMIT_SIGMAS = 2.0      # of a value, that lie on one side of its limit
+LIMIT_SIGMAS = 2.0      # statistical: of a value, on one side of its limit; once in 44
 DRIVE_MORE = {'scale_factor': Code.SCALE_SIGMA_TOO_LARGE, 'scale_ratio':
               Code.SCALE_SIGMA_TOO_LARGE, 'yaw_mounting_angle': Code.YAW_SIGMA_TOO_LARGE,
               'pitch_mounting_angle': Code.YAW_SIGMA_TOO_LARGE}

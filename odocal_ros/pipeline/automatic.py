@@ -31,10 +31,10 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.odometer_steps import Steps
 from odocal_ros.settings.config import Config
 
-SECOND = 10**9
-LEG_END_REST_NS = 10 * SECOND    # of the standstill that ends a leg: it tells place and biases
-PARKED_NS = 120 * SECOND         # a longer standstill ends a leg of any length
-STOOD_NS = 1 * SECOND            # of the first count of a drive-off the vehicle stood
+SECOND = 10**9    # definition: ns
+LEG_END_REST_NS = 10 * SECOND    # judgement: of the rest that ends a leg, for place and biases
+PARKED_NS = 120 * SECOND         # judgement: a longer standstill ends a leg of any length
+STOOD_NS = 1 * SECOND            # judgement: before the first count of a drive-off it stood
 
 
 @dataclass

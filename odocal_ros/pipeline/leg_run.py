@@ -29,7 +29,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import Inputs
 
-# of the time that methods take, and of the tracks after them
+# judgement: of the time that methods take, and of the tracks after them
 METHOD_EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
 TRACKS = 2
 

@@ -25,7 +25,7 @@ from odocal_ros.pipeline.method_run import Path, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 
-FEWEST_TRACK_FIXES = 3    # for a check of the track
+FEWEST_TRACK_FIXES = 3    # judgement: for a check of the track
 
 
 def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimate]) -> Floats:

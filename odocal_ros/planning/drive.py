@@ -19,8 +19,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadUsage
 from odocal_ros.nav.rotations import matrix_from_rpy
 
-REST_SPEED = 1e-6     # m/s
-DRIVE_STEP = 0.1      # s, of drives made here
+REST_SPEED = 1e-6     # m/s, judgement: below it a planned drive stands
+DRIVE_STEP = 0.1      # s, judgement: of drives made here
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.planning.drive import DRIVE_STEP, PlannedDrive, REST_SPEED
 
 BRAKING = 1.5    # m/s^2, judgement: as in a town
-QUARTER = np.pi / 2
-# a minute of town: still, up, cruise with a turn, down, still (docs/method.md section 3)
+QUARTER = np.pi / 2    # definition: rad
+# judgement: a minute of town: still, up, cruise with a turn, down, still
 TOWN_T = np.array([0.0, 5.0, 15.0, 40.0, 50.0, 60.0])
 TOWN_SPEED = np.array([0.0, 0.0, 12.0, 12.0, 0.0, 0.0])
 TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right

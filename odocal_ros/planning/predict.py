@@ -37,7 +37,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY
 
-SLIP = 0.01                 # m/sqrt(s), what the smoother believes at first
+SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive tells it
 
 
 @dataclass(frozen=True, kw_only=True)

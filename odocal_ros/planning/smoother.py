@@ -29,8 +29,8 @@ from odocal_ros.planning.samples import Ideal, ideal
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import grade_of
 
-WIDEST_SPACING = 5.0    # s
-SWAY_RATE = 10.0        # Hz of the white noise that sigmas.sway is said for
+WIDEST_SPACING = 5.0    # s, judgement: between keyframes of a planned drive
+SWAY_RATE = 10.0        # Hz, definition: of the white noise that sigmas.sway is said for
 
 
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,

@@ -21,7 +21,7 @@ from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
 
 CLOCK_APART = 0.5      # s between topics, judgement: no driver is as late
-OFFSET_REACH = 1.0     # s, what a time_offset setting holds
+OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
 CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')

@@ -30,7 +30,7 @@ from odocal_ros.reasons import Code, Reason
 if TYPE_CHECKING:
     from odocal_ros.screening.screen import Inputs
 
-BIN_S = 1.0                        # s, accelerations are compared as means over it
+BIN_S = 1.0                        # s, judgement: accelerations are compared as means over it
 FEWEST_BINS_FACING = 20                # bins, judgement: a sigma of a gain is known to a sixth
 WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters of the yaw
 

@@ -23,9 +23,9 @@ from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import ImuConfig
 
-# far beyond any sensor in any unit in use (deg/s, mm/s^2), so that wrong units stay to be named
+# judgement: far beyond any sensor in any unit in use (deg/s, mm/s^2): wrong units stay to be named
 BEYOND_SENSOR = {'w_i': 1e3, 'f_i': 1e5, 'value': 1e15, 'velocity_n': 1e5, 'q_ni': 10.0}
-# rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
+# judgement: rows beyond any sensor, each within CLUMP_REACH rows of the one before, are a clump
 CLUMP_ROWS = 5
 CLUMP_REACH = 50          # rows: a page or a packed block of a recording is about so many
 DAMAGED_SHARE = 0.01      # of the rows beyond any sensor: so many are a damaged recording, or

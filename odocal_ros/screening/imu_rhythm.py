@@ -25,14 +25,14 @@ from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import room
 from odocal_ros.data.pieces import chunks, PIECE_ROWS
 
-BLOCK_TIME = 1.0          # s of rows in whose mean a lost row shows
-WINDOW_BLOCKS = 20        # over which the rhythm is a mean: jitter over sqrt(2000) at 100 Hz
-JITTER_SHARE = 2e-3       # of an interval, the least that is worth it
-TESTED_ROWS = 20_000      # at the most, in as many
-TESTED_GROUPS = 40        # groups, whose sums tell how sure it is
-BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # a row amid those of its cubic
-APART = 1e-9              # s, that rows are apart at least
-SURE_SIGMAS = 4.0         # of that rows are evener on the rhythm: by chance once in 30,000
+BLOCK_TIME = 1.0          # s, judgement: of rows in whose mean a lost row shows
+WINDOW_BLOCKS = 20        # judgement: of a mean, which leaves jitter over sqrt(2000) at 100 Hz
+JITTER_SHARE = 2e-3       # judgement: of an interval, the least that is worth it
+TESTED_ROWS = 20_000      # judgement: at the most, in as many
+TESTED_GROUPS = 40        # judgement: groups, whose sums tell how sure it is
+BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
+APART = 1e-9              # s, judgement: that rows are apart at least
+SURE_SIGMAS = 4.0         # statistical: that rows are evener so, by chance once in 30,000
 
 
 def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:

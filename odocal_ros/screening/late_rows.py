@@ -25,12 +25,13 @@ from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
 
-ON_TIME_WINDOW = 5.0      # s, within which some row comes on time
-EVEN_BESIDE = 5           # rows to either side that tell where a row should be
+ON_TIME_WINDOW = 5.0      # s, judgement: within which some row comes on time
+EVEN_BESIDE = 5           # judgement: rows to either side that tell where a row should be
 LINE = (-EVEN_BESIDE, EVEN_BESIDE)
-CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])     # a line takes half the acceleration for lateness
-LEAST_JITTER = 1e-4       # s off the rhythm that is worth it
-ROUNDING_COUNTS = 2.5     # by which a row may be off: rounding
+# definition: a line takes half the acceleration for lateness
+CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])
+LEAST_JITTER = 1e-4       # s, judgement: off the rhythm that is worth it
+ROUNDING_COUNTS = 2.5     # judgement: that rounding may put a row off by
 
 
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],

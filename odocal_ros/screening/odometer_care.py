@@ -27,7 +27,7 @@ from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import speed_glitches
 
-STEPS_BESIDE = 5    # steps beside a jump or a gap that tell the speed there
+STEPS_BESIDE = 5    # judgement: steps beside a jump or a gap that tell the speed there
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],

@@ -27,9 +27,9 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.grades import G
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
-REVERSING_STEP = 0.1          # s, grid
-PUSH_TIME = 0.6            # s each side that accelerations are taken over
-STOP_BEFORE = 1.0             # s of the stop that belong to it
+REVERSING_STEP = 0.1          # s, judgement: grid
+PUSH_TIME = 0.6            # s, judgement: each side, that accelerations are taken over
+STOP_BEFORE = 1.0             # s, judgement: of the stop that belong to it
 BY_IMU = 'the Imu is pushed the other way than at the other starts'
 BY_FIT = 'Imu and fixes go back'
 

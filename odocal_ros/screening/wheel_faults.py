@@ -24,9 +24,9 @@ from odocal_ros.screening.glitches import ROLLS
 from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, runs, TUKEY
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
-FAULT_GRID = 0.5          # s
-STILL_SHARE = 0.02        # of the other wheel's way: what still counts as not moving
-OTHER_WHEEL_COUNTS = 8    # the other wheel makes meanwhile, at least
+FAULT_GRID = 0.5          # s, judgement
+STILL_SHARE = 0.02        # judgement: of the other wheel's way: what still counts as not moving
+OTHER_WHEEL_COUNTS = 8    # judgement: the other wheel makes meanwhile, at least
 SIDES = ('left', 'right')
 
 

@@ -34,7 +34,7 @@ NOT_OURS = re.compile(r'(result|qos_overrides)\.|(use_sim_time|start_type_descri
 TRUE = {'y', 'Y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 FALSE = {'n', 'N', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 WHOLE = re.compile(r'[-+]?(?:(0[xX][0-9a-fA-F]+)|(0[0-7]*)|[1-9][0-9]*)')
-LONGEST = 100        # characters of a number
+LONGEST = 100        # judgement: characters of a number
 Node = Any           # of PyYAML
 DOTTED = re.compile(r'([-+]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 

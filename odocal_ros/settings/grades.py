@@ -16,7 +16,7 @@ import math
 
 from odocal_ros.settings.config import ImuConfig
 
-G = 9.80665          # m/s^2
+G = 9.80665          # m/s^2, definition: standard gravity (CGPM 1901), of data sheets
 
 
 @dataclass(frozen=True)

@@ -13,25 +13,29 @@ What several rooms ask alike: how many sigmas make a word, and what land vehicle
 A level is one of two sides of the normal law; beside each, how often chance alone reaches it.
 
 Beside a number stands where it is from: physical, with its source; statistical, with how often
-chance does so; tuned, with the benchmark that shows it; or judgement, where nothing was measured.
+chance does so; tuned, with the benchmark that shows it; judgement, where nothing was measured;
+format, of a specification; or definition: a unit, a layout, a quadrature, what a source has set.
 """
 
 import math
 
-REMARK_SIGMAS = 3.0     # to say that something is there: once in 370
-FAULT_SIGMAS = 5.0      # to call a sensor or a setting wrong: once in 1.7 million
-OUTLIER_SIGMAS = 5.0    # robust sigmas from which one value of many is not of them: the same
-FASTEST = 100.0         # m/s that no land vehicle drives: a counter reset, or another unit
+REMARK_SIGMAS = 3.0     # statistical: to say that something is there: once in 370
+FAULT_SIGMAS = 5.0      # statistical: to call a sensor or a setting wrong: once in 1.7 million
+# statistical: robust sigmas from which one value of many is not of them: the same
+OUTLIER_SIGMAS = 5.0
+FASTEST = 100.0         # m/s, physical: no land vehicle is so fast: a counter reset, another unit
 # physical: wear changes a tyre's radius by 2 %, pressure and load by 1 %, another make by 3 %
 TYRE_SPREAD = 0.05      # relative, by which scales of one vehicle's wheels, or drives, may differ
-# of the sigma believed beforehand: a posterior one below it says that the data told the value;
+# judgement: of a prior sigma; a posterior one below it says that the data determined the value,
 # at half the data weigh three times the prior
 INFORMED_SHARE = 0.5
 # statistical: sigmas by a median, which half of the values may spoil
 NORMAL_MEDIAN = 0.6745      # of |x|, x normal with sigma 1
 RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
-SWAY = 0.05             # m/s to the side and up, of a body on its springs, that no wheel feels
+# m/s, judgement: to the side and up, of a body on its springs, that no wheel feels
+SWAY = 0.05
 # judgement: stamps further back, so many in turn, are those of a time that began anew
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
+# definition: units
 DAY_NS = 86_400 * 10**9
 RAD_PER_DEG = math.pi / 180

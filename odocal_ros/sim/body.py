@@ -21,6 +21,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.motion import inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Profile
 
+# physical: a car's body on its springs goes at some 1.3 Hz, damped by shock absorbers
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
 

@@ -18,8 +18,9 @@ from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.sim.noise import stream
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
-WALK = 1e-4              # of the scale, relative, per square root of a day
-# shares of the vehicles whose tyres are changed, Imu moved, counter broken; at least one of three
+WALK = 1e-4              # judgement: of the scale, relative, per square root of a day
+# judgement: shares of the vehicles whose tyres are changed, Imu moved, counter broken; at least
+# one of three
 FATES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
 
@@ -34,6 +35,7 @@ class Model:
     pitch: float
 
 
+# judgement: some fleet's models
 MODELS = (Model('shuttle', 0.0210, 0.0213, math.radians(1.0), math.radians(0.4)),
           Model('van', 0.0245, 0.0243, math.radians(-0.5), math.radians(0.8)),
           Model('truck', 0.0310, 0.0312, math.radians(0.2), math.radians(-0.6)))

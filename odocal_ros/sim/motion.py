@@ -32,8 +32,8 @@ from odocal_ros.nav.earth import (
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.profile import Profile
 
-STEADY = Profile([0.0, 1.0], [[0.0]])     # no sway
-GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # on -1 to 1
+STEADY = Profile([0.0, 1.0], [[0.0]])     # definition: no sway
+GAUSS = tuple(zip(*np.polynomial.legendre.leggauss(4), strict=True))     # definition: on -1 to 1
 
 
 @dataclass(frozen=True)

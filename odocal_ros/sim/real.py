@@ -22,7 +22,7 @@ from odocal_ros.settings.grades import GRADES
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, ...]      # nine, row by row
-NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9
+NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
 WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',

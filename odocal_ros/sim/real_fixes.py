@@ -17,16 +17,16 @@ from odocal_ros.sim.motion import Motion, point
 from odocal_ros.sim.noise import gauss_markov, stream
 from odocal_ros.sim.options import SimOptions
 
-# ages, in time constants, and weights of a first-order filter: Gauss and Legendre on pieces, so
-# fine that the kinks of a route do no harm
+# definition: ages, in time constants, and weights of a first-order filter: Gauss and Legendre on
+# pieces, so fine that the kinks of a route do no harm
 EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
                         np.arange(20.0, 41.0, 4.0)])
 NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
 WEIGHTS = np.exp(-NODES) * np.repeat(np.diff(EDGES) / 2, 2)
 WEIGHTS /= WEIGHTS.sum()
-UP = 2.0             # errors of the height over those of east and north
-SPREAD = 0.9         # of the logarithm of a burst's size and length
-ONSET = (1.0, 3.0)   # s in which a burst comes and goes
+UP = 2.0             # judgement: errors of the height over those of east and north
+SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
+ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:

@@ -16,8 +16,9 @@ from odocal_ros.sim.noise import gauss_markov, stream
 from odocal_ros.sim.options import SimOptions
 from odocal_ros.sim.real import Real
 
-RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))   # Hz, width, share: wheel hop, engine
-APART_NS = 50_000    # between the stamps of one batch
+# physical: Hz, width, share: wheel hop, engine
+RESONANCES = ((12.0, 3.0, 1.0), (27.0, 4.0, 0.6))
+APART_NS = 50_000    # judgement: between the stamps of one batch
 
 
 def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:

@@ -16,8 +16,8 @@ from odocal_ros.sim.motion import State
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import G
 
-REST = 0.01          # rolling resistance over load
-AIR = 1e-5           # air drag over load, per (m/s)^2
+REST = 0.01          # physical: rolling resistance over load, of tyres on asphalt
+AIR = 1e-5           # judgement: air drag over load, per (m/s)^2
 
 
 def growth(state: State, real: Real) -> Floats | float:

@@ -38,10 +38,10 @@ from odocal_ros.sim.real import NONE3
 # s from the first Imu sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
 TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
-FIRST_COUNT = 10_000     # an encoder that was on before the recording
-WHITE_SHARE = 0.2        # of the correlated sigma: receiver noise on top
-SIGMA_FLOOR = 0.001      # m; no receiver reports zero
-AT_REST = 1e-9           # m/s
+FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
+WHITE_SHARE = 0.2        # judgement: of the correlated sigma: receiver noise on top
+SIGMA_FLOOR = 0.001      # m, judgement: no receiver reports zero
+AT_REST = 1e-9           # m/s, judgement
 
 
 def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floats]:

@@ -20,7 +20,7 @@ from odocal_ros.data.arrays import Floats
 Pair = tuple[float, float]
 Drawn = tuple[dict[str, Any], dict[str, Any]]    # of an effect: SimOptions, figures of Real
 GRADES = ('consumer', 'industrial', 'tactical')
-# units of data sheets in SI; G: as they round it, far within any distribution here
+# definition: units of data sheets in SI; G: as they round it, far within any distribution here
 G, MG, DEG, DEG_H, KMH = 9.81, 9.81e-3, math.radians(1.0), math.radians(1.0) / 3600, 1 / 3.6
 
 # one number for each class: a sigma (normal), a share or a size

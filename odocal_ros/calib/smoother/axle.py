@@ -25,7 +25,7 @@ from odocal_ros.data.arrays import Floats
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-RATE_WINDOW = 0.1    # s about a keyframe, in which vibration averages down
+RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
 
 
 def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:

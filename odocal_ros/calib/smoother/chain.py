@@ -33,8 +33,8 @@ from odocal_ros.data.mapped import let_go, room
 from odocal_ros.errors import OdocalError
 
 Floats = NDArray[np.float64]
-LET_GO_AFTER = 512          # intervals worked on until what lies in a file is let go
-SHORT_LEG = 1200            # intervals of a leg so short that what is made of them may be kept
+LET_GO_AFTER = 512          # judgement: intervals until what lies in a file is let go
+SHORT_LEG = 1200            # judgement: intervals of a leg of which all that is made is kept
 
 
 class NotPositive(OdocalError):

@@ -39,7 +39,8 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.settings.config import Config
 
-LONG_LEG = 660.0        # s, from which keyframes lie twice SPACING apart: docs/decisions/0005
+# s, judgement: from which keyframes lie twice SPACING apart; its cost: docs/decisions/0005
+LONG_LEG = 660.0
 # judgement: keyframes of a fit from nothing, which takes ten times the passes
 FEW_KEYS = 150
 LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few

@@ -33,7 +33,7 @@ from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, KINDS, LN_K, P
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.settings.grades import Grade
 
-SAME_SIGMAS = 1e-3      # relative change of prior sigmas that is none
+SAME_SIGMAS = 1e-3      # judgement: relative change of prior sigmas that is none
 
 
 def mixture_prior(data: Floats, pull: Floats, odds: float = 0.5) -> tuple[Floats, float]:

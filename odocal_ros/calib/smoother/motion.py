@@ -56,7 +56,7 @@ from odocal_ros.nav.rotations import exp_so3, skew, transpose
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
-D = slice(E, E + 3)     # rows of the odometer, after those of the other unknowns
+D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
 # of Motion, what each interval has
 EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'pushed',

@@ -33,6 +33,7 @@ IMU = ('gyro', 'accel', 'gyro_walk', 'accel_walk')
 ROAD = {'along': 0, 'along_hard': 0, 'side': 1, 'side_turn': 1, 'up': 2}
 INTERVAL = (*IMU, *ROAD)
 SLOW_LEVELS = ('slow', 'slow_up')
+# definition: Gauss and Legendre's nodes and weights on 0 to 1
 GAUSS_X, GAUSS_W = (np.polynomial.legendre.leggauss(3)[0] + 1) / 2, \
     np.polynomial.legendre.leggauss(3)[1] / 2
 # rad/s: above it, a vehicle may slide sideways. Judgement: 0.5 m/s^2 at 10 m/s

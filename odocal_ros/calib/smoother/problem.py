@@ -54,7 +54,8 @@ from odocal_ros.settings.grades import G, Grade, grade_as_seen
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
 # forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
 # order leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix.
-# SAME_DERIVATIVES, to keep those, which cost most: an interval's are the same to half a per cent
+# SAME_DERIVATIVES, to keep those, which cost most: an interval's are the same to half a per cent.
+# Judgement
 SAME_SUMS = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
 SAME_DERIVATIVES = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a

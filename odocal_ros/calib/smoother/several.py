@@ -33,7 +33,7 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
-DAY = 86400e9        # ns, by definition
+DAY = 86400e9        # ns, definition
 
 
 def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,

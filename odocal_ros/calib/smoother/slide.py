@@ -39,7 +39,7 @@ TURN_SLIDE = 2e-4
 HEAVE = 2e-3
 # m/sqrt(s), an ordinary road: physical, a body's sway, white at 10 Hz
 ORDINARY_ROAD = SWAY / np.sqrt(10.0)
-# rad turned in all: less than one crossroads tests nothing, two do (docs/decisions/0005)
+# rad turned in all: less than one crossroads tests nothing, two do. Judgement
 NO_TURN = np.pi / 2
 SIDEWAYS = ('side', 'side_turn', 'up')
 

@@ -34,7 +34,7 @@ from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
 from odocal_ros.nav.rotations import skew
 
-# s each side, over which a speed is taken: some rows of an odometer (judgement)
+# s each side, over which a speed is taken: some rows of an odometer. Judgement
 SPEED_WINDOW = 0.4
 
 

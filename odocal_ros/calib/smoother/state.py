@@ -83,7 +83,7 @@ FIX_LAG2 = CONSTANTS.index('fix_lag_square')
 # Pull and braking are two: a wheel that does not drive brakes only
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
-FAST_SPEED = 20.0           # m/s at which the slope is said: by definition, of a road out of town
+FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a road out of town
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: a body answers late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')

@@ -23,8 +23,8 @@ from odocal_ros.calib.marks import FEWEST_SCATTERED
 from odocal_ros.calib.wheels.model import Bins
 from odocal_ros.data.arrays import Floats
 
-# grids of sizes, 0 for none: slow errors of the fixes, of their stated variance; slip of a wheel,
-# m/sqrt(s)
+# judgement: grids of sizes, 0 for none: slow errors of the fixes, of their stated variance; slip
+# of a wheel, m/sqrt(s)
 SLOW_VARIANCES = np.append(0.0, np.geomspace(0.003, 300.0, 34))
 SLIP_NOISES = np.append(0.0, np.geomspace(1e-5, 0.1, 41))
 # prior probability of no slow error, and of no slip. Tuned: with 0.9 sigmas are smaller than

@@ -44,7 +44,8 @@ from odocal_ros.screening.wheel_pair import Pair, pair, runs
 from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 Event = tuple[float, float, float]      # begin, end, s, and size, m
-# steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s, those between are seen too
+# steps between the ends of windows: slips of up to 1, 3, 8, 20, 50 s, those between are seen too.
+# Judgement
 SLIP_SPANS = (10, 30, 80, 200, 500)
 # 1 sigma of what two wheels on real ground part by without a slip. Physical, judgement: m in any
 # window (stones, tyres); of the track width times the turn (scrub, camber, the gyro's scale)

@@ -32,7 +32,8 @@ from odocal_ros.screening.wheel_faults import SIDES
 from odocal_ros.settings.config import Config
 
 Found = tuple[tuple[float, float], float, float, int]      # as unseen_slip returns it
-SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)    # s, of the slips looked for; those between are seen too
+# s, judgement: of the slips looked for; those between are seen too
+SLIP_LENGTHS = (0.0, 8.0, 20.0, 45.0)
 # statistical: sigmas from which a slip is seen, of 1000 places looked at: once in 25 000 legs
 UNSEEN_SIGMAS = 5.5
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 
-SLIP_GRID = 0.1     # s between the rows in which slips, of a second at least, are looked for
+# s, judgement: between the rows in which slips, of a second at least, are looked for
+SLIP_GRID = 0.1
 
 
 def _none(kind: type = float) -> NDArray[Any]:
