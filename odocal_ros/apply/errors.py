@@ -25,7 +25,7 @@ from odocal_ros.settings.grades import Grade
 # definition: where the unknowns stand in the error state
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 K, M, G, N = 12, slice(13, 15), 15, 16    # m: about the y and z axis of b
-BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # what it tells, of a body that is nearly level: no heading
+BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable by it, of a body nearly level: no heading
 BY_REST = np.r_[3:9]
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
@@ -112,11 +112,11 @@ class Errors:
         H[:, BG] = np.eye(3)
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
-    def _correction(self, H: Floats, z: Floats, R: Floats, told: list[int] | Ints) -> Floats:
+    def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:
         cov = self.cov
         S = H @ cov @ H.T + R
         gain = np.zeros((N, len(z)))
-        gain[told] = np.linalg.solve(S, H @ cov)[:, told].T
+        gain[observed] = np.linalg.solve(S, H @ cov)[:, observed].T
         keep = np.eye(N) - gain @ H
         self.cov = keep @ cov @ keep.T + gain @ R @ gain.T
         by: Floats = gain @ z

@@ -72,28 +72,28 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
         They hold no scale factor.
 
     """
-    def told(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
+    def estimate_of(name: str, otherwise: float, sigma: float = 0.0) -> tuple[float, float]:
         e = estimates.get(name)
         if e is None or e.value is None:
             return otherwise, sigma
         return e.value, sigma if e.sigma is None else e.sigma
 
-    scale, sigma = told('scale_factor', math.nan)
-    left, right = (told(name, math.nan)[0] for name in SIDES)
+    scale, sigma = estimate_of('scale_factor', math.nan)
+    left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):
         raise BadConfig('the calibration holds no result.scale_factor: give the calibration.yaml '
                         'that odocal replay or the calibrator wrote, --params-file FILE')
     nominal = config.imu.nominal_yaw
-    yaw = told('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
-    pitch = told('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
+    yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
+    pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
     guessed = tuple(f'{name} is not in the calibration: taken as {value:.4g} +- {sigma:.2g} rad'
                     for name, (value, sigma) in (('yaw_mounting_angle', yaw),
                                                  ('pitch_mounting_angle', pitch))
                     if name not in estimates or estimates[name].value is None)
-    bias = np.array([told(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
+    bias = np.array([estimate_of(f'gyro_bias_{axis}', math.nan)[0] for axis in 'xyz'])
     return Vehicle(
         scale, sigma / scale, None if math.isnan(left + right) else (left, right),
         yaw[0], pitch[0], yaw[1], pitch[1],
-        np.array([told(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
+        np.array([estimate_of(f'odometer_lever_arm_{axis}', given)[0] for axis, given in zip(
             'xyz', config.odometer.lever_arm, strict=True)]),
         None if np.isnan(bias).any() else bias, guessed)

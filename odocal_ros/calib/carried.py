@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What earlier legs tell of a vehicle, without the legs: for days to come, and over a restart."""
+"""Prior of a vehicle from its earlier legs, without the legs: for days to come, over a restart."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -53,12 +53,13 @@ def combine_method(name: str, results: Sequence[MethodResult],
     estimates: dict[str, Estimate] = {}
     sources: dict[str, list[tuple[int, Floats]]] = {}
     for i, parameter in enumerate(parameters):
-        told = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
+        determined = [k for k, r in enumerate(results) if r.estimates[parameter].value is not None]
         unit = results[0].estimates[parameter].unit
-        if not told:
+        if not determined:
             estimates[parameter] = Estimate(None, None, unit)
             continue
-        value, own, shared, why = _combine(parameter, i, [results[k] for k in told], walked[told])
+        value, own, shared, why = _combine(parameter, i, [results[k] for k in determined],
+                                           walked[determined])
         reasons += why
         relative = value if parameter.startswith('scale_factor') else 1.0
         sigma = abs(relative) * float(np.sqrt(own + sum(v @ v for v in shared.values())))

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a person looks at to believe a leg: tracks, residuals, speed, scale by section, fixes."""
+"""What a person looks at to trust a leg: tracks, residuals, speed, scale by section, fixes."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -21,7 +21,7 @@ from odocal_ros.reasons import Code, Reason
 TRACE = 'trace'      # of the details: what a developer needs
 
 
-def told_if_wild() -> np.errstate:
+def raised_if_wild() -> np.errstate:
     """Return a context in which what runs away raises FloatingPointError, in place of warnings."""
     return np.errstate(over='raise', divide='raise', invalid='raise')
 

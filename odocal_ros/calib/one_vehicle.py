@@ -28,7 +28,7 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
     """
     found = []
     estimates = [(n, leg_estimates(leg)) for n, leg in numbered]
-    scales = [scale for scale in _told('scale_factor', estimates) if scale.value]
+    scales = [scale for scale in _values('scale_factor', estimates) if scale.value]
     units = dict.fromkeys(scale.unit for scale in scales)
     if len(units) > 1:
         which = '; '.join(f'{unit} in leg {_numbers(s.leg for s in scales if s.unit == unit)}'
@@ -40,7 +40,7 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         low, high = far
         found.append(f'the scale of leg {high.leg} is {100 * more:.1f} % above '
                      f'that of leg {low.leg}')
-    yaws = _told('yaw_mounting_angle', estimates)
+    yaws = _values('yaw_mounting_angle', estimates)
     # of an Imu that faces backwards they lie about +-180 deg
     far = _farthest([yaw._replace(value=float(wrap(yaw.value - yaws[0].value))) for yaw in yaws])
     # rad, 5 deg: no mounting gives way so far
@@ -52,8 +52,8 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
                    'mounting changes between drives'),) if found else ()
 
 
-class _Told(NamedTuple):
-    """What a leg tells of one value."""
+class _LegValue(NamedTuple):
+    """The estimate of one value by one leg."""
 
     leg: int
     value: float
@@ -61,17 +61,17 @@ class _Told(NamedTuple):
     unit: str
 
 
-def _told(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_Told]:
+def _values(name: str, estimates: Sequence[tuple[int, dict[str, Estimate]]]) -> list[_LegValue]:
     every = ((n, of_leg.get(name)) for n, of_leg in estimates)
-    return [_Told(n, e.value, e.sigma, e.unit) for n, e in every
+    return [_LegValue(n, e.value, e.sigma, e.unit) for n, e in every
             if e is not None and e.value is not None and e.sigma is not None]
 
 
-def _farthest(told: list[_Told]) -> tuple[_Told, _Told] | None:
+def _farthest(values: list[_LegValue]) -> tuple[_LegValue, _LegValue] | None:
     """Return the lowest and the highest where they surely differ."""
-    if len(told) < 2:
+    if len(values) < 2:
         return None
-    order = sorted(told, key=lambda one: one.value)
+    order = sorted(values, key=lambda one: one.value)
     low, high = order[0], order[-1]
     noise = (high.sigma**2 + low.sigma**2)**0.5
     return (low, high) if high.value - low.value > FAULT_SIGMAS * noise else None

@@ -36,7 +36,7 @@ class Quantity:
         """Return the largest sigma that is good enough, a share of the value or rad."""
         if self.estimates[0] == 'track_width':
             # no verdict.* asks for it: what the method states it by
-            return TRACK_WIDTH.told_share
+            return TRACK_WIDTH.determined_share
         return config.verdict.max_scale_sigma if self.relative else config.verdict.max_yaw_sigma
 
 

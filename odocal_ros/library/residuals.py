@@ -56,7 +56,7 @@ def residuals(result: Calibration) -> Series:
     Return what is left over of each sensor, a row for each component of each.
 
     sensor, component, value, sigma, unit : the calibrated drive less what the sensor says, and one
-    standard deviation of the noise it is believed to have.   distance_m : driven until then.
+    standard deviation of the noise it is modelled with.   distance_m : driven until then.
 
     ``track`` along, left: dead reckoning from the start mark less each fix, as calibrated;
     ``track_before`` as configured. By the smoother, where it could fit: ``fix`` east, north, up;
@@ -78,7 +78,7 @@ def residuals(result: Calibration) -> Series:
 
 def _rows(leg: LegResult, left: Left) -> Series:
     m, c = left.value.shape
-    told = np.isfinite(left.sigma).ravel()
+    known = np.isfinite(left.sigma).ravel()
     t, e = np.repeat(left.t, c), leg.evidence
     far = np.full(m * c, np.nan) if e is None else np.interp(t, e.t, e.distance)
     columns = {'t': t, 'sensor': np.full(m * c, left.sensor),
@@ -86,4 +86,4 @@ def _rows(leg: LegResult, left: Left) -> Series:
                'value': left.value.ravel().astype(float),
                'sigma': left.sigma.ravel().astype(float),
                'unit': np.full(m * c, left.unit), 'distance_m': far}
-    return {name: column[told] for name, column in columns.items()}
+    return {name: column[known] for name, column in columns.items()}

@@ -32,18 +32,18 @@ GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """Speeds known: at t s, ``value`` + side * offset, scale units per s, 1 sigma."""
+class SpeedInstants:
+    """Speeds at instants t, s:, ``value`` + side * offset, scale units per s, 1 sigma."""
 
     t: Floats        # (m,)
     value: Floats    # (m,)
     side: Floats     # (m,) 1 forwards, -1 backwards
     sigma: Floats    # (m,)
 
-    def between(self, begin: float, end: float) -> 'Told':
+    def between(self, begin: float, end: float) -> 'SpeedInstants':
         """Return those of a time, s."""
         pick = (self.t >= begin) & (self.t <= end)
-        return Told(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
+        return SpeedInstants(self.t[pick], self.value[pick], self.side[pick], self.sigma[pick])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,9 @@ class CoarseSpeed:
         return np.diff(total)
 
     @cached_property
-    def told(self) -> Told:
+    def instants(self) -> SpeedInstants:
         """
-        Return what the rows tell of the speed, but for the offset that all values share.
+        Return the speeds that the rows determine, but for the offset that all values share.
 
         The offset is half a cell where the sender truncates, none where it rounds. A change by one
         cell: the speed of its middle is the mean of both values, uniform by what the speed changes
@@ -115,7 +115,7 @@ class CoarseSpeed:
         least_crossing = 0.02    # of a cell, sigma of a crossing: what speeds do beside
         sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), least_crossing * q)
         order = np.argsort(when, kind='stable')
-        return Told(when[order], value[order], np.sign(value[order]), sigma[order])
+        return SpeedInstants(when[order], value[order], np.sign(value[order]), sigma[order])
 
 
 def _rates(t: Floats, edge: Floats, q: float) -> Floats:

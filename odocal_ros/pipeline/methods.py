@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
-from odocal_ros.calib.failed import failed, told_if_wild
+from odocal_ros.calib.failed import failed, raised_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import unsolved
 from odocal_ros.calib.wheels.wheel_slips import WheelSlips, with_unseen
@@ -111,7 +111,7 @@ def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) ->
     inputs = prepared.inputs
     try:
         # what runs away is told by the number that is none, not by warnings and what follows
-        with told_if_wild():
+        with raised_if_wild():
             return work()
     except (OdocalError, MemoryError):
         raise

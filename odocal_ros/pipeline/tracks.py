@@ -35,8 +35,8 @@ def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimat
     f : as found; of its angles those are kept that ``estimates`` do not hold.
     """
     found = mounting_from_forward(f)
-    told = {name for name, e in estimates.items() if e.value is not None}
-    angles = [0.0 if name in told else angle for name, angle in zip(
+    determined = {name for name, e in estimates.items() if e.value is not None}
+    angles = [0.0 if name in determined else angle for name, angle in zip(
         ('yaw_mounting_angle', 'pitch_mounting_angle'), found, strict=True)]
     return (ready.nominal or ready.rough) * forward_b(*angles)
 

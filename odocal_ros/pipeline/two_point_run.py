@@ -147,7 +147,7 @@ class TwoPointRun:
         residual[:, 2] = up[:, 2]              # the pitch is no noise of heights
         covariance = self.inputs.covariance_n[between]
         factor = self._noise_factor(residual, covariance, drift, chord)
-        if np.isnan(self.config.gnss.correlation_time):     # else told, not judged
+        if np.isnan(self.config.gnss.correlation_time):     # else set, not judged
             start, end = marks_no_better(
                 (chord.start, chord.end), ready.spans, fixes[0], self.track.at(fixes[0]) @ f,
                 chord.M @ f, residual / factor[0], covariance, drift_n / factor[0])

@@ -85,7 +85,7 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
 
     Imu by its grade; wheels that slip by ``sigmas.slip``, slide and bounce by ``sigmas.sway``;
     fixes of the stated sigma, white, or white to WHITE_SHARE of it beside a part that stays alike
-    for the correlation time. Never less than the smoother believes in.
+    for the correlation time. Never less than the smoother's own bounds.
     """
     grade = grade_of(sigmas.config.imu)
     road = dict.fromkeys(SLIPPING, sigmas.sway**2 / SWAY_RATE)

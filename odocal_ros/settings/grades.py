@@ -92,10 +92,10 @@ def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
     variance : dict, white noise of 'gyro' and 'accel' at rest, per s; empty: not known.
     """
     grades = [grade_of(dataclasses.replace(imu, grade=name)) for name in GRADES]
-    told = list(GRADES).index(imu.grade)
+    stated = list(GRADES).index(imu.grade)
     if not variance:
-        return grades[told]
-    return min(reversed(grades[:told + 1]), key=lambda grade: sum(
+        return grades[stated]
+    return min(reversed(grades[:stated + 1]), key=lambda grade: sum(
         abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
         for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))))
 

@@ -74,7 +74,7 @@ def test_only_speeds_have_a_grid_and_reversed_ones_too():
 @pytest.mark.parametrize(('how', 'offset'), [('floor', KMH / 2), ('round', 0.0)])
 def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
     every = slice(None, None, 10 // rate)
-    told = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).told
+    told = CoarseSpeed(KMH, *sent(KMH, how, T[every], SPEED[every])).instants
     z = (told.value + offset - np.interp(told.t, T, SPEED)) / told.sigma
     # uniform: sqrt(3) sigma at most, but for what the change in a step is known by
     assert np.abs(z).max() < 2.6
@@ -86,13 +86,13 @@ def test_what_steps_tell_is_the_speed_within_the_sigma(how, offset, rate):
 
 def test_backwards_the_offset_is_backwards():
     t, v = sent(KMH, 'floor')
-    np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).told.side, -1.0)
+    np.testing.assert_array_equal(CoarseSpeed(KMH, t, -v).instants.side, -1.0)
 
 
 def test_zero_and_the_cell_beside_it_tell_nothing():
     # a dead band of a cell: from 0 to 2 at once
     t, v = sent(KMH, 'floor', speed=SPEED / 8)
-    told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).told
+    told = CoarseSpeed(KMH, t, np.where(v < 1.5 * KMH, 0.0, v)).instants
     assert np.abs(told.value).min() > 1.9 * KMH
 
 
@@ -115,7 +115,7 @@ def test_what_is_told_is_true_on_the_mean_where_cruises_begin_and_end(rate):
     corners[1::4], corners[3::4] = corners[0::4] + cruise / 0.7, corners[2::4] + cruise / 0.9
     t = np.arange(corners[0], corners[-1], 1 / rate)
     speed = np.interp(t, corners, v)
-    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).told
+    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
     error = told.value + KMH / 2 - np.interp(told.t, corners, v)
     assert len(told.t) > 800
     assert abs((error / told.sigma).mean()) < 3.3 / np.sqrt(len(told.t))

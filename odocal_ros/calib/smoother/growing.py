@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from odocal_ros.calib.budget import PARAMETERS
-from odocal_ros.calib.failed import told_if_wild
+from odocal_ros.calib.failed import raised_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
@@ -92,7 +92,7 @@ class GrowingFit:
         self.once_s = 0.0
         last, self._last = self._last, None
         try:
-            with told_if_wild():
+            with raised_if_wild():
                 best, problem = self._fit(last, view, config, trace)
                 if not best.settled:
                     raise BadData('the smoother has not settled on the way so far')

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a fit leaves over of each sensor, and how well it knows the biases, along the leg."""
+"""Residuals of each sensor after the fit, and the sigmas of the biases, along the leg."""
 
 from typing import Any
 
@@ -96,5 +96,5 @@ def _of_fixes(fit: Fit) -> tuple[Floats, Floats]:
     each = np.sqrt(fixes.weight / fixes.per_effective) / factor
     value = -(covariance_root @ (fixes.r / each)[:, :, None])[:, :, 0]
     sigma = np.sqrt(covariance_root**2 @ factor**2)
-    told = fixes.known()
-    return np.where(told, value, np.nan), np.where(told, sigma, np.nan)
+    known = fixes.known()
+    return np.where(known, value, np.nan), np.where(known, sigma, np.nan)

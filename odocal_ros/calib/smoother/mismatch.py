@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Where the model does not hold: what is said of it, and by how much the sigmas are widened."""
+"""Model validation: where residuals contradict the noise model, and the factor on all sigmas."""
 
 import numpy as np
 
@@ -34,12 +34,12 @@ OF_FORCE = ('Mount the Imu firmly, or set imu.grade, or imu.accel_noise and the 
 def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
-    told, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
+    stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     level = fit.levels.roots()
     shaken = max(level[name] / own[name] for name in ('gyro', 'accel'))
-    worse = [f'{what} {level[name] / told[name]:.1f} times' for name, what in (
+    worse = [f'{what} {level[name] / stated[name]:.1f} times' for name, what in (
         ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
-        if level[name] > WORSE_THAN_GRADE * told[name]]
+        if level[name] > WORSE_THAN_GRADE * stated[name]]
     worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, what in (
         (fit.state.gyro_bias, problem.priors.gyro_bias, 'gyro bias'),
         (fit.state.accel_bias, problem.priors.accel_bias, 'accelerometer bias'))

@@ -163,7 +163,7 @@ def interval_noise(motion: Motion, leg: SmootherLeg, rest: Bools,
 
 def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Floats:
     """
-    Return noises of a way that is told by speeds in steps: (K, 18, g).
+    Return noises of a way that is measured by speeds in steps: (K, 18, g).
 
     Fine steps round. Along the way itself coarse ones say nothing: what they tell is in
     speed_steps.py. In a turn an error that goes from one end of its cell to the other amid the

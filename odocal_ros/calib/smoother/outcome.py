@@ -83,7 +83,7 @@ def not_settled(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) ->
 
 
 def no_imu(fit: Fit) -> list[Reason]:
-    """Return why a fit is not to be believed whose Imu no maker would sell, empty else."""
+    """Return why a fit is implausible whose Imu no maker would sell, empty else."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
     if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off

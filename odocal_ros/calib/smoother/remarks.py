@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a fit shows of the vehicle beside its values: what varies, what is off, what that costs."""
+"""Diagnostics of a fit: a scale that varies, constants far off their priors, the model's floor."""
 
 from typing import Any
 
@@ -96,8 +96,8 @@ def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: fl
     """
     if not misalignment:
         return sigma
-    told = min(1.0, found_sigma**2 / (2 * misalignment**2))
-    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + told) / 2 + (found / 2)**2)
+    posterior_share = min(1.0, found_sigma**2 / (2 * misalignment**2))
+    out: float = np.sqrt(sigma**2 + misalignment**2 * (1 + posterior_share) / 2 + (found / 2)**2)
     return out
 
 

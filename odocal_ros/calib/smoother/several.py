@@ -116,7 +116,7 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Say in which constants legs differ, and which leg differs most from the others."""
     J, said = len(found.deviation), []
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.spread}
-    # what is told with a parameter differs with it
+    # what is determined with a parameter differs with it
     worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
     for name, z in apart.items():
         k = int(np.argmax(np.abs(z)))

@@ -51,7 +51,7 @@ class SlowError(Part):
         gain = 2 * problem.fix_sigma**2 / USUAL_TIME
         return {'slow': gain, 'slow_up': 4 * gain}, {
             **dict.fromkeys(('slow', 'slow_up'), 2 * LEAST.fix**2 / USUAL_TIME),
-            'correlation_time': 5.0}      # s: less is not told from white
+            'correlation_time': 5.0}      # s: less is not separable from white
 
     def in_use(self, levels: Levels) -> bool:
         """Tell whether slow errors are estimated."""

@@ -50,7 +50,7 @@ def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float,
 
 
 def are_slow(problem: Problem, first: Fit) -> bool:
-    """Tell whether the errors of the fixes stay for a while: as told, or by a first fit."""
+    """Tell whether the errors of the fixes are correlated in time: as set, or by a first fit."""
     if not np.isnan(problem.fix_time):
         return problem.fix_time > 0.0
     if first.levels['fix'] < 0.2**2:        # a fix so much better than it says was filtered

@@ -40,7 +40,7 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.coarse_speed import Told
+from odocal_ros.nav.coarse_speed import SpeedInstants
 
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
@@ -55,8 +55,8 @@ class SpeedSteps(PointRows):
     def __init__(self, problem: 'Problem', here: Here) -> None:
         leg, state, points = problem.leg, here.state, here.points[self.name]
         self.state, self.points = state, points
-        self.told, self.k = _within(problem), points.interval
-        self.sigma = self.told.sigma * leg.rough_scale
+        self.instants, self.k = _within(problem), points.interval
+        self.sigma = self.instants.sigma * leg.rough_scale
         # at an even acceleration the speed is at the same place of its cell again and again
         self.per_effective = problem.per_effective.get(self.name, 1.0)
         C, tau = state.C_nb[self.k], points.tau[:, None]
@@ -78,7 +78,7 @@ class SpeedSteps(PointRows):
             self.speed, state.t[self.k] + points.tau, axle.speeding_up()[self.k]
         ) - axle.means_by_way(here.intervals)
         self.varied = 1 + self.from_mean @ c[TYRES]
-        said = self.told.value + self.told.side * c[SPEED_OFFSET]
+        said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
         self.raw = (self.said - self.speed + self.gained * here.odo_later)[:, None]
 
@@ -117,7 +117,7 @@ class SpeedSteps(PointRows):
         J[:, BG] = turn(np.swapaxes(self.C, 1, 2), turned) * tau + np.cross(arm, state.forward)
         K = state.scale * self.varied
         # by what is said: the speed lies anywhere in its cell, so the error is the speed's alone
-        c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.told.side
+        c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.instants.side
         c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
         for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
@@ -130,8 +130,8 @@ class SpeedSteps(PointRows):
         return J[:, None], c[:, None]
 
 
-def _within(problem: 'Problem') -> Told:
+def _within(problem: 'Problem') -> SpeedInstants:
     """Return what the speeds tell within the keyframes."""
     t, coarse = problem.imu.t[problem.imu.key], problem.leg.travel.coarse
     assert coarse is not None, 'by_steps'
-    return coarse.told.between(t[0], t[-1])
+    return coarse.instants.between(t[0], t[-1])

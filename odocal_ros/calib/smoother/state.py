@@ -110,7 +110,7 @@ class State:
     t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the Imu, m, m/s.   C_nb : (N, 3, 3).
     gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
     slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
-    up_b : (3,) up in b, in the mean of the leg: what the Imu's roll on the vehicle is told by.
+    up_b : (3,) up in b, mean of the leg: by it the Imu's roll on the vehicle is observable.
     """
 
     t: Floats

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What comes before the fit: fewer epochs, a first state, fixes far from those beside them."""
+"""Initial values of the fit: decimated epochs, a robust similarity, outliers among the fixes."""
 
 from dataclasses import replace
 

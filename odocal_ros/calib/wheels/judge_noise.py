@@ -8,10 +8,10 @@
 # the License.
 
 """
-How large and how slow the fixes' errors are, how far wheels slip and counts stray, by residuals.
+Variance components of the wheels' equations: slow errors of fixes, wheel slip, rounding.
 
-Restricted likelihood over a grid, together with what the receiver states: the covariance used is
-its mean over what is believable, so that a sigma holds what is not known of the noise itself.
+Restricted likelihood over a grid of sizes, with priors (what the receiver states is one): the
+covariance used is the posterior mean, so that a sigma holds what is not known of the noise itself.
 """
 
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def white_share(t_fix: Floats, residual: Floats, covariance_n: Floats, bins: Bin
 
 
 def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
-                covariance_n: Floats, white: float, told: float) -> FixNoise:
+                covariance_n: Floats, white: float, correlation_time: float) -> FixNoise:
     """
     Judge the slow part of the fixes' errors.
 
@@ -95,7 +95,7 @@ def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
         Of the fixes: bins, times, s, and stated covariance, m^2.
     white : float
         As white_share returns it.
-    told : float
+    correlation_time : float
         gnss.correlation_time: 0 white, NaN to be judged.
 
     """
@@ -108,11 +108,13 @@ def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
     k = np.arange(n)
     W[:, k, :, k] = cross
     W = white * W.reshape(2 * n, 2 * n)
-    if told == 0:
+    if correlation_time == 0:
         return FixNoise(white, 0.0, np.nan, W)
     use = np.flatnonzero(np.tile(bins.filled, 2))
     root = np.sqrt(stated).T.ravel()
-    times = 5.0 * 2.0**np.arange(8) if np.isnan(told) else np.array([told])    # s, to 640
+    times = np.array([correlation_time])
+    if np.isnan(correlation_time):
+        times = 5.0 * 2.0**np.arange(8)     # s, to 640
     begin, end = spread(bins, t_fix)
     shapes = [root[:, None] * np.kron(np.eye(2), slow_means(begin, end, time)) * root
               for time in times]

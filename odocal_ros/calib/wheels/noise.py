@@ -8,7 +8,7 @@
 # the License.
 
 """
-What the wheels' equations err by: named parts of the covariance of all observations.
+Measurement covariance of the wheels' equations, as named parts.
 
 Observations are stacked east (N), north (N), turn (N) of the bins. A part is a root (3N, k), one
 column for each independent unit error, or a whole covariance (3N, 3N) where there are many.

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a drive can tell of the wheels and what not: figures, and refusals with the reason."""
+"""Observability of the wheels' parameters: condition and correlation, refusals with the reason."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def correlation(covariance: Floats, names: tuple[str, ...] = PARAMETERS) -> dict
 
 def without_turns(solution: Solution) -> tuple[float, float]:
     """
-    Return what the fixes alone would tell of left and right, the patent's way.
+    Return the observability of left and right by the fixes alone, the patent's way.
 
     Returns
     -------
@@ -59,13 +59,13 @@ def without_turns(solution: Solution) -> tuple[float, float]:
     size = np.sqrt(np.diag(normal))
     size = np.maximum(size, 1e-9 * size.max())      # of one counter for both: no ratio at all
     rest = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-13, hermitian=True)
-    variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not told at all
+    variance = rest[1, 1] if rest[1, 1] > 0 else np.nan       # not observable at all
     return float(values[-1] / max(values[0], 1e-15)), float(np.sqrt(variance) / size[1])
 
 
 def separable(solution: Solution, sigma_ratio: float, config: Config,
               turn_rate: bool) -> tuple[Reason, ...]:
-    """Return why left and right cannot be told apart, empty if they can."""
+    """Return why left and right are not observable apart, empty if they are."""
     limit = INFORMED_SHARE * (config.wheels.radius_range or TYRE_SPREAD)
     if turn_rate and sigma_ratio <= limit:
         return ()
@@ -79,24 +79,25 @@ def separable(solution: Solution, sigma_ratio: float, config: Config,
                    'left and right are not stated'),)
 
 
-def width_told(solution: Solution, sigma: float, given: float) -> tuple[bool, tuple[Reason, ...]]:
-    """Tell whether the drive itself tells the track width, and why not where none is given."""
+def width_observable(solution: Solution, sigma: float,
+                     given: float) -> tuple[bool, tuple[Reason, ...]]:
+    """Tell whether the drive determines the track width, and why not where none is given."""
     width = solution.state.width
-    if solution.width_told and width <= TRACK_WIDTH.least:
+    if solution.width_observable and width <= TRACK_WIDTH.least:
         return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the difference of the wheels does '
                               'not follow the turns by gyro: as if less than '
                               f'{TRACK_WIDTH.least:g} m lay between them'),)
-    told = solution.width_told and sigma < TRACK_WIDTH.told_share * width
-    if told or given:
+    determined = solution.width_observable and sigma < TRACK_WIDTH.determined_share * width
+    if determined or given:
         learned = sigma < INFORMED_SHARE * TRACK_WIDTH.taped_share * given
-        return told and (not given or learned), ()
+        return determined and (not given or learned), ()
     away = solution.eq.yaw
     return False, (Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the heading ranges over '
                           f'{np.rad2deg(np.ptp(away)):.1f} deg: too little for the track width'),)
 
 
 def judge_width(width: float, sigma: float, given: float) -> tuple[Reason, ...]:
-    """Return what is to be said of a track width told by the drive beside the one given, m."""
+    """Return what is to be said of a track width by the drive beside the one given, m."""
     if not given or abs(width - given) <= REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return ()

@@ -30,7 +30,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 @dataclass(frozen=True, eq=False)
 class WheelPriors:
     """
-    Prior sigmas.
+    Prior sigmas of the parameters, and the steps to the priors' values.
 
     width : m, as configured, 0 unknown.   turn_rate : wheels' turns are used.
     latency : s.   gyro_scale : relative.
@@ -41,13 +41,13 @@ class WheelPriors:
     latency: float
     gyro_scale: float
 
-    def steps(self, leg: WheelLeg, state: State, width_told: bool,
+    def steps(self, leg: WheelLeg, state: State, width_observable: bool,
               rounds: int) -> tuple[Floats, Floats]:
         """Return inverse variances and values, (p,) each, as steps from a state."""
         weight, value = np.zeros((2, len(PARAMETERS)))
         given = self.width or TRACK_WIDTH.of_a_car
         taped = TRACK_WIDTH.taped_share * given
-        loose = TRACK_WIDTH.any_sigma if width_told else (
+        loose = TRACK_WIDTH.any_sigma if width_observable else (
             TRACK_WIDTH.car_sigma if rounds > 2 else taped)
         weight[WIDTH] = 1 / (taped if self.width else loose)**2
         value[WIDTH] = given - state.width

@@ -24,7 +24,7 @@ from odocal_ros.calib.wheels.observable import (
     judge_heading,
     judge_width,
     separable,
-    width_told,
+    width_observable,
     without_turns,
 )
 from odocal_ros.calib.wheels.solution import Solution
@@ -80,14 +80,14 @@ def fit_wheels(leg: WheelLeg, config: Config, turn_rate: bool = True) -> MethodR
     reasons = separable(solution, sigma[RATIO], config, turn_rate)
     apart = not reasons
     reasons = slipped + reasons
-    told, why = width_told(solution, sigma[WIDTH], config.odometer.track_width)
+    width_known, why = width_observable(solution, sigma[WIDTH], config.odometer.track_width)
     heading = float(wrap(solution.state.heading))
     about_heading = judge_heading(leg, heading, config)
     yaw_known = Code.YAW_NOT_SEPARABLE not in {r.code for r in about_heading}
     sources = _sources(leg, solution)
     reasons += why + about_heading + judge_fit(solution) + lag_reasons(
         solution.state.fix_lag_square, sigma[FIX_LAG2])
-    if told:
+    if width_known:
         reasons += judge_width(solution.state.width, sigma[WIDTH], config.odometer.track_width)
     total = np.sqrt(np.diag(total_covariance(sources)))
     K = solution.state.scale
@@ -102,7 +102,7 @@ def fit_wheels(leg: WheelLeg, config: Config, turn_rate: bool = True) -> MethodR
         'heading_error': Estimate(heading, float(sigma[HEADING]), 'rad'),
         'yaw_mounting_angle': Estimate(-heading, float(total[3]), 'rad') if yaw_known
         else Estimate(None, None, 'rad'),
-        'track_width': Estimate(solution.state.width, float(sigma[WIDTH]), 'm') if told
+        'track_width': Estimate(solution.state.width, float(sigma[WIDTH]), 'm') if width_known
         else Estimate(None, None, 'm'),
         'gyro_bias_z': _gyro_bias(leg, solution)}
     return MethodResult('wheels', tuple(reasons), estimates, PARAMETERS, sources,

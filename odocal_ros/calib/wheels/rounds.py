@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The rounds in which the equations of the wheels are linearised, noise judged, and solved."""
+"""Gauss-Newton iterations of the wheels: linearised, variance components judged, solved."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ from odocal_ros.settings.levels import OUTLIER_SIGMAS
 
 
 class Rounds:
-    """The rounds of relinearisation over one leg, five at most."""
+    """Gauss-Newton iterations over one leg, five at most."""
 
     def __init__(self, leg: WheelLeg, config: Config, bins: Bins, turn_rate: bool,
                  width: float) -> None:
@@ -61,7 +61,7 @@ class Rounds:
         self.since = leg.start.t if leg.alignment.heading_source == 'fixed' else leg.alignment.t
         n = len(bins.edges) - 1
         self.bad = np.zeros(n, bool)
-        self.turns, self.told, self.rounds = TurnNoise(), False, 0
+        self.turns, self.width_observable, self.rounds = TurnNoise(), False, 0
 
     def run(self, state: State, fixes: int) -> Solution:
         """Return the solution from a first state."""
@@ -88,7 +88,7 @@ class Rounds:
         parts.append(Part('pitch', np.concatenate(
             [eq.by[:, 0, 3], eq.by[:, 1, 3], 0 * eq.turn])[:, None] * height.pitch_sigma))
         parts.append(tilted(eq, state, height.tilt_variance))
-        if not (self.width or self.told):
+        if not (self.width or self.width_observable):
             parts.append(unknown_width(eq, self._drift(eq)))
         known: Floats = sum((p.whole() for p in parts), np.zeros(()))
         if judge or self.rounds == 0:
@@ -101,20 +101,20 @@ class Rounds:
         if judge and self._drop_bins(fit, n):
             fit = self._fit(V, r, X, self._used(n), state, L, eq)
         # else the gyro's own drift would pass for turns, and the width for nothing
-        self.told = self._turns_tell(eq, V, r, X, state, L)
-        widen = float(fit.step[WIDTH]) if self.told else 0.0
+        self.width_observable = self._turns_observable(eq, V, r, X, state, L)
+        widen = float(fit.step[WIDTH]) if self.width_observable else 0.0
         self.rounds += 1
         new = _stepped(state, fit, height, widen)
         step = fit.step / np.sqrt(np.diag(np.linalg.inv(fit.normal)))
         kept = int((~self.bad)[self.bins.of_fix].sum())
         return Solution(new, self.bins, eq, fit, fix[:, fit.use] @ fit.left, X,
                         self._steps(state)[0], tuple(parts), height, self.noise, self.turns,
-                        kept, 0, self._bias(fit, L, eq), self.told, False), \
+                        kept, 0, self._bias(fit, L, eq), self.width_observable, False), \
             step[[SCALE, RATIO, HEADING]]
 
-    def _turns_tell(self, eq: Equations, V: Floats, r: Floats, X: Floats, state: State,
+    def _turns_observable(self, eq: Equations, V: Floats, r: Floats, X: Floats, state: State,
                     L: Floats) -> bool:
-        """Tell whether the turns are far above what the gyro may have drifted."""
+        """Tell whether turns observe the track width: far above what the gyro may have drifted."""
         if not self.turn_rate:
             return False
         way = np.append(0.0, np.cumsum(eq.length))
@@ -143,7 +143,7 @@ class Rounds:
         return least_squares(V, r, X, drift, use, *self._steps(state))
 
     def _steps(self, state: State) -> tuple[Floats, Floats]:
-        return self.priors.steps(self.leg, state, self.told, self.rounds)
+        return self.priors.steps(self.leg, state, self.width_observable, self.rounds)
 
     def _bias(self, fit: Fit, L: Floats, eq: Equations) -> tuple[float, float]:
         """Return the gyro's bias about the vertical beyond that of the alignment, and sigma."""
@@ -155,7 +155,7 @@ class Rounds:
         return float(c @ fit.left), float(np.sqrt(max(left, 0.0)))
 
     def _drop_bins(self, fit: Fit, n: int) -> bool:
-        """Leave out bins that stray from what all others say; tell whether there are new ones."""
+        """Reject bins by their normalised residuals; tell whether there are new ones."""
         z = np.zeros(3 * n)
         z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
         far = (np.hypot(z[:n], z[n:2 * n]) > OUTLIER_SIGMAS) & ~self.bad

@@ -8,7 +8,7 @@
 # the License.
 
 """
-What the gyro says of the wheels: exchanged, one slipping, counting unlike each other.
+Faults of two wheels by the gyro: exchanged, one slipping, counting unlike each other.
 
 The ways of the two wheels differ by the track width times the turn. What is left of the
 difference is rounding and gyro noise, millimetres over seconds; a wheel that spins or slides on
@@ -267,5 +267,5 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
     log_odds = excess[at] * size / sigma**2
     # once in 150 the other wheel; parts mean and Imu by less than a quarter of the half, the slip
     # begins or ends elsewhere
-    told = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
-    return int(np.sign(log_odds)) if told else 0
+    clear = abs(log_odds) > 5.0 and abs(excess[at]) > abs(size) / 8
+    return int(np.sign(log_odds)) if clear else 0

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the estimator of the wheels comes to: the state, and how the observations make it."""
+"""Solution of the wheels' least squares: the state, and how the observations make it."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Solution:
     residual : (3N,) m, what is taken for errors of the fixes.   X : (3N, p).
     priors : (p,) inverse prior variances.   parts : of the covariance.
     kept, dropped : fixes.   bias_z : value, sigma of the gyro's bias about the vertical, rad/s,
-    against that of the alignment.   width_told : the drive turns enough for the track width.
+    against that of the alignment.   width_observable : the drive turns enough for the track width.
     """
 
     state: State
@@ -47,7 +47,7 @@ class Solution:
     kept: int
     dropped: int
     bias_z: tuple[float, float]
-    width_told: bool
+    width_observable: bool
     settled: bool
 
     def covariance(self) -> Floats:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What is known of a track width before the drive: of cars, of one that was measured, of any."""
+"""Prior of a track width: of cars, of one that was measured, of any."""
 
 from dataclasses import dataclass
 
@@ -23,10 +23,10 @@ class TrackWidth:
     of_a_car: float = 1.6       # where nothing is known yet
     least: float = 0.1          # a track of less is none
     car_sigma: float = 0.8      # of a vehicle that is most likely a car
-    any_sigma: float = 10.0     # of any vehicle, where the drive itself tells it
+    any_sigma: float = 10.0     # of any vehicle, where the drive determines it
     first_sigma: float = 3.0    # of any vehicle, where wheels and gyro alone are compared
     taped_share: float = 0.02   # 1 sigma of one that is given: taped, and tyres are wide
-    told_share: float = 0.05    # sigma from which a width found says nothing (judgement)
+    determined_share: float = 0.05    # sigma from which a width found says nothing: judgement
 
 
 TRACK_WIDTH = TrackWidth()

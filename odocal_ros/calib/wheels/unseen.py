@@ -171,7 +171,7 @@ def _slip(found: Found) -> dict[str, Any]:
 def _said(span: tuple[float, float], size: float, sigma: float, wheel: int) -> Reason:
     which = 'one of the wheels parts from the other' if wheel < 0 else (
         f'the {SIDES[wheel]} wheel {"spins" if size > 0 else "slides"}')
-    # of less than 5 s begin and end are not told apart
+    # of less than 5 s begin and end are not separable
     when = f'about t = {span[0]:.0f} s' if span[1] - span[0] < 5.0 else (
         f'between t = {span[0]:.0f} and {span[1]:.0f} s')
     return Reason(Code.WHEEL_SLIP, f'{which} by {100 * abs(size):.0f} cm (+-{100 * sigma:.1f}) '

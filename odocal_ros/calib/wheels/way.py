@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The way of a leg by its wheels and gyro, turned by what the gyro is found to err by."""
+"""Dead reckoning of two wheels and its derivatives, turned by the estimated drift of the gyro."""
 
 from typing import TYPE_CHECKING
 

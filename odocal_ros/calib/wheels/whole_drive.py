@@ -8,7 +8,7 @@
 # the License.
 
 """
-Two wheels over the whole drive: how their ways follow from each other, the turn and the load.
+Regression of the right wheel's way on the left one's, turn and load, over the whole drive.
 
 The right wheel's way is that of the left one, the track width times the turn, and little more.
 What this says of the drive as a whole: exchanged, one counter sent twice, unlike counts, a ratio
