@@ -40,7 +40,7 @@ PARAMETERS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 
 
 def parameter_gradient(f: Floats) -> Floats:
-    """Return the (3, 3) derivative of (ln K, yaw, pitch) by f = K forward_b."""
+    """Return the derivative G of (ln K, yaw, pitch) by f, (3, 3): docs/method.md (T8)."""
     K = np.linalg.norm(f)
     x, y, z = f
     level = np.hypot(x, z) * (-1.0 if x < 0 else 1.0)      # as mounting_from_forward has it
@@ -51,7 +51,7 @@ def parameter_gradient(f: Floats) -> Floats:
 
 def drift_sources(t: Floats, D: Floats, q_nb: Floats, alignment: Alignment) -> dict[str, Floats]:
     """
-    Return the gyro sources as chord errors, each (3, k) m for one sigma.
+    Return the gyro sources as chord errors, (3, k) m for one sigma: docs/method.md (T10).
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def budget(f: Floats, M: Floats, start: MarkFix, end: MarkFix, t: Floats, D: Flo
            velocity_change: Floats, lever_arm_sigma: float,
            odometer_time_sigma: float) -> tuple[Source, ...]:
     """
-    Return the sources of error of (ln K, yaw, pitch) for one leg.
+    Return the sources of error of (ln K, yaw, pitch): docs/method.md (T9) to (T12).
 
     The fixes' own vertical errors are part of fix_start and fix_end; ``height`` is the error that
     both ends share, which makes the Earth, and so the chord, larger. ``projection`` is there to
@@ -207,7 +207,7 @@ def _height_sigma(start: MarkFix, end: MarkFix) -> float:
 
 def _second_order(t: Floats, D: Floats, alignment: Alignment, height_variance: float) -> Source:
     """
-    Return what is of second order in the scale.
+    Return what is of second order in the scale: docs/method.md (T12).
 
     Half the distance-weighted variance of a wandering attitude, for a gyro bias
     and noise of the size of their sigmas, and half the square of the tilt that height errors of
@@ -238,7 +238,7 @@ def displacement(track: Track, rows: slice, t_start: float, f: Floats) -> Floats
 
 
 def total_covariance(sources: Iterable[Source]) -> Floats:
-    """Return the covariance of the parameters from all sources, (p, p)."""
+    """Return the covariance of the parameters from all sources, (p, p): docs/method.md (T13)."""
     return sum((s.effects @ s.effects.T for s in sources), np.zeros(()))
 
 

@@ -7,7 +7,11 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Several legs of one vehicle to one result: own errors average down, shared ones do not."""
+"""
+Several legs of one vehicle to one result: own errors average down, shared ones do not.
+
+The equations are those of docs/method.md, (T15) and (T16).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -102,7 +106,7 @@ def _details(sources: Sequence[Source], parameters: Sequence[str],
 
 def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Floats,
              ) -> tuple[float, float, dict[str, Floats], tuple[Reason, ...]]:
-    """Return value, own variance, shared effects by source, reasons of one parameter."""
+    """Return value, own variance, shared effects, reasons of a parameter: (T15), (T16)."""
     relative = parameter.startswith('scale_factor')
     x = np.array([r.estimates[parameter].value for r in have])
     y = np.log(x) if relative else x
@@ -137,7 +141,7 @@ def _combine(parameter: str, i: int, have: Sequence[MethodResult], walked: Float
 
 def _weights(covariance: Floats) -> Floats:
     """
-    Return the weights, none below zero, of the mean with the least variance.
+    Return the weights, none below zero, of the mean with the least variance: (T15).
 
     By own errors alone, a leg that a shared error hardly touches would count for little beside
     one that it rules, and the mean would be worse than that leg.

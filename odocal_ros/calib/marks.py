@@ -64,7 +64,7 @@ class MarkFix:
 def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
              correlation_time: float = np.nan) -> tuple[Floats, Floats, int, int]:
     """
-    Average fixes of one place.
+    Average fixes of one place: docs/method.md (T6), (T7).
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def _near_middle(position_n: Floats, covariance_n: Floats) -> Bools:
 
 def _share(t: Floats, residual: Floats, whole: Floats, weight: Floats,
            correlation_time: float) -> float:
-    """Return which part of a single fix's variance is left in the mean."""
+    """Return which part of a single fix's variance is left in the mean: docs/method.md (T7)."""
     n = len(t)
     white = float(weight @ weight)          # 1/n for equal weights
     if n == 1 or correlation_time == 0:

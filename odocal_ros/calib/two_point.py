@@ -75,7 +75,7 @@ class Chord:
 
 def solve(chord: Chord, up_scale: float = 1.0) -> tuple[Floats, bool]:
     """
-    Solve M f = c for f = K forward_b.
+    Solve M f = c for f = K forward_b: docs/method.md (T3), (T4).
 
     up_scale : factor on the stated height sigmas; np.inf leaves heights out.
 
@@ -267,7 +267,7 @@ def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple
 def _cross_check(chord: Chord, f: Floats, nominal_scale: float,
                  config: Config) -> dict[str, dict[str, float]]:
     """
-    Return K and yaw by eq. (6)-(10) in the plane and by the geodesic, S1 / S2 and bearings.
+    Return K and yaw by eq. (6)-(10) in the plane and by the geodesic: docs/method.md (T14).
 
     The track is taken with K0, yaw 0 and the pitch found, moved to the start position.
     """

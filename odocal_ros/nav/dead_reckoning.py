@@ -87,7 +87,7 @@ class Track:
 
 def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
     """
-    Sum attitude over travel.
+    Sum attitude over travel: docs/method.md (T1).
 
     Parameters
     ----------
@@ -113,14 +113,14 @@ def dead_reckon(t: Floats, q_nb: Floats, travel: Travel) -> Track:
 
 
 def forward_b(yaw: float | Floats, pitch: float | Floats) -> Floats:
-    """Return the vehicle's forward axis in b for mounting angles, rad (roll 0): (..., 3)."""
+    """Return the forward axis in b for mounting angles, rad, docs/method.md (T2): (..., 3)."""
     return np.stack([np.cos(pitch) * np.cos(yaw), -np.sin(yaw) * np.ones_like(pitch),
                      np.sin(pitch) * np.cos(yaw)], -1)
 
 
 def mounting_from_forward(d_b: ArrayLike) -> tuple[Floats, Floats]:
     """
-    Return yaw and pitch mounting angle, rad, of a forward axis in b: inverse of forward_b.
+    Return yaw and pitch mounting angle, rad, of a forward axis in b: docs/method.md (T5).
 
     Yaw in [-pi, pi], pitch within 90 deg: an odometer that counts backwards is a yaw of pi.
     """

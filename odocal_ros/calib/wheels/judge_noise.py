@@ -83,7 +83,7 @@ def white_share(t_fix: Floats, residual: Floats, covariance_n: Floats, bins: Bin
 def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
                 covariance_n: Floats, white: float, correlation_time: float) -> FixNoise:
     """
-    Judge the slow part of the fixes' errors.
+    Judge the slow part of the fixes' errors: docs/method.md (W9) to (W11).
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def judge_fixes(r: Floats, X: Floats, known: Floats, bins: Bins, t_fix: Floats,
 
 def judge_turns(r: Floats, X: Floats, known: Floats, counts: Floats, walk: Floats) -> TurnNoise:
     """
-    Judge how far rounding to counts and slips make the wheels' turn err.
+    Judge how far rounding to counts and slips make the wheels' turn err: (W10), (W11).
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def judge_turns(r: Floats, X: Floats, known: Floats, counts: Floats, walk: Float
 
 def log_size_prior(sizes: Floats, usual: float, spread: float) -> Floats:
     """
-    Return the log prior of sizes of a grid, the first of them 0: (n,).
+    Return the log prior of sizes of a grid, the first of them 0, docs/method.md (W11): (n,).
 
     usual, spread : median of what there is, and sigma of its logarithm.
     """
@@ -176,10 +176,10 @@ def inverse_root(covariance: Floats) -> Floats:
 
 def evidence(r: Floats, X: Floats, root: Floats, shape: Floats, sizes: Floats) -> Floats:
     """
-    Return the restricted log likelihood of r = X b + e, cov e = known + size shape, by size.
+    Return the restricted log likelihood of r = X b + e, by size: docs/method.md (W10).
 
-    But for ln det known. In the axes in which both are diagonal: a size costs next to nothing.
-    root : inverse_root(known).
+    cov e = known + size shape; but for ln det known. In the axes in which both are diagonal a
+    size costs next to nothing.   root : inverse_root(known).
     """
     values, axes = np.linalg.eigh(root @ shape @ root.T)
     d = 1 + sizes[:, None] * np.maximum(values, 0.0)             # (sizes, n)
@@ -195,7 +195,7 @@ def evidence(r: Floats, X: Floats, root: Floats, shape: Floats, sizes: Floats) -
 
 def slow_means(begin: Floats, end: Floats, time: float) -> Floats:
     """
-    Return the covariance of bin means of a Gauss-Markov process of unit variance, (N, N).
+    Return the covariance of bin means of a unit Gauss-Markov process, (W9): (N, N).
 
     begin, end : (N,) s, of the fixes in each bin.   time : s, its time constant.
     """

@@ -68,7 +68,9 @@ class Drift:
 def least_squares(V: Floats, r: Floats, X: Floats, drift: Drift, use: Bools, weight: Floats,
                   value: Floats) -> Fit:
     """
-    Solve r = X step + e, cov e = V, with priors; and the drift, whose share of e is L phi.
+    Solve r = X step + e, cov e = V, with priors, and the drift: docs/method.md (W12), (W13).
+
+    The drift's share of e is L phi.
 
     Parameters
     ----------

@@ -103,7 +103,7 @@ def C_bv(heading_error: float, pitch: float) -> Floats:
 
 def wheel_factors(scale: float, log_ratio: float) -> tuple[float, float]:
     """
-    Return the left and the right factor, m per unit.
+    Return the left and the right factor, m per unit: docs/method.md (W1).
 
     scale : of the mean of both counts on a straight way, the harmonic mean of the two.
     log_ratio : ln(right / left).

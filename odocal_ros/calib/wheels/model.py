@@ -8,7 +8,7 @@
 # the License.
 
 """
-The two equations of the wheels, linearised about a state, on bins of time.
+The two equations of the wheels, docs/method.md (W3), (W4), linearised, on bins of time.
 
     fix(t)  = p0 + sum to t - D of C (K_L dP_L + K_R dP_R) / 2 d + lever arm + lag + fix error
     0       = K_R s_R - K_L s_L - w psi - d0 + count error

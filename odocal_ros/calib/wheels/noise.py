@@ -59,7 +59,7 @@ def node_covariance(t: Floats, since: float, alignment: Alignment) -> dict[str, 
 
 
 def drift_covariance(alignment: Alignment, bins: Bins, eq: Equations, since: float) -> Floats:
-    """Return the covariance of the heading's drift at the nodes, all in all, (N + 1, N + 1)."""
+    """Return the covariance Q of the drift at the nodes, docs/method.md (W6): (N + 1, N + 1)."""
     by_bias = eq.phi_axes[:, 2] * alignment.gyro_bias_sigma
     return sum(node_covariance(bins.edges, since, alignment).values()) + by_bias @ by_bias.T
 
@@ -87,7 +87,7 @@ def bridge_loading(eq: Equations, width: float) -> Floats:
 
 def walk_root(moving: Floats) -> Floats:
     """
-    Return the root of the bin means of a walk that grows by 1 a root second in motion, (N, 2N).
+    Return the root of bin means of a walk, 1 a root second, docs/method.md (W8): (N, 2N).
 
     A mean holds half of its bin's step, and what the walk does between the bin's ends.
     """
@@ -132,7 +132,9 @@ def known_parts(leg: WheelLeg, eq: Equations, bins: Bins, state: State, since: f
 
 def quantisation(leg: WheelLeg, eq: Equations, bins: Bins, state: State, level: float) -> Floats:
     """
-    Return the covariance of what rounding to counts makes: a draw a standstill, many moving.
+    Return the covariance of rounding to counts, docs/method.md (W7): (3N, 3N).
+
+    A draw a standstill, many moving.
 
     Where the disc stands is open, so the rounding of two rows x counts apart has the covariance
     1 / 12 - {x} (1 - {x}) / 2 = sum over m of cos(2 pi m x) / (2 pi^2 m^2), {x} the part beyond

@@ -35,7 +35,7 @@ def correlation(covariance: Floats, names: tuple[str, ...] = PARAMETERS) -> dict
 
 def without_turns(solution: Solution) -> tuple[float, float]:
     """
-    Return the observability of left and right by the fixes alone, the patent's way.
+    Return the observability of left and right by the fixes alone: docs/method.md (W18).
 
     Returns
     -------

@@ -120,7 +120,7 @@ def refused(leg: WheelLeg | Inputs, reason: Reason) -> MethodResult:
 
 
 def _rows(solution: Solution) -> Floats:
-    """Return the derivatives of PARAMETERS by the solution's own parameters, (5, p)."""
+    """Return the derivatives of PARAMETERS by the solution's own, docs/method.md (W2): (5, p)."""
     ratio = np.exp(solution.state.log_ratio)
     rows = np.zeros((5, len(solution.priors)))
     rows[:3, SCALE] = 1.0
@@ -137,7 +137,7 @@ def _root(covariance: Floats) -> Floats:
 
 
 def _sources(leg: WheelLeg, solution: Solution) -> tuple[Source, ...]:
-    """Return the parts of the covariance as effects on PARAMETERS, each with its name."""
+    """Return the parts of the covariance as effects on PARAMETERS: docs/method.md (W15)."""
     rows = _rows(solution)
     BX = rows @ solution.fit.B
     sources = []
@@ -171,7 +171,7 @@ def _height_sigma(leg: WheelLeg) -> float:
 
 def _second_order(solution: Solution) -> float:
     """
-    Return what climb and heading not known make of the scale, relative.
+    Return what climb and heading not known make of the scale, relative: docs/method.md (W16).
 
     Half their mean square over the way shortens the level track; of a normal error its rms is
     sqrt(3) / 2 of the variance. In it too is what epochs of 40 ms cut off bends, with counts and

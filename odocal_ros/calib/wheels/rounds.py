@@ -114,7 +114,7 @@ class Rounds:
 
     def _turns_observable(self, eq: Equations, V: Floats, r: Floats, X: Floats, state: State,
                     L: Floats) -> bool:
-        """Tell whether turns observe the track width: far above what the gyro may have drifted."""
+        """Tell whether the track width is observable by turns: docs/method.md (W17)."""
         if not self.turn_rate:
             return False
         way = np.append(0.0, np.cumsum(eq.length))
@@ -155,7 +155,7 @@ class Rounds:
         return float(c @ fit.left), float(np.sqrt(max(left, 0.0)))
 
     def _drop_bins(self, fit: Fit, n: int) -> bool:
-        """Reject bins by their normalised residuals; tell whether there are new ones."""
+        """Reject bins by their normalised residuals, (W14); tell whether there are new ones."""
         z = np.zeros(3 * n)
         z[fit.use] = fit.left / np.sqrt(np.maximum(np.diag(fit.P), 1e-12))
         far = (np.hypot(z[:n], z[n:2 * n]) > OUTLIER_SIGMAS) & ~self.bad

@@ -73,6 +73,7 @@ class Way:
         both = (dP[0] + dP[1]) / 2
         self.v = both @ d_b
         ratio = np.exp(state.log_ratio)
+        # docs/method.md (W2)
         by_ratio = (dP[1] * ratio - dP[0]) / (1 + ratio) / 2
         self.yaw = self._yaw()
         x = (self.middle - edges[self.of]) / np.diff(edges)[self.of]
@@ -100,7 +101,7 @@ class Way:
         return bool(self.state.phi.any() or self.state.gyro_scale)
 
     def phi(self, t: Floats) -> Floats:
-        """Return by what the computed attitude is to be turned at times: (k, 3) rad, n."""
+        """Return the drift of the attitude at times, docs/method.md (W5): (k, 3) rad, n."""
         phi = np.stack([np.interp(t, self.bins.edges, p) for p in self.state.phi.T], -1)
         g = self.state.gyro_scale
         phi[:, 2] += g * (1 + g) * np.interp(t, self.t, self.by_gyro_scale)
@@ -113,7 +114,7 @@ class Way:
         return -(yaw - np.interp(since, track.t, yaw)) / (1 + self.state.gyro_scale)**2
 
     def _yaw(self) -> Floats:
-        """Return the turn by gyro at each epoch, (m,)."""
+        """Return the turn by gyro at each epoch, (m,): psi of docs/method.md (W4)."""
         x = matrix_from_quat(self.q_nb) @ self.d_b
         if self.turned:
             x = turned(self.phi(self.t), x)
@@ -145,7 +146,7 @@ class Way:
         return np.bincount(self.of, (x[:-1] + x[1:]) / 2 * self.weight, n) / np.maximum(time, 1e-9)
 
     def turn(self, state: 'State') -> tuple[Floats, Floats, Floats]:
-        """Return residual (N,) m and derivatives (N, 5) of the turn equation, yaw at the nodes."""
+        """Return residual (N,) m and derivatives (N, 5) of (W4), and the turn at the nodes."""
         left, right = (k * (s - s[0]) for k, s in zip(self.k, self.s, strict=True))
         ratio = np.exp(state.log_ratio)
         by = np.stack([right - left, (right * ratio + left) / (1 + ratio), -self.yaw,
