@@ -33,7 +33,7 @@ GRID_CELLS, GRID_PADDED, GRID_ROUGH = 2**17, 2**20, 2**18
 
 @dataclass(frozen=True, eq=False)
 class SpeedInstants:
-    """Speeds at instants t, s:, ``value`` + side * offset, scale units per s, 1 sigma."""
+    """Speeds at instants t, s: ``value`` + side * offset, scale units per s, 1 sigma."""
 
     t: Floats        # (m,)
     value: Floats    # (m,)
