@@ -10,8 +10,9 @@
 """
 Arrays that lie in files without a name: hours of samples, and what is worked in for so long.
 
-Whoever reads them sees arrays like any others. ``let_go`` gives back the memory of all of them:
-what is wanted again is read again. Where the disk takes no more, arrays are in memory.
+Whoever reads them sees arrays like any others. ``let_go`` gives back the memory of all of them
+once they are large: what is wanted again is read again. Where the disk takes no more, arrays are
+in memory.
 """
 
 import contextlib
@@ -27,6 +28,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 ROOM_BYTES = 2**24      # judgement: bytes of an array to work in from which it lies in a file
+# judgement: bytes of all arrays in files up to which they are held, for pages read again cost time
+HELD_BYTES = 2**27
 _maps: WeakSet[mmap.mmap] = WeakSet()
 _lock = Lock()
 
@@ -55,8 +58,9 @@ def room(*shape: int, dtype: DTypeLike = float) -> NDArray[Any]:
 
 
 def let_go() -> None:
-    """Give back the memory of all arrays that lie in files; they can be used as before."""
+    """Give back the memory of arrays in files, if it is much; they can be used as before."""
     with _lock:
         maps = list(_maps)
-    for pages in maps:
-        pages.madvise(mmap.MADV_DONTNEED)
+    if sum(map(len, maps)) > HELD_BYTES:
+        for pages in maps:
+            pages.madvise(mmap.MADV_DONTNEED)

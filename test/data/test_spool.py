@@ -11,6 +11,8 @@
 
 import errno
 import os
+from pathlib import Path
+import re
 import tracemalloc
 
 import numpy as np
@@ -39,6 +41,7 @@ def small(monkeypatch):
     for name, size in (('MEMORY_BYTES', 200_000), ('TAIL_BYTES', 50_000),
                        ('MERGED_BYTES', 20_000)):
         monkeypatch.setattr(spool, name, size)
+    monkeypatch.setattr(mapped, 'HELD_BYTES', 0)
 
 
 def fed(recorder, imu, first, last):
@@ -84,6 +87,24 @@ def test_a_large_room_is_zeros_that_can_be_let_go(monkeypatch):
         raise OSError(28, 'no space left on device')
     monkeypatch.setattr(mapped.os, 'posix_fallocate', full)
     assert mapped.room(1000, 5).sum() == 0.0        # in memory, then
+
+
+def test_arrays_in_files_are_let_go_once_they_are_large(monkeypatch):
+    array = mapped.room(mapped.ROOM_BYTES // 8)
+    array[:] = 1
+
+    def resident():
+        (block,) = re.findall(rf'^{array.ctypes.data:x}-.*\n(?:\w+:.*\n)*?Rss: +(\d+)',
+                              Path('/proc/self/smaps').read_text(), re.MULTILINE)
+        return int(block) * 1024
+
+    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes)
+    let_go()
+    assert resident() == array.nbytes
+    monkeypatch.setattr(mapped, 'HELD_BYTES', array.nbytes - 1)
+    let_go()
+    assert resident() == 0
+    assert array.sum() == len(array)
 
 
 def test_a_leg_takes_no_more_memory_as_it_grows(imu):
