@@ -63,13 +63,32 @@ def lengths(x: Floats) -> Floats:
     return np.sqrt(across(np.add, x * x))
 
 
+def median(x: Floats) -> float:
+    """
+    Return what numpy has for the median of x, (n,), of many rows in a fourth of its time.
+
+    Only what lies about the median of some of them is put in order.
+    """
+    if len(x) < PIECE_ROWS:
+        return float(np.median(x))
+    few = np.sort(x[::64])
+    low, high = few[[int(0.45 * len(few)), int(0.55 * len(few))]]
+    below, above = np.count_nonzero(x < low), np.count_nonzero(x > high)
+    amid = x[(x >= low) & (x <= high)]
+    at = len(x) // 2 - below        # of the upper of the two in the middle
+    if not 0 < at < len(amid) or below + len(amid) + above < len(x):     # NaN is neither
+        return float(np.median(x))
+    amid.partition(at)
+    return float(amid[at] if len(x) % 2 else (amid[:at].max() + amid[at]) / 2)
+
+
 def medians(x: Floats) -> Floats:
     """Return the median of each column: (n, k) to (k,)."""
     column, found = room(len(x)), []
     for k in range(x.shape[1]):
         for rows in chunks(len(x)):
             column[rows] = x[rows, k]
-        found.append(np.median(column, overwrite_input=True))
+        found.append(median(column))
     return np.array(found)
 
 

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.bagio.read import Bag, TopicInfo
-from odocal_ros.data.arrays import Ints
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.leg import LegRecorder
+from odocal_ros.data.pieces import medians
 from odocal_ros.data.samples import take
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
@@ -155,18 +156,11 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
     """Tell how each joint or entry of an odometer moves; return the settings for the wheels."""
     options: list[str] = []
     open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
-    imu = taps[mapping['imu']].recorder.rows('imu') if mapping.get('imu') in taps else None
-    turn = None
-    if imu is not None:
-        imu = take(imu, ~(beyond('f_i', imu.f_i) | beyond('w_i', imu.w_i)))
-    if imu is not None and len(imu.stamp_ns):
-        up_i = np.median(imu.f_i, axis=0)
-        turn = imu.stamp_ns, imu.w_i @ (up_i / max(np.linalg.norm(up_i), 1e-9))
-    for facts in topics:
-        tap = taps.get(facts['name'])
-        if tap is None or tap.values is None:
-            continue
-        facts['values'] = tap.values.facts(turn)
+    listed = [(tap, tap.values, facts) for facts in topics
+              if (tap := taps.get(facts['name'])) and tap.values]
+    turn = _turn(taps[mapping['imu']]) if listed and mapping.get('imu') in taps else None
+    for tap, values, facts in listed:
+        facts['values'] = values.facts(turn)
         if len(facts['values']) > 1:
             facts['moves'] = in_words(facts['values'])
         form = tap.reader.form
@@ -179,6 +173,16 @@ def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
                 f'odometer.{side}={key}' for side, key in zip(('left', 'right'), named,
                                                               strict=True)]
     return options
+
+
+def _turn(imu: _Tap) -> tuple[Ints, Floats] | None:
+    """Return stamps and the turn rate to the left, rad/s, None where no row is usable."""
+    rows = imu.recorder.rows('imu')
+    rows = take(rows, ~(beyond('f_i', rows.f_i) | beyond('w_i', rows.w_i)))
+    if not len(rows.stamp_ns):
+        return None
+    up_i = medians(rows.f_i)
+    return rows.stamp_ns, rows.w_i @ (up_i / max(float(np.linalg.norm(up_i)), 1e-9))
 
 
 def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.pieces import across, lengths, medians
+from odocal_ros.data.pieces import across, lengths, median, medians
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerForm, OdometerSamples
 from odocal_ros.screening.fix_screen import placed
 from odocal_ros.screening.glitches import beyond, oriented
@@ -36,18 +36,18 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
     stamp, received = samples.stamp_ns[stamped], samples.received_ns[stamped]
     step = np.diff(stamp) * 1e-9
     rising = step[step > 0]
-    usual = float(np.median(rising)) if len(rising) else 0.0
+    usual = median(rising) if len(rising) else 0.0
     gap = 5.0    # in median intervals: longer is a gap
     least_gap = 0.1    # s, shorter is jitter
     gaps = np.flatnonzero(step > max(gap * usual, least_gap))
     order = gaps[np.argsort(-step[gaps], kind='stable')][:10]
-    lag = (received - stamp) * 1e-9
+    lag: Floats = np.multiply(received - stamp, 1e-9)
     # mean of what lies between the gaps: bursts and gaps are no rate
     running = float(rising.sum() - step[gaps].sum())
     return {
         'rate_hz': (len(rising) - len(gaps)) / running if running > 0 else None,
         'headerless': headerless,
-        'header_to_bag': None if headerless or not len(lag) else float(np.median(lag)),
+        'header_to_bag': None if headerless or not len(lag) else median(lag),
         'header_to_bag_spread': None if headerless or not len(lag) else float(
             np.subtract(*np.percentile(lag, [97.5, 2.5])) / 4),
         'zero_stamps': int((~stamped).sum()), 'repeated_stamps': int((step == 0).sum()),

@@ -15,7 +15,7 @@ import numpy as np
 
 from odocal_ros.data.arrays import Bools, Floats, Ints
 from odocal_ros.data.leg import Leg
-from odocal_ros.data.pieces import by_step, pieces
+from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
@@ -51,7 +51,7 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
         samples = _stamped(getattr(leg, slot))
         if not len(samples.stamp_ns):
             continue
-        ahead = float(np.median(_lag_at(samples.received_ns, imu) - _lag(samples)))
+        ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
         ahead += offsets[slot]
         if abs(ahead) > CLOCK_APART:
             found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import across, by_row, by_step, lengths
+from odocal_ros.data.pieces import across, by_row, by_step, lengths, median
 from odocal_ros.data.samples import HeadingSamples, ImuSamples
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code, Reason
@@ -116,7 +116,7 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
         return found
     size = bound[far]
     usual_steps = 20.0    # times the usual step from row to row
-    clear = size > usual_steps * float(np.median(bound, overwrite_input=True))
+    clear = size > usual_steps * median(bound)
     done = -1
     glitch_time = 0.4    # s within which a glitch is over: longer, and motion itself may do it
     back_share = 0.5    # of the bound: nearer to the row before it, the glitch is over

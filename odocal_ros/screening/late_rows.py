@@ -21,6 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.data.pieces import median
 from odocal_ros.data.samples import OdometerForm, OdometerSamples
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
@@ -66,10 +67,10 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
 
 def interval(t: Floats) -> float:
     """Return the sender's interval, s, lost and late rows notwithstanding."""
-    usual = float(np.median(np.diff(t)))
+    usual = median(np.diff(t))
     interval_span = 5.0    # s over which the interval is taken
     n = min(max(int(interval_span / usual), 1), len(t) - 1) if usual > 0 else 1
-    mean = float(np.median(t[n:] - t[:-n])) / n
+    mean = median(t[n:] - t[:-n]) / n
     steady_share = 0.005    # by which it is another than the median: rows are lost
     return mean if abs(mean - usual) < steady_share * usual else usual
 

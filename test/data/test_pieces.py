@@ -12,7 +12,7 @@
 import numpy as np
 import pytest
 
-from odocal_ros.data.pieces import across, lengths, PIECE_ROWS
+from odocal_ros.data.pieces import across, lengths, median, medians, PIECE_ROWS
 from odocal_ros.nav.integral import integral_at, integrals_at, twice_integral_at
 
 
@@ -38,6 +38,24 @@ def test_lengths_are_numpys_norms_of_rows(columns):
     x = wild(1000, columns)
     with np.errstate(over='ignore'):
         np.testing.assert_array_equal(lengths(x), np.linalg.norm(x, axis=1))
+
+
+def unlike(kind, n):
+    """Return values of which those taken to tell the median say much, little, or nothing."""
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=n)
+    return {'noise': x, 'steps': np.round(x), 'one': np.full(n, 2.0), 'sorted': np.sort(x),
+            'misled': np.where(np.arange(n) % 64, x, 9.0), 'infinite': np.where(x > 0, np.inf, x),
+            'nan': np.where(x > 4, np.nan, x)}[kind]
+
+
+@pytest.mark.parametrize('kind', ['noise', 'steps', 'one', 'sorted', 'misled', 'infinite', 'nan'])
+def test_a_median_of_many_rows_is_numpys(kind):
+    for n in (PIECE_ROWS, PIECE_ROWS + 1):
+        x = unlike(kind, n)
+        np.testing.assert_array_equal(median(x), np.median(x))
+        both = np.stack([x, -x], -1)
+        np.testing.assert_array_equal(medians(both), np.median(both, axis=0))
 
 
 def test_an_integral_over_pieces_is_that_at_once_at_each_of_several_times():
