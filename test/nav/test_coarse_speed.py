@@ -131,7 +131,8 @@ def test_small_steps_between_cruises_of_a_motorway_are_within_the_sigma(rate):
     end = np.cumsum(rng.uniform(5, 40, 600) + rise)
     corners = np.c_[np.r_[0.0, end[:-1]], end - rise].ravel()
     t = np.arange(0.0, corners[-1], 1 / rate)
-    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, np.interp(t, corners, cruise.repeat(2)))).told
+    speed = np.interp(t, corners, cruise.repeat(2))
+    told = CoarseSpeed(KMH, *sent(KMH, 'floor', t, speed)).instants
     z = (told.value + KMH / 2 - np.interp(told.t, corners, cruise.repeat(2))) / told.sigma
     assert len(z) > 600
     # uniform: sqrt(3) at most, but for crossings whose rate is known to a whole step
