@@ -110,11 +110,11 @@ def thinned(y: Floats, most: int = MOST_POINTS) -> Ints:
     n = len(y)
     if n <= most:
         return np.arange(n)
-    columns = y.reshape(n, -1).T
+    columns = np.nan_to_num(y.reshape(n, -1).T)
     edges = np.linspace(0, n, most // (2 * len(columns)) + 1).astype(int)
     keep = {0, n - 1}
     for a, b in zip(edges[:-1], edges[1:], strict=True):
-        for column in np.nan_to_num(columns[:, a:b]):
+        for column in columns[:, a:b]:
             keep |= {a + int(column.argmin()), a + int(column.argmax())}
     return np.array(sorted(keep))
 
