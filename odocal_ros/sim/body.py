@@ -18,24 +18,34 @@ import numpy as np
 
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import matrix_from_rpy
-from odocal_ros.sim.motion import inertial_v, Motion, State
+from odocal_ros.sim.motion import Hills, inertial_v, Motion, State
 from odocal_ros.sim.profile import hermite, Profile
+from odocal_ros.sim.zoo import G
 
 # physical: a car's body on its springs goes at some 1.3 Hz, damped by shock absorbers
 FREQUENCY = 2 * np.pi * 1.3   # rad/s
 DAMPING = 0.3
 
 
-def tilts(speed: Profile, yaw_rate: Profile, squat: float,
-          body_roll: float) -> tuple[Profile, Profile]:
-    """Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles."""
+def tilts(speed: Profile, yaw_rate: Profile, squat: float, body_roll: float,
+          hills: Hills | None = None, wheelbase: float = 0.0) -> tuple[Profile, Profile]:
+    """
+    Return roll and pitch of the body on the vehicle by time, rad, as fixed-axis angles.
+
+    What holds it on a slope is a push too. Both axles stand on the road: the body lies along the
+    chord of the wheelbase, the rear axle moves along the road below it.
+    """
+    hills = hills or Hills()
     step = 0.02    # s; a cubic between is then good to (w h)^4 / 384 = 2e-6
     t = np.round(np.arange(0.0, speed.end + step, step), 9)
-    forward, side = speed.derivative().mean(t), speed(t) * yaw_rate(t)
+    v, s = speed(t), speed.integral()(t)
+    (here, here_by, _), (amid, amid_by, _) = hills(s), hills(s + wheelbase / 2)
+    forward, side = speed.derivative().mean(t) + G * here, v * yaw_rate(t)
     # nose up is a negative pitch; in a turn to the left the left side goes up
-    roll, pitch = (hermite(t, *sprung(gain * push, step))
-                   for gain, push in ((body_roll, side), (-squat, forward)))
-    return roll, pitch
+    roll, roll_rate = sprung(body_roll * side, step)
+    pitch, pitch_rate = sprung(-squat * forward, step)
+    return hermite(t, roll, roll_rate), hermite(t, pitch - (amid - here),
+                                                pitch_rate - (amid_by - here_by) * v)
 
 
 def sprung(push: Floats, step: float) -> tuple[Floats, Floats]:

@@ -70,6 +70,7 @@ class Real:
 
     sideslip: float = 0.0            # rad per m/s^2 to the side, rear axle drifts outwards
     squat: float = 0.0               # rad per m/s^2, nose up
+    wheelbase: float = 0.0           # m, on whose chord the body lies over a crest; 0: as the road
     body_roll: float = 0.0           # rad per m/s^2, outwards
 
     imu_arm_error: Vector = NONE3        # m, configured less true

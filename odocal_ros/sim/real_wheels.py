@@ -34,7 +34,8 @@ def growth(state: State, real: Real) -> Floats | float:
 def slip_share(state: State, real: Real) -> Floats:
     """Return the metres spun beyond each metre of ground as the tyres pull or brake: (n,)."""
     forward = np.where(state.speed < 0, -1.0, 1.0)
-    force = forward * state.acceleration / G + REST + AIR * state.speed**2     # over load
+    # over load; up a slope they pull too
+    force = forward * (state.acceleration / G + state.slope) + REST + AIR * state.speed**2
     # half of the load is on the driven axle; all wheels brake
     pull = 2 * np.maximum(force, 0.0) if real.driven else np.zeros_like(force)
     share: Floats = real.tyre_slip * (pull + np.minimum(force, 0.0))

@@ -93,12 +93,13 @@ def motion_of(options: SimOptions) -> Motion:
     route = ROUTES[options.scenario](options.duration, stream(options.seed, 'route'))
     start = Start(options.latitude, options.longitude, options.height,
                   float(yaw_from_heading(options.heading)))
-    real, more = options.real, {}
+    real, hills, more = options.real, Hills(options.slope), {}
     if options.sway or real.sideslip:
         more['sway'] = _sway(route, options)
-    if real.squat or real.body_roll:
-        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll)
-    return Motion(route.speed, route.yaw_rate, start, Hills(options.slope), **more)
+    if real.squat or real.body_roll or real.wheelbase:
+        more['tilt'] = body.tilts(route.speed, route.yaw_rate, real.squat, real.body_roll, hills,
+                                  real.wheelbase)
+    return Motion(route.speed, route.yaw_rate, start, hills, **more)
 
 
 def _sway(route: Route, options: SimOptions) -> tuple[Profile, Profile]:

@@ -18,7 +18,16 @@ from smoother_legs import made, truth
 from odocal_ros.calib.smoother.axle import Axle
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.state import ACCEL, BARE, LEAN, M, PITCH, TYRES, YAW
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    BARE,
+    LEAN,
+    M,
+    PITCH,
+    PITCH_CENTRE,
+    TYRES,
+    YAW,
+)
 from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.sim.real import Real
@@ -130,6 +139,36 @@ def test_a_body_leans_late_and_a_sliding_axle_early(real, axis):
 
     assert left([0, 1]) < 0.3 * left([])
     assert left([0, 1, 2, 3]) < 0.7 * left([0, 1])
+
+
+def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
+    """What is left is that the road bends within it: by (h / length)^2 of it, and seconds."""
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1,
+                              scale=1e-3, nominal_scale=1e-3, real=Real(wheelbase=3.0))
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    part = Equations(problem, state, problem.sums(state)).parts['motion']
+    C_vn = np.swapaxes(state.C_nb[:-1] @ state.C_bv, 1, 2)
+    off = (C_vn @ part.raw[:, 15:18, None])[:, 2, 0]
+    by = (C_vn @ part.jacobians(BARE)[2][:, 15:18, PITCH_CENTRE, None])[:, 2, 0]
+    centre = -(by @ off) / (by @ by)
+    assert np.abs(off).max() > 1e-3       # m in a second
+    assert centre == pytest.approx(1.5, rel=0.02)
+    assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
+
+
+def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():
+    drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, slope=0.1)
+    problem, state = Problem.of(leg, config), truth(drive, config, leg)
+    motion = Equations(problem, state, problem.sums(state)).parts['motion'].motion
+    since = (drive.truth.start_ns - drive.options.start_ns) * 1e-9
+    there = drive.motion.at(since + (state.t[1:] + state.t[:-1]) / 2)
+    fast = there.speed > 2.0
+    want = there.acceleration + G * there.slope
+    # means of a second of what changes by up to 1 m/s^3 within it
+    assert np.abs(motion.axle.speeding_up() - want)[fast].max() < 0.3
+    assert np.ptp(G * there.slope[fast]) > 0.5
+    # the body's axes are those of the road here
+    assert np.abs(motion.pushed[:, 0] - want)[fast].max() < 0.3
 
 
 def test_the_truth_of_an_accelerometer_with_scale_error_fulfils_them(perfect):

@@ -9,6 +9,8 @@
 
 """Real wheels: what they grow and slip is in the truth; what is sent coarsely is not."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -46,6 +48,14 @@ def test_tyres_slip_by_the_force_over_the_load():
     braked = real_wheels.tyre_slip(state, Real(tyre_slip=1 / 30, driven=False))
     assert braked[b] == 0
     assert braked[-1] < 0
+
+
+def test_up_a_slope_tyres_slip_by_its_share_of_the_load():
+    _, level, real = run(tyre_slip=1 / 30)
+    up = replace(level, slope=np.full(len(level.t), 0.05))
+    pulls = level.acceleration > 0.1
+    more = real_wheels.slip_share(up, real) - real_wheels.slip_share(level, real)
+    assert more[pulls] == pytest.approx(2 / 30 * 0.05)
 
 
 @pytest.mark.parametrize('odometer', ['counts', 'speed', 'angle'])

@@ -21,10 +21,12 @@ import numpy as np
 from odocal_ros.calib.smoother.preintegrate import Intervals, turn
 from odocal_ros.calib.smoother.state import FAST_SPEED, ODO_ARM, State
 from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.grades import G
 
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
+WALK_SPEED = 1.0     # m/s, below which a slope is not its rise over its way: judgement
 RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
 
 
@@ -63,22 +65,28 @@ class Axle:
         """
         Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
 
-        Acceleration forward and left, m/s^2, and their change, m/s^3.
+        Specific force forward and left, m/s^2, and their change, m/s^3: on a slope they hold the
+        vehicle too.
         """
         T = np.diff(self.state.t)[:, None]
         # by the axes at mid interval: those at its begin would take the push of a turn for braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
-        accel = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
-        jerk = np.gradient(accel, axis=0) / T if len(T) > 1 else np.zeros_like(accel)
-        return np.concatenate([accel, jerk], axis=1)
+        C_vn = (C_vn[:-1] + C_vn[1:]) / 2
+        force = (turn(C_vn, np.diff(self.v_n, axis=0) / T) + G * C_vn[:, :, 2])[:, :2]
+        jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
+        return np.concatenate([force, jerk], axis=1)
 
     def speeding_up(self) -> Floats:
         """
-        Return by how much the way is driven faster, what tyres pull for, in each interval: (K,).
+        Return by how much the way is driven faster, and what it climbs: (K,) m/s^2.
 
-        In m/s^2; of speeds, since a vehicle that slides in a turn has part of its push ahead.
+        What tyres pull for in each interval; of speeds, since a vehicle that slides in a turn has
+        part of its push ahead.
         """
-        return np.diff(np.abs(self._ahead(self.v_n))) / np.diff(self.state.t)
+        speed, rise = np.abs(self._ahead(self.v_n)), self.v_n[:, 2]
+        climb = (rise[1:] + rise[:-1]) / np.maximum(speed[1:] + speed[:-1], 2 * WALK_SPEED)
+        pull: Floats = np.diff(speed) / np.diff(self.state.t) + G * climb
+        return pull
 
     def means_by_way(self, sums: Intervals) -> Floats:
         """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""

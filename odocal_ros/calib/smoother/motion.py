@@ -41,6 +41,7 @@ from odocal_ros.calib.smoother.state import (
     P,
     PHI,
     PITCH,
+    PITCH_CENTRE,
     SPEED_OFFSET,
     State,
     TYRES,
@@ -60,7 +61,7 @@ D = slice(E, E + 3)     # definition: rows of the odometer, after those of the o
 ROWS = D.stop
 # of Motion, what each interval has
 EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'pushed',
-        'from_mean', 'varied', 'travelled', 'residual')
+        'pitched', 'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -109,6 +110,7 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
+        way = way + self.pitched * state.constants[PITCH_CENTRE]
         if np.any(change[0]):
             way = way + turn(intervals.S_by, np.asarray(change[0]))
         self.faster = self._faster()
@@ -155,6 +157,9 @@ class Motion:
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         self.leaned = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))
+        # nose down about a point ahead, the odometer goes up
+        nose_down = (self.sums.mean_rate - state.gyro_bias[:-1]) @ self.left * T[:, 0]
+        self.pitched = np.outer(nose_down, self.up)
 
     def _unsaid(self, coarse: CoarseSpeed | None) -> Floats | None:
         """Return the derivative of the way by what speeds in steps lack: (K, 3), or None."""
@@ -211,6 +216,7 @@ class Motion:
         for i, axis in enumerate((self.up, -self.left)):
             turned = C @ s.S @ (state.scale * axis)
             c[:, D, LEAN.start + i:LEAN.stop:2] = -turned[:, :, None] * self.pushed[:, None, i::2]
+        c[:, D, PITCH_CENTRE] = -turn(C, self.pitched)
         c[:, D, ODO_ARM] = swing @ state.C_bv
         if self.unsaid is not None:
             c[:, D, SPEED_OFFSET] = -self.unsaid

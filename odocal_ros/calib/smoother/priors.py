@@ -21,7 +21,6 @@ from odocal_ros.calib.smoother.state import (
     BG,
     constants_from,
     GNSS_ARM,
-    LEAN,
     M,
     ODO_ARM,
     P,
@@ -49,7 +48,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_zy'),
           'receiver_smoothing': constants_from('fix_lag_square'),
           'tyre_changes': TYRES,
-          'body_lean': LEAN,
+          'body_lean': constants_from('squat', 'pitch_centre'),
           'speed_truncation': constants_from('speed_offset'),
           'heading': constants_from('heading_offset')}
 

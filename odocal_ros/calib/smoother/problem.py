@@ -209,6 +209,7 @@ def imperfect_sigmas(grade: Grade, duration: float) -> Floats:
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
+    Over a crest it pitches about the middle of its wheelbase.
     """
     axes = np.sqrt(2) * grade.misalignment     # two angles, since one of three turns the frame
     usual = {
@@ -220,7 +221,8 @@ def imperfect_sigmas(grade: Grade, duration: float) -> Floats:
         'scale_by_time': 2.5e-3 / max(duration, 600.0),     # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
-        'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4}    # rad per m/s^3
+        'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
+        'pitch_centre': 1.5}                        # m: a car's 1.4, a truck's 2.5
     return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
 
 

@@ -57,7 +57,7 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
              'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
-             'speed_offset')
+             'pitch_centre', 'speed_offset')
 
 
 def constants_from(first: str, last: str = '') -> slice:
@@ -88,12 +88,13 @@ FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a roa
 # change, rad per m/s^3: a body answers late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')
 # what a good vehicle has not: all to here, but for the gyro's scale, which every turn tells
-IMPERFECT = constants_from('gyro_scale_x', 'sideslip_by_jerk')
+PITCH_CENTRE = CONSTANTS.index('pitch_centre')
+IMPERFECT = constants_from('gyro_scale_x', 'pitch_centre')
 # kinds of these, each there or not, and how many constants each has
 KIND_SIZES = {'gyro_scale': 2, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
               'accelerometer_axis': 3, 'fix_lag_square': 1, 'scale_by_speed': 1,
               'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1, 'sideslip': 1,
-              'squat_by_jerk': 1, 'sideslip_by_jerk': 1}
+              'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
 KINDS = tuple(slice(end - size, end) for size, end in zip(
     KIND_SIZES.values(), accumulate(KIND_SIZES.values()), strict=True))
 # scale units per s: of a speed sent in steps, what a value of it lacks, half a step where the
