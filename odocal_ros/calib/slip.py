@@ -17,6 +17,7 @@ not.
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from odocal_ros.calib.result import Source
 from odocal_ros.data.arrays import Floats
@@ -79,7 +80,7 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     # in a turn the level error comes to bear on another axis: no window is judged there
     C = track.C_nb_at(grid)
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
-    excess[np.abs(yaw[span:] - yaw[:-span]) > SPIN_TURN] = 0.0
+    excess[np.ptp(sliding_window_view(yaw, span + 1), axis=1) > SPIN_TURN] = 0.0
     # what the drive as a whole does (rough road, soft suspension) is no event
     usual = np.median(np.abs(excess[excess != 0.0])) / NORMAL_MEDIAN if excess.any() else 0.0
     least = 0.45        # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m

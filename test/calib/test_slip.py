@@ -15,6 +15,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.result import Source
+from odocal_ros.calib.slip import find_slips
+from odocal_ros.nav.dead_reckoning import Track
+from odocal_ros.nav.earth import gravity
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
@@ -64,3 +67,19 @@ def test_a_source_of_slip_adds_spins_rather_than_averaging_them():
     assert isinstance(slip, Source)
     assert slip.effects.shape[1] == 1
     assert not replace(slip).shared
+
+
+@pytest.mark.parametrize(('slip', 'bends'), [(1.0, False), (0.0, False), (0.0, True)])
+def test_a_bend_to_and_fro_is_no_slip(slip, bends):
+    """Two lanes across and back within a window: a yaw of 3 deg left out, turns press ahead."""
+    t, speed, off = np.arange(0.0, 60.0, 0.02), 12.0, np.deg2rad(3.0)
+    there = (t > 30) & (t < 34)
+    rate = np.where(there & bends, 0.7 * np.sin(2 * np.pi * (t - 30) / 4), 0.0)
+    yaw = np.cumsum(rate) * 0.02
+    q_nb = np.stack([0 * t, 0 * t, np.sin(yaw / 2), np.cos(yaw / 2)], -1)
+    spun = slip * np.clip(t - 31.5, 0.0, 1.0)
+    f_b = np.stack([0 * t, speed * rate, 0 * t + gravity(0.8, 0.0)], -1)
+    track = Track(t, q_nb, speed * t + spun, np.zeros((len(t), 3, 3)))
+    when, size = find_slips(t, f_b, track, np.array([np.cos(off), np.sin(off), 0.0]), 0.8, 0.01)
+    assert len(when) == (slip > 0)
+    assert size.sum() == pytest.approx(slip, abs=0.2)
