@@ -67,11 +67,10 @@ def sideslip(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def squat(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Put the body on springs and axles."""
+    """Put the body on springs."""
     pitch, roll = (0.2, 0.5) if vehicle.robot else (lognormal(rng, 1.3, 0.4),
                                                     lognormal(rng, 4.5, 0.3))
-    return {}, {'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G),
-                'wheelbase': 0.5 if vehicle.robot else 2.8}
+    return {}, {'squat': float(pitch * DEG / G), 'body_roll': float(roll * DEG / G)}
 
 
 def lever_arms(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
