@@ -61,18 +61,29 @@ class Axle:
         speed: Floats = np.einsum('ki,ki->k', v_n, self.state.C_nb @ self.state.forward)
         return speed
 
+    def _climb(self) -> Floats:
+        """
+        Return the slope of the road ahead in each interval, by the way that goes up: (K,) rad.
+
+        The body's own pitch would hold the mounting's, which would then hold itself up.
+        """
+        speed, rise = self._ahead(self.v_n), self.v_n[:, 2]
+        ahead = speed[1:] + speed[:-1]
+        slope: Floats = (rise[1:] + rise[:-1]) * ahead / np.maximum(ahead**2, (2 * WALK_SPEED)**2)
+        return slope
+
     def pushes(self) -> Floats:
         """
         Return what springs and tyres answer to in each interval, as LEAN has it: (K, 4).
 
-        Specific force forward and left, m/s^2, and their change, m/s^3: on a slope they hold the
-        vehicle too.
+        Acceleration forward, what holds the vehicle on a slope with it, and left, m/s^2, and their
+        change, m/s^3.
         """
         T = np.diff(self.state.t)[:, None]
         # by the axes at mid interval: those at its begin would take the push of a turn for braking
         C_vn = np.swapaxes(self.state.C_nb @ self.state.C_bv, 1, 2)
-        C_vn = (C_vn[:-1] + C_vn[1:]) / 2
-        force = (turn(C_vn, np.diff(self.v_n, axis=0) / T) + G * C_vn[:, :, 2])[:, :2]
+        force = turn((C_vn[:-1] + C_vn[1:]) / 2, np.diff(self.v_n, axis=0) / T)[:, :2]
+        force[:, 0] += G * self._climb()
         jerk = np.gradient(force, axis=0) / T if len(T) > 1 else np.zeros_like(force)
         return np.concatenate([force, jerk], axis=1)
 
@@ -83,10 +94,9 @@ class Axle:
         What tyres pull for in each interval; of speeds, since a vehicle that slides in a turn has
         part of its push ahead.
         """
-        speed, rise = np.abs(self._ahead(self.v_n)), self.v_n[:, 2]
-        climb = (rise[1:] + rise[:-1]) / np.maximum(speed[1:] + speed[:-1], 2 * WALK_SPEED)
-        pull: Floats = np.diff(speed) / np.diff(self.state.t) + G * climb
-        return pull
+        speed = self._ahead(self.v_n)
+        up: Floats = G * self._climb() * np.sign(speed[1:] + speed[:-1])
+        return np.diff(np.abs(speed)) / np.diff(self.state.t) + up
 
     def means_by_way(self, sums: Intervals) -> Floats:
         """Return the means of ``varies_with`` over a leg, each metre counted alike: (4,)."""

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
 # of Motion, what each interval has
-EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'faster', 'unsaid', 'pushed',
-        'pitched', 'from_mean', 'varied', 'travelled', 'residual')
+EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid',
+        'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -110,11 +110,12 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
-        way = way + self.pitched * state.constants[PITCH_CENTRE]
         if np.any(change[0]):
             way = way + turn(intervals.S_by, np.asarray(change[0]))
         self.faster = self._faster()
-        self.way = turn(half @ self.C, way) + self.faster * change[1]
+        self.rolled = turn(half @ self.C, way)
+        self.way = self.rolled + turn(self.C, self.pitched * state.constants[PITCH_CENTRE]) \
+            + self.faster * change[1]
         self.unsaid = self._unsaid(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]

@@ -177,8 +177,9 @@ def _given(motion: Motion, leg: SmootherLeg, axes: Floats, rest: Bools) -> Float
         given = np.zeros((len(rest), ROWS, 1))
         given[:, D, 0] = axes[:, 0] * sigma[:, None]
         return given * ~rest[:, None, None]
-    size = np.linalg.norm(motion.way, axis=1, keepdims=True)
-    along = np.where(size > 1e-3, motion.way / np.maximum(size, 1e-3), axes[:, 0])
+    # as long as it may be, it goes where the wheels roll; how the body pitches is not in that
+    size = np.linalg.norm(motion.rolled, axis=1, keepdims=True)
+    along = np.where(size > 1e-3, motion.rolled / np.maximum(size, 1e-3), axes[:, 0])
     turned = np.abs(np.einsum('ki,ki->k', motion.C[:, 2], motion.sums.mean_rate)) * motion.T[:, 0]
     most = motion.state.scale * coarse.most * motion.T[:, 0]
     given = np.zeros((len(rest), ROWS, 2))
