@@ -17,11 +17,13 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother.axle import Axle
 from odocal_ros.calib.smoother.equations import Equations
+from odocal_ros.calib.smoother.motion import D
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BARE,
     LEAN,
+    LN_K,
     M,
     PITCH,
     PITCH_CENTRE,
@@ -154,6 +156,13 @@ def test_over_a_crest_the_body_pitches_about_the_middle_of_its_wheelbase():
     assert np.abs(off).max() > 1e-3       # m in a second
     assert centre == pytest.approx(1.5, rel=0.02)
     assert np.sqrt(((off + by * centre)**2).mean()) < 0.05 * np.sqrt((off**2).mean())
+    # no count lifts the odometer: what does is no part of what the scale multiplies
+    c = state.constants.copy()
+    c[PITCH_CENTRE] = centre
+    lifted = replace(state, constants=c)
+    there = Equations(problem, lifted, problem.sums(lifted)).parts['motion']
+    np.testing.assert_allclose(there.jacobians(BARE)[2][:, D, LN_K],
+                               part.jacobians(BARE)[2][:, D, LN_K], atol=1e-9)
 
 
 def test_tyres_pull_up_a_slope_as_they_do_to_speed_up():

@@ -68,7 +68,7 @@ def shaken():
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET] = 0.0
-    c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, *[0.0] * 7]
+    c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, *[0.0] * 6, 1e3]
     return problem, state.moved(step, c)
 
 

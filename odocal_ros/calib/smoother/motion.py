@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 D = slice(E, E + 3)     # definition: rows of the odometer, after those of the other unknowns
 ROWS = D.stop
 # of Motion, what each interval has
-EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'rolled', 'faster', 'unsaid',
-        'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
+EACH = ('T', 'C', 'C_end', 'f_n', 'f_n_end', 'dv', 'dp', 'way', 'rolled', 'heaved', 'faster',
+        'unsaid', 'pushed', 'pitched', 'from_mean', 'varied', 'travelled', 'residual')
 
 
 def rotvec(C: Floats) -> Floats:
@@ -114,8 +114,8 @@ class Motion:
             way = way + turn(intervals.S_by, np.asarray(change[0]))
         self.faster = self._faster()
         self.rolled = turn(half @ self.C, way)
-        self.way = self.rolled + turn(self.C, self.pitched * state.constants[PITCH_CENTRE]) \
-            + self.faster * change[1]
+        self.heaved = turn(self.C, self.pitched * state.constants[PITCH_CENTRE])
+        self.way = self.rolled + self.heaved + self.faster * change[1]
         self.unsaid = self._unsaid(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
@@ -186,6 +186,8 @@ class Motion:
         a[:, P, P], a[:, P, V], a[:, P, PHI] = -one, -one * T, skew(self.dp)
         gyro = self._by_gyro()
         a[:, :, BG] = gyro[:, :, :3]
+        a[:, D, BG] += state.constants[PITCH_CENTRE] * T * np.outer(
+            C @ self.up, self.left).reshape(K, 3, 3)
         a[:, P, BA], a[:, V, BA] = C @ s.AA, C @ s.A
         a[:, V, V], a[:, V, PHI] = -one, skew(self.dv)
         a[:, PHI, PHI] = -one
@@ -208,7 +210,8 @@ class Motion:
         s, C, state = self.sums, self.C, self.state
         c = np.zeros((len(self.T), ROWS, M))
         swing = self.C_end - C
-        c[:, D, LN_K] = -(self.travelled if self.fitted else self.way)
+        # a body that pitches lifts the odometer by no count
+        c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
         c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]
         for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
