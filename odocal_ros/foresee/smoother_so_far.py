@@ -16,7 +16,14 @@ import time
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother import GrowingFit, smoother_leg, SmootherLeg, SoFar, too_little
+from odocal_ros.calib.smoother import (
+    GrowingFit,
+    smoother_leg,
+    SmootherLeg,
+    SoFar,
+    too_little,
+    too_little_of,
+)
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import BadData
@@ -117,8 +124,7 @@ class SmootherSoFar:
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
                             placed.rough, t_stop)
-        fixes = ((view.t_fix >= view.t_begin) & (view.t_fix <= view.t_stop)).sum()
-        few = too_little(int(fixes), float(view.t_imu[-1] - view.t_begin))
+        few = too_little_of(view)
         if few:
             raise BadData(few.text)
         return view

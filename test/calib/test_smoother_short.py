@@ -49,3 +49,15 @@ def test_it_goes_by_what_the_receiver_says(stated):
                   covariance_n=leg.covariance_n * stated**2)
     # twice as good as said: the other three quarters of the variance may stay for a minute
     assert (smooth(one, config).details['noise']['correlation_time'] > 0) == (stated > 1)
+
+
+@pytest.mark.filterwarnings('error')
+def test_fixes_where_the_imu_is_silent_are_none():
+    """Of no fix there is no median: numpy warned of it on the node's terminal."""
+    _, config, leg = made(**TOWN)
+    imu, fix = leg.t_imu < 60.0, leg.t_fix > 100.0
+    leg = replace(leg, t_begin=30.0, t_imu=leg.t_imu[imu], f_b=leg.f_b[imu], w_b=leg.w_b[imu],
+                  t_fix=leg.t_fix[fix], fixes_n=leg.fixes_n[fix],
+                  covariance_n=leg.covariance_n[fix])
+    (reason,) = smooth(leg, config).reasons
+    assert reason.text.startswith('0 fixes in 30 s')

@@ -11,12 +11,18 @@
 The GNSS / Imu / odometer smoother: a batch maximum likelihood over all samples of a leg.
 
 ``smooth`` takes a leg that is over, ``GrowingFit`` one that grows; ``smoother_leg`` makes either
-of screened samples, where ``too_little`` says no. ``bound`` is the covariance without a fit.
+of screened samples, where ``too_little_of`` says no. ``bound`` is the covariance without a fit.
 """
 
 from odocal_ros.calib.smoother.growing import GrowingFit, SoFar
 from odocal_ros.calib.smoother.leg import smoother_leg, SmootherLeg
-from odocal_ros.calib.smoother.smoother import bound, keyframe_times, smooth, too_little
+from odocal_ros.calib.smoother.smoother import (
+    bound,
+    keyframe_times,
+    smooth,
+    too_little,
+    too_little_of,
+)
 
 __all__ = ['GrowingFit', 'SmootherLeg', 'SoFar', 'bound', 'keyframe_times', 'smooth',
-           'smoother_leg', 'too_little']
+           'smoother_leg', 'too_little', 'too_little_of']

@@ -49,9 +49,7 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
 
     """
-    inside = (leg.t_fix >= leg.t_begin) & (leg.t_fix <= leg.t_stop)
-    few = too_little(int(inside.sum()),
-                     min(leg.t_stop, leg.t_imu[-1]) - max(leg.t_begin, leg.t_imu[0]))
+    few = too_little_of(leg)
     if few:
         return refused([few], leg.scale_unit)
     problem = Problem.of(leg, config)
@@ -98,6 +96,16 @@ def likeliest_fit(problem: Problem, config: Config, trace: Trace | None = None) 
     if slow:
         return with_slow_errors(problem, about, trace)
     return fit(problem, about.state, about.levels, about=about, trace=trace)
+
+
+def too_little_of(leg: SmootherLeg) -> Reason | None:
+    """Return why a leg's fixes beside its Imu rows are too few, None if they are not."""
+    first = int(np.searchsorted(leg.t_imu, leg.t_begin))
+    t = leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
+    if len(t) < 2:
+        return too_little(0, 0.0)
+    beside = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
+    return too_little(int(beside.sum()), float(t[-1] - t[0]))
 
 
 def too_little(fixes: int, seconds: float) -> Reason | None:
