@@ -44,6 +44,9 @@ class SlowError(Part):
         self.state, self.T = here.state, here.intervals.T
         self.jump = 1.0 if here.spread is None else here.spread[:, JUMP:]
         self.time_given = not np.isnan(problem.fix_time)
+        # where runs of intervals begin through which the error goes unseen: a fix ends one
+        ends = np.bincount(here.points['fixes'].interval, minlength=len(self.T)) > 0
+        self.runs = np.flatnonzero(np.append(True, ends[:-1] | ends[1:]))
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
@@ -110,11 +113,16 @@ class SlowError(Part):
         Return what drives the error in each interval, on the axis that it moves most: (2, K, 1).
 
         As of the road: the best estimate in its own sigmas, and the variance that it should have.
+        Intervals without fixes between them tell their sum alone: it is judged, for all of them.
         """
-        seen = np.clip(1 - self._variances(near)[2] / self.drive, 1e-12, None)
-        z = self.residual() / np.sqrt(self.drive)
+        seen = 1 - self._variances(near)[2] / self.drive
+        seen, push, drive = (np.add.reduceat(x, self.runs) for x in (
+            seen, self.residual(), self.drive))
+        seen, z = np.clip(seen, 1e-12, None), push / np.sqrt(drive)
         most = np.argmax(np.abs(z) / np.sqrt(seen), axis=1)[:, None]
-        return np.stack([np.take_along_axis(x, most, axis=1) for x in (z, seen)])
+        length = np.diff(np.append(self.runs, len(self.T)))
+        return np.stack([np.repeat(np.take_along_axis(x, most, axis=1), length, axis=0)
+                         for x in (z, seen)])
 
     def _time(self, product: Floats, excess: Floats, begin: Floats) -> tuple[float, float]:
         """
