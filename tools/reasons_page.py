@@ -121,6 +121,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '`gnss.default_sigma` was taken.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '
         'that they claim. The sigma was made to match what is seen.',
+        Code.FIXES_ASTRAY: 'For seconds, or up to two minutes, the fixes jump off together, and '
+        'back: multipath between houses, or a receiver that took wrong whole cycles.',
     },
     'The drive': {
         Code.NO_STANDSTILL: 'There is no rest before the start mark. Level and gyro bias then '

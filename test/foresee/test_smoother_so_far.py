@@ -119,6 +119,21 @@ def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(loo
     assert [x.once_s > 0 for x in looks] == [False, False, True, False, True, False, True, False]
 
 
+def test_fixes_that_went_astray_stay_left_out(config):
+    drive = drive_of(fix_noise='rtk')
+    t = (drive.fix.stamp_ns - drive.truth.start_ns) * 1e-9
+    wrong = (t > 30.0) & (t < 50.0)
+    fix = replace(drive.fix, height=drive.fix.height + 4.0 * wrong,
+                  latitude=drive.fix.latitude + 5e-7 * wrong)     # rad: 3 m
+    first, second = (seen.running.method for seen in looked(
+        replace(drive, fix=fix), config, looks=(100.0, 120.0)))
+    for method in (first, second):
+        said = [r.text for r in method.reasons if r.code is Code.FIXES_ASTRAY]
+        assert len(said) == 1
+        assert 'in a stretch' in said[0]
+    assert second.details['iterations'] < first.details['iterations']
+
+
 def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, looks, monkeypatch):
     so_far = SmootherSoFar()
 

@@ -24,6 +24,7 @@ import numpy as np
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.failed import raised_if_wild
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.astray import leave_out, Stretch
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
@@ -75,6 +76,7 @@ class GrowingFit:
         self.once_s = 0.0
         self._last: WarmStart | None = None
         self._per_effective: dict[str, float] = {}
+        self._astray: list[Stretch] = []
         self._judged = 0.0       # s of the leg when it was last fit from nothing
 
     def forget(self) -> None:
@@ -100,7 +102,7 @@ class GrowingFit:
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the way so far: {error}') from None
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
-        self._per_effective = problem.per_effective
+        self._per_effective, self._astray = problem.per_effective, problem.astray
         return so_far
 
     def _fit(self, last: WarmStart | None, view: SmootherLeg, config: Config,
@@ -110,6 +112,8 @@ class GrowingFit:
         problem = Problem.of(view, config, rows_of(view, spacing))
         problem.per_effective = self._per_effective
         begun = None if last is None else carried(last, problem)
+        if begun is not None:
+            leave_out(problem, self._astray, begun.state.constants)
         if begun is None:
             begin = self._cpu_s()
             best = best_fit(problem, config, trace)
@@ -138,6 +142,7 @@ class GrowingFit:
         self._judged = duration
         if anew.settled:
             problem.per_effective = other.per_effective
+            leave_out(problem, other.astray, anew.state.constants)
             best = _decided_anew(best, anew, problem, config, trace)
         self.once_s += self._cpu_s() - begin
         return best

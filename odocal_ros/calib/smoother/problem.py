@@ -10,6 +10,7 @@
 """A leg made ready for the smoother: keyframes, priors, first noise levels, sums over samples."""
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,6 +52,9 @@ from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen
 
+if TYPE_CHECKING:
+    from odocal_ros.calib.smoother.astray import Stretch
+
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
 # forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
 # order leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix.
@@ -72,7 +76,8 @@ class Problem:
     imu: ImuRows
     grade: Grade
     priors: Priors
-    use: np.ndarray          # (k,) bool, fixes within the keyframes
+    within: np.ndarray       # (k,) bool, fixes within the keyframes
+    use: np.ndarray          # (k,) bool, of these the ones that are used
     root: np.ndarray         # (m, 3, 3) inverse roots of the stated covariances
     still: np.ndarray        # (N,) bool
     outside: dict[str, Velocity | Heading]    # within the keyframes, where there are any
@@ -84,6 +89,7 @@ class Problem:
     shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
     # velocity, heading, steps of speed: errors that are one
     per_effective: dict[str, float] = field(default_factory=dict)
+    astray: list['Stretch'] = field(default_factory=list)     # fixes left out of use
     kept: 'Sums | None' = None                    # the last, which the next fit may do with
 
     @classmethod
@@ -95,8 +101,9 @@ class Problem:
         use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
         grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
-        made = cls(leg, imu, grade, _priors(config, grade, leg), use, root, still, used(leg, t),
-                   turned(leg, imu), config.gnss.correlation_time, rates_at(imu.t, imu.w_b, t))
+        made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
+                   used(leg, t), turned(leg, imu), config.gnss.correlation_time,
+                   rates_at(imu.t, imu.w_b, t))
         for part in PARTS:
             if part.there(made):
                 first, least = part.first_levels(made)

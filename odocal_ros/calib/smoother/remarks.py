@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.receiver_lag import lag_reasons
+from odocal_ros.calib.smoother.astray import astray_reasons
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -115,8 +116,8 @@ def level_pitch(fit: Fit, near: Neighbours, widen: float) -> dict[str, Any]:
 def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
     c, leg = fit.state.constants, problem.leg
-    said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
-            *_varies(fit, sigma)]
+    said = [*_noisy(problem, fit.levels), *astray_reasons(problem),
+            *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]), *_varies(fit, sigma)]
     usual = imperfect_sigmas(grade_of(config.imu), leg.t_stop - leg.t_begin)
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)

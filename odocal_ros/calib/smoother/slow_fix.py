@@ -27,6 +27,9 @@ from odocal_ros.calib.smoother.slow_error import USUAL_TIME
 from odocal_ros.data.arrays import Floats
 
 WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
+# times the usual step between fixes, a second at least. Tuned: through a gap of 20 s a jump of
+# RTK's height by 3 m bends the pitch by 6 sigmas, through 10 s by 3 (docs/decisions/0009)
+GAP = 10.0
 
 
 def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
@@ -55,11 +58,15 @@ def are_slow(problem: Problem, first: Fit) -> bool:
         return problem.fix_time > 0.0
     if first.levels['fix'] < 0.2**2:        # a fix so much better than it says was filtered
         return True
-    t = problem.leg.t_fix[problem.use]
-    alike, sigma = correlation(t, first.weighted[Fixes].r[:, :2])
+    t, r = problem.leg.t_fix[problem.use], first.weighted[Fixes].r
     # a fit with slow errors costs time where there are none, one without them the truth of sigmas:
-    # 1.5 sigmas, one white leg in 15; of RTK's centimetre little is left to be seen: 0.05
-    return alike > max(0.05, 1.5 * sigma) or _hidden(t, first.levels['fix'])
+    # 1.5 sigmas, one white leg in 15; of RTK's centimetre little is left to be seen: 0.05. Heights
+    # tell of what level places do not only where a receiver comes back at another: 4 sigmas
+    for axes, sigmas in ((slice(0, 2), 1.5), (slice(2, 3), 4.0)):
+        alike, sigma = correlation(t, r[:, axes])
+        if alike > max(0.05, sigmas * sigma):
+            return True
+    return _hidden(t, first.levels['fix'])
 
 
 def _hidden(t: Floats, level: float) -> bool:
@@ -75,6 +82,17 @@ def _hidden(t: Floats, level: float) -> bool:
     """
     out: bool = t[-1] - t[0] < 90.0 and level < 1 - 4 / np.sqrt(len(t))
     return out
+
+
+def have_gap(problem: Problem) -> bool:
+    """
+    Tell whether a leg goes on for a while without fixes.
+
+    A receiver may come back elsewhere. The track bends through the gap to meet it, and no residual
+    shows that: only a fit in which the fixes may have jumped tells.
+    """
+    t = problem.leg.t_fix[problem.use]
+    return bool(np.diff(t).max(initial=0.0) > GAP * max(1.0, np.median(np.diff(t))))
 
 
 def with_slow_errors(problem: Problem, first: Outline, trace: Trace | None = None) -> Fit:

@@ -9,19 +9,24 @@
 
 """The smoother: scale and mounting angles from all samples of a leg at once (docs/method.md)."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
+from odocal_ros.calib.smoother.astray import left_out
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import Fit, fit, Trace
+from odocal_ros.calib.smoother.estimate import Fit, fit, Outline, Trace
 from odocal_ros.calib.smoother.imperfect import judge_imperfect, with_imperfect
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import no_imu, not_settled, outcome, refused
+from odocal_ros.calib.smoother.part import JUMP
 from odocal_ros.calib.smoother.point_rows import alike, PointRows
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slow_fix import are_slow, with_slow_errors
+from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
+from odocal_ros.calib.smoother.slow_fix import are_slow, have_gap, with_slow_errors
 from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import first_state
@@ -29,6 +34,8 @@ from odocal_ros.calib.smoother.state import State
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
+
+ROUNDS = 4      # judgement: fits, fixes that go astray left out between; large steps show first
 
 
 def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
@@ -91,10 +98,26 @@ def likeliest_fit(problem: Problem, config: Config, trace: Trace | None = None) 
     problem.per_effective = {
         name: alike(part) for name, part in best.weighted.parts.items()
         if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}
-    slow, about = are_slow(problem, best), best.outline()
-    del best, fits      # the equations of one fit at a time
-    if slow:
-        return with_slow_errors(problem, about, trace)
+    del fits        # the equations of one fit at a time
+    for left in reversed(range(ROUNDS)):
+        slow, about = are_slow(problem, best), best.outline()
+        del best
+        best = _settled(problem, about, slow, trace)
+        if not (left and left_out(problem, best)):
+            break
+        state = replace(best.state, slow_n=0.0 * best.state.slow_n)
+        del best
+        best = fit(problem, state, problem.first_levels.but(**problem.shaken), 3, trace=trace)
+    return best
+
+
+def _settled(problem: Problem, about: Outline, slow: bool, trace: Trace | None) -> Fit:
+    """Return the fit from a rough one, slow fix errors in it, or such as jump in a gap."""
+    if slow or have_gap(problem):
+        best = with_slow_errors(problem, about, trace)
+        if slow or best.spread[:, JUMP].max() > SLIP_VARIANCE:
+            return best
+        del best
     return fit(problem, about.state, about.levels, about=about, trace=trace)
 
 
