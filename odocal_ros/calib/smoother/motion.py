@@ -25,14 +25,10 @@ from odocal_ros.calib.smoother.axle import Axle, varies_with
 from odocal_ros.calib.smoother.preintegrate import Intervals, turn
 from odocal_ros.calib.smoother.state import (
     ACCEL,
-    ACCEL_AXIS,
-    ACCEL_SIGNAL,
     BA,
     BG,
     E,
     GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
     LEAN,
     LN_K,
     M,
@@ -88,9 +84,8 @@ class Motion:
 
     change : (K, 3 + g), s: by what gyro bias and constants and the odometer's delay differ from
         those that the sums were made with (for the others the sums have been shifted).
-    fitted : the state is so near that residuals are noise: derivatives by what multiplies a
-        signal go by the signal as fitted. Those by the signal as measured hold its noise, which
-        the fit then takes for information, and a smaller signal for a better one.
+    fitted : the state is so near that residuals are noise: the derivative by the scale goes by
+        the way as fitted, for the Imu's see signals.py.
     """
 
     def __init__(self, problem: 'Problem', state: State, intervals: Intervals,
@@ -231,21 +226,4 @@ class Motion:
             c[:, D, TYRES] = 0.0
         c[:, :, GYRO] = gyro[:, :, 3:]
         c[:, V, ACCEL], c[:, P, ACCEL] = C @ s.F, C @ s.FF
-        if self.fitted:
-            self._fit_signals(c, gyro)
         return c
-
-    def _fit_signals(self, c: Floats, gyro: Floats) -> None:
-        """
-        Take the noise, which the residuals are, out of the signals in c.
-
-        The noises of two sensors are independent, so the forces that act on the gyro are left.
-        """
-        axis, signal = list(ACCEL_AXIS), list(ACCEL_SIGNAL)
-        for rows in (V, P):
-            noise = turn(transpose(self.C), self.residual[:, rows])
-            c[:, rows, ACCEL] += self.C[:, :, axis] * noise[:, None, signal]
-        rate = turn(transpose(self.C), self.residual[:, PHI]) / self.T
-        for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
-            if by < 3:
-                c[:, :, GYRO.start + i] += gyro[:, :, into] * rate[:, by, None]

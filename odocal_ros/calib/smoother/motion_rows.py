@@ -20,9 +20,10 @@ from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
 from odocal_ros.calib.smoother.noise import INTERVAL, interval_noise, Levels
 from odocal_ros.calib.smoother.part import Here, Part, Total
+from odocal_ros.calib.smoother.signals import Signals
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.state import M, State
+from odocal_ros.calib.smoother.state import BG, M, State
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.mapped import room
 
@@ -52,6 +53,7 @@ class MotionRows(Part):
         change = here.gyro_change, here.odo_later
         self.motion = Motion(problem, here.state, here.intervals, change, here.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
+        self.signals = Signals(self.motion) if here.fitted else None
         self.noise = interval_noise(self.motion, problem.leg,
                                     problem.still[:-1] & problem.still[1:], here.spread)
 
@@ -91,10 +93,21 @@ class MotionRows(Part):
         """Return the whitened derivatives of some intervals: (k, 18, 2n + M)."""
         if rows.start in self._kept:
             return self._kept[rows.start]
-        J = self.whiten[rows] @ np.concatenate(self.motion.take(rows).jacobians(self.n), axis=2)
+        J = self.whiten[rows] @ np.concatenate(self.derivatives(rows), axis=2)
         if len(self.r) <= SHORT_LEG:
             self._kept[rows.start] = J
         return J
+
+    def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:
+        """Return those of some intervals as in ``Motion.jacobians``, once fitted by signals."""
+        begin, end, constants = self.motion.take(rows).jacobians(self.n)
+        if self.signals is not None:
+            gyro = (self.noise.columns(rows) * self.roots())[:, :, self.of('gyro')]
+            whiten = self.whiten[rows]
+            found = np.einsum('kic,kij,kj->kc', whiten @ gyro, whiten, self.raw[rows],
+                              optimize=True)
+            self.signals.fit(rows, constants, begin[:, :, BG], gyro, found)
+        return begin, end, constants
 
     def forget(self) -> None:
         """Let go of the derivatives."""
