@@ -76,6 +76,20 @@ GRADES: dict[str, Grade] = {
                                    2e-3, 1e-5),
 }
 
+# Turn-on biases of Imus as they are sold, 1 sigma: gyro rad/s, accelerometer m/s^2. Physical: by
+# data sheets and what is measured (docs/zoo.md), ten and more times those of a grade above, which
+# a driver has taken out or a standstill tells
+TURN_ON = {'consumer': (math.radians(1.0), 25e-3 * G), 'industrial': (math.radians(0.1), 3e-3 * G),
+           'tactical': (math.radians(5.0) / 3600.0, 1e-3 * G)}
+
+
+def turn_on_bias(imu: ImuConfig) -> tuple[float, float]:
+    """Return the usual turn-on bias of a gyro, rad/s, and an accelerometer, m/s^2: 1 sigma."""
+    grade = grade_of(imu)
+    usual = TURN_ON.get(imu.grade, (0.0, 0.0))
+    return (max(grade.gyro_bias, usual[0] if math.isnan(imu.gyro_bias) else 0.0),
+            max(grade.accel_bias, usual[1] if math.isnan(imu.accel_bias) else 0.0))
+
 
 SETTINGS = {'gyro_scale_error': 'gyro_scale_sigma',
             'accel_scale_error': 'accel_scale_sigma',

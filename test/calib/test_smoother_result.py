@@ -222,3 +222,15 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     reason, = method.reasons
     assert reason.code is Code.NOT_CONVERGED
     assert 'accelerometer scale y is -21 % off' in reason.text
+
+
+@pytest.mark.parametrize(('times', 'said'), [(30.0, False), (200.0, True)])
+def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, said):
+    drive, config, _ = made(**SHORT)
+    config = with_settings(config, {'imu.grade': 'industrial'})
+    bias = times * np.radians(20.0) / 3600.0        # rad/s: of the grade's; sold with 0.1 deg/s
+    turning = changed(drive.imu, w_i=lambda w: w + [0.0, bias, 0.0])
+    method = smooth(leg_of(replace(drive.leg(), imu=turning), config), config)
+    worse = [r.text for r in method.reasons if r.code is Code.IMU_WORSE_THAN_GRADE]
+    assert bool(worse) == said, worse
+    assert np.abs(off(drive, method)).max() < 3.3

@@ -20,7 +20,7 @@ from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import grade_of
+from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
@@ -35,15 +35,16 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     """Return the factor on all sigmas, at least 1, and reasons."""
     reasons: list[Reason] = []
     stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
+    gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
     shaken = max(level[name] / own[name] for name in ('gyro', 'accel'))
     worse = [f'{what} {level[name] / stated[name]:.1f} times' for name, what in (
         ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
         if level[name] > WORSE_THAN_GRADE * stated[name]]
-    worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, what in (
-        (fit.state.gyro_bias, problem.priors.gyro_bias, 'gyro bias'),
-        (fit.state.accel_bias, problem.priors.accel_bias, 'accelerometer bias'))
-        if np.max(np.abs(now[0]) / sigma) > 2 * WORSE_THAN_GRADE]
+    worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, sold, what in (
+        (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold, 'gyro bias'),
+        (fit.state.accel_bias, problem.priors.accel_bias, accel_sold, 'accelerometer bias'))
+        if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; estimated from the drive instead',
