@@ -20,10 +20,10 @@ second but the road, and it is by the road's noise that the fit judges them: aga
 is a better one. Of these only what lasts is a signal.
 """
 
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.motion import Motion, ROWS
 from odocal_ros.calib.smoother.preintegrate import turn
 from odocal_ros.calib.smoother.state import (
     ACCEL,
@@ -40,9 +40,6 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.rotations import transpose
 
-if TYPE_CHECKING:
-    from odocal_ros.calib.smoother.motion import Motion
-
 # s, running mean. Tuned: over 4 s a swaying consumer Imu's vertical scale is 1.8 sigmas of its
 # grade off in 30 minutes, over 10 s 0.5, over 20 s 0.4 (docs/decisions/0009)
 LASTING = 10.0
@@ -56,7 +53,7 @@ class Signals:
     rate, force : (K, 3) in b, means of the intervals.
     """
 
-    def __init__(self, motion: 'Motion') -> None:
+    def __init__(self, motion: Motion) -> None:
         self.motion = motion
         back, up_b, T = transpose(motion.C), motion.C[:, 2], motion.T
         rate = motion.sums.mean_rate + turn(back, motion.residual[:, PHI]) / T
@@ -77,33 +74,46 @@ class Signals:
         forces that act on the gyro are left.
         """
         part = self.motion.take(rows)
-        C, back = part.C, transpose(part.C)
-        noise = turn(back, part.residual[:, PHI]) / part.T
+        self._by_rates(part, rows, constants[:, :, GYRO], by_bias)
+        k, C = len(part.C), part.C[:, None]
+        # of the noise about each axis of b
+        of_gyro = ((gyro.reshape(k, ROWS, -1, 3) @ C) * (found.reshape(k, 1, -1, 3) @ C)).sum(2)
+        for axes, size in ((V, part.sums.A), (P, part.sums.AA)):
+            self._by_forces(part, constants[:, axes, ACCEL], size * self.force[rows, None, 2:],
+                            part.residual[:, axes], of_gyro[:, axes])
+
+    def _by_rates(self, part: Motion, rows: slice, columns: Floats, by_bias: Floats) -> None:
+        """Put the derivatives right that go by turn rates: columns (k, 18, g)."""
+        noise = turn(transpose(part.C), part.residual[:, PHI]) / part.T
         by_bias = by_bias.copy()
         by_bias[:, BG] = 0.0        # which walks, as a scale does not
         for i, (into, by) in enumerate(zip(GYRO_AXIS, GYRO_SIGNAL, strict=True)):
-            column = constants[:, :, GYRO.start + i]
             if by == UPRIGHT:
-                column += by_bias[:, :, into] * noise[:, by, None]
+                columns[:, :, i] += by_bias[:, :, into] * noise[:, by, None]
             elif by < UPRIGHT:
-                column[:] = by_bias[:, :, into] * self.rate[rows, by, None]
-        k = len(C)
-        of_gyro = ((gyro.reshape(k, -1, gyro.shape[2] // 3, 3) @ C[:, None])
-                   * (found.reshape(k, 1, -1, 3) @ C[:, None])).sum(axis=2)
-        for axes, size in ((V, part.sums.A), (P, part.sums.AA)):
-            turned = back @ of_gyro[:, axes]      # toward an axis, about an axis of b
-            own = turn(back, part.residual[:, axes]) - turned.sum(axis=2)
-            for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
-                column = constants[:, axes, ACCEL.start + i]
-                left = np.zeros((k, 3))
-                if by == UPRIGHT:
-                    column[:] = turn(C, size[:, :, into] * self.force[rows, by, None])
-                else:
-                    left[:, into] = own[:, by]
-                if into == by:      # the force along it, turned about another, toward the third
-                    for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
-                        left[:, toward] += turned[:, toward, about]
-                column += turn(C, left)
+                columns[:, :, i] = by_bias[:, :, into] * self.rate[rows, by, None]
+
+    def _by_forces(self, part: Motion, columns: Floats, upright: Floats, residual: Floats,
+                   of_gyro: Floats) -> None:
+        """
+        Put the derivatives of velocity, or of place, right that go by forces: columns (k, 3, a).
+
+        upright : (k, 3, 3) those by what lasts of the upright force, by the axis it enters.
+        of_gyro : (k, 3, 3) what the gyro's noise about each axis of b put into the residual.
+        """
+        back = transpose(part.C)
+        turned = back @ of_gyro      # toward an axis of b, about one
+        own = turn(back, residual) - turned.sum(axis=2)
+        for i, (into, by) in enumerate(zip(ACCEL_AXIS, ACCEL_SIGNAL, strict=True)):
+            noise = np.zeros_like(own)
+            if by == UPRIGHT:
+                columns[:, :, i] = turn(part.C, upright[:, :, into])
+            else:
+                noise[:, into] = own[:, by]
+            if into == by:      # the force along it, turned about another, toward the third
+                for about, toward in ((into - 1, into - 2), (into - 2, into - 1)):
+                    noise[:, toward] += turned[:, toward, about]
+            columns[:, :, i] += turn(part.C, noise)
 
 
 def lasting(x: Floats, T: Floats) -> Floats:
