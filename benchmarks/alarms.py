@@ -126,8 +126,6 @@ FAULTS: dict = {
     'WHEELS_SWAPPED': ('left is right', 'town', {'two_wheels': True}, {}, {},
                        lambda leg, rng: replace(leg, odometer=leg.odometer_right,
                                                 odometer_right=leg.odometer)),
-    'FIXES_ASTRAY': ('12 m off for 8 s, 40 an hour', 'town', {},
-                     {'bursts': 40.0, 'burst_size': 12.0, 'burst_time': 8.0}, {}, None),
 }
 RUNS = ('clean', *FAULTS)
 

@@ -93,8 +93,6 @@ class Code(Enum):
     COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
     FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
                                      'the receiver and the sky.')
-    FIXES_ASTRAY = NOTE, ('Nothing: they were left out, odometer and Imu hold what lies between; '
-                          'under open sky there are fewer.')
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark: level, gyro '
                               'bias and heading then come from rest.')

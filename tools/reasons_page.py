@@ -121,8 +121,6 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '`gnss.default_sigma` was taken.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '
         'that they claim. The sigma was made to match what is seen.',
-        Code.FIXES_ASTRAY: 'For seconds, or up to two minutes, the fixes jump off together, and '
-        'back: multipath between houses, or a receiver that took wrong whole cycles.',
     },
     'The drive': {
         Code.NO_STANDSTILL: 'There is no rest before the start mark. Level and gyro bias then '
@@ -195,8 +193,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'what least squares find.',
     },
     'All the samples at once': {
-        Code.NOT_CONVERGED: 'The estimate of the whole drive did not come to rest. Its values are '
-        'not to be used.',
+        Code.NOT_CONVERGED: 'The equations of the drive could not be solved, or their solution is '
+        'one that no IMU can have. There are no values.',
         Code.SCALE_NOT_DETERMINED: 'The drive says too little about the scale to state one.',
         Code.YAW_NOT_DETERMINED: 'The drive says too little about the yaw to state one.',
         Code.PARAMETER_NOT_DETERMINED: 'A further value, such as a lever arm or a delay, cannot '

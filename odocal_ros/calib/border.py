@@ -10,7 +10,7 @@
 """The information of a leg's data on the constants of the vehicle, no prior in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,8 +29,7 @@ class Border:
     names : of the constants.   value : (m,) where the leg was linearised, as settings have it:
     a lever arm is the whole one.   information : (m, m), semidefinite.   pull : (m,).
     centre, sigma : (m,) of the priors, inf where there is none.   used : (m,) the sigmas, those
-    widened that the leg gainsaid.   usual : (m,) of what may be there or not, and which of both
-    the leg's own evidence says, the sigma of what is there; 0 of others.
+    widened that the leg contradicts, and those of imperfections by the sizes it found.
     """
 
     names: tuple[str, ...]
@@ -40,10 +39,6 @@ class Border:
     centre: Floats
     sigma: Floats
     used: Floats
-    usual: Floats = field(default_factory=lambda: np.zeros(()))
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'usual', np.broadcast_to(self.usual, np.shape(self.value)))
 
     def widened(self, factor: float) -> 'Border':
         """Return what data are worth whose sigmas are too small by a factor."""

@@ -72,7 +72,6 @@ def carried_from(content: dict[str, Any]) -> Carried:
         entry = content['border']
         names = tuple(map(str, entry['names']))
         m = len(names)
-        entry = {'usual': [0.0] * m} | entry      # files of before know of none
         numbers = {f.name: _array(entry[f.name], (m, m) if f.name == 'information' else (m,),
                                   NOTHING.get(f.name, np.nan))
                    for f in fields(Border) if f.name != 'names'}

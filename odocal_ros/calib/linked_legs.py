@@ -10,7 +10,6 @@
 """The rows of several legs as one least squares: docs/method.md (S35) to (S37)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -35,9 +34,9 @@ class LinkedLegs:
             about = last.value[self.names.index(name)]
             self.take([b.turned(name, about) for b in self.borders])
         self.centre = last.centre
-        self.sigma, self.used, self.usual = (
+        self.sigma, self.used = (
             np.max([getattr(b, which) for b in self.borders], axis=0)
-            for which in ('sigma', 'used', 'usual'))
+            for which in ('sigma', 'used'))
         self.unit = np.where(np.isfinite(self.used), self.used, STEP_UNIT)
         self.drifting = self.names.index(drifting)
         # 0.1 ppm of ln K: no vehicle keeps it, and rows of less would swamp all others by rounding
@@ -107,31 +106,8 @@ class LinkedLegs:
         A, b = self.system(spread)
         rows, b = _left(A, b, self.place(len(self.borders) - 1))
         rows = rows / self.unit
-        every = np.all([b.usual > 0 for b in self.borders], axis=0)
         return Border(self.names, value, rows.T @ rows, rows.T @ (b - rows @ value),
-                      self.centre, self.sigma, self.used, self.usual * every)
-
-    def evidence(self, at: Ints) -> tuple[Floats, Floats]:
-        """
-        Return the legs' information on some constants, the others taken out with their priors.
-
-        Returns
-        -------
-        information (k, k), and the pull where all of them are zero, (k,).
-
-        """
-        A, b = self.system()
-        prior, centre = self._prior_rows(A.shape[1], at)
-        rows, b = _left(np.concatenate([A, prior]), np.concatenate([b, centre]),
-                        self.place(0)[at])
-        rows = rows / self.unit[at]
-        return rows.T @ rows, rows.T @ b
-
-    def with_priors(self, at: Ints, sigmas: Floats) -> list[Border]:
-        """Return the borders with other prior sigmas of some constants."""
-        first, used = self.sigma.copy(), self.used.copy()
-        first[at] = used[at] = sigmas
-        return [replace(b, sigma=first, used=used) for b in self.borders]
+                      self.centre, self.sigma, self.used)
 
     def disagreement(self, spread: dict[str, float] | None = None) -> tuple[float, float]:
         """
@@ -192,4 +168,4 @@ def _on(border: Border, names: tuple[str, ...]) -> Border:
         return out
     # a prior that a leg does not have is none that it has widened
     return Border(names, on(border.value, 0.0), D, on(border.pull, 0.0), on(border.centre, 0.0),
-                  on(border.sigma, 0.0), on(border.used, 0.0), on(border.usual, 0.0))
+                  on(border.sigma, 0.0), on(border.used, 0.0))

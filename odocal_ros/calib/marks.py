@@ -75,7 +75,7 @@ def mean_fix(t: Floats, position_n: Floats, covariance_n: Floats,
     covariance_n : (n, 3, 3) array
         As stated, m^2.
     correlation_time : float
-        s; 0: white; NaN: judged from the data.
+        s; 0: white; NaN: estimated from the data.
 
     Returns
     -------

@@ -91,14 +91,23 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
 
 def _scale(running: Running, asked: float) -> Prospect:
     e = running.method.estimates[SCALE]
-    slow = running.method.details['noise']['correlation_time'] > 0
     sigma = float(running.sigmas[0])
-    metres = _metres(running, sigma / asked, WAY_POWER_SLOW if slow else WAY_POWER)
+    slow = _slow_share(running)
+    power = WAY_POWER_SLOW * slow + WAY_POWER * (1 - slow)
+    metres = _metres(running, sigma / asked, power)
     now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
     return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
                     f'no {FARTHEST_M / 1000:.0f} km more bring it to what is asked', now)
+
+
+def _slow_share(running: Running) -> float:
+    """Return the share of the slow fix errors in what the fixes add to the scale's variance."""
+    by = {s.name: float((s.effects[0]**2).sum()) for s in running.method.sources
+          if s.name in ('fixes', 'slow_fix_errors')}
+    total = sum(by.values())
+    return by.get('slow_fix_errors', 0.0) / total if total else 0.0
 
 
 def _yaw(running: Running, asked: float) -> Prospect:

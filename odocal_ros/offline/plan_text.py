@@ -12,7 +12,7 @@
 import math
 import textwrap
 
-from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
+from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
 from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines

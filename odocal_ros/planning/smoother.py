@@ -15,14 +15,12 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, SLIPPING
-from odocal_ros.calib.smoother.imperfect import judged_priors
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import outcome, refused
 from odocal_ros.calib.smoother.problem import Problem, SPACING
-from odocal_ros.calib.smoother.slow_fix import WHITE_SHARE
+from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
 from odocal_ros.calib.smoother.smoother import too_little
-from odocal_ros.calib.smoother.state import Priors
 from odocal_ros.planning.drive import PlannedDrive
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.samples import Ideal, ideal
@@ -60,10 +58,7 @@ def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
     problem = Problem.of(made.leg, sigmas.config, made.imu)
     levels = planned_levels(problem, sigmas, made.fixes_in_one)
     try:
-        fit = _fit(problem, made, levels, problem.priors)
-        priors = judged_priors(fit, problem.grade, found=False)
-        if priors is not fit.priors:
-            fit = _fit(problem, made, levels, priors)
+        fit = _fit(problem, made, levels)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations cannot be solved: {error}')],
                        '1')
@@ -103,9 +98,9 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
         correlation_time=tau, **{k: max(v, least[k]) for k, v in values.items()})
 
 
-def _fit(problem: Problem, made: Ideal, levels: Levels, priors: Priors) -> Fit:
+def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     """Return the fit that stands where it is: no step is taken."""
-    state = made.state
+    state, priors = made.state, problem.priors
     weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
                np.nan, weighted, solve(weighted.normal()))

@@ -130,7 +130,7 @@ class GnssConfig:
     default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes that '
                                    'come without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Time over which fix errors stay '
-                                      'alike; 0: white; NaN: judged from the data.')
+                                      'alike; 0: white; NaN: estimated from the data.')
     use_velocity: bool = setting(False, ro=True, about='Subscribe to GNSS velocity '
                                  '(fix_velocity).')
 

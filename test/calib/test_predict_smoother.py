@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from smoother_legs import made, truth
 
-from odocal_ros.calib.smoother import bound, imperfect, problem, smooth
+from odocal_ros.calib.smoother import bound, problem, smooth
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import MODEL_FLOOR
@@ -38,7 +38,7 @@ from odocal_ros.settings.grades import GRADES
 NAMES = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
 ROAD = {'sway': 0.05, 'slip_walk': 0.01}       # what a drive is planned with
 WHITE = {'gnss.correlation_time': 0.0}
-USUAL = problem.imperfect_sigmas(GRADES['consumer'], 600.0)
+USUAL = problem.imperfect_sigmas(GRADES['consumer'])
 
 
 def sigmas_of(method):
@@ -121,8 +121,7 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
     config = with_settings(Config(), WHITE | {
         'imu.grade': grade, 'gnss.lever_arm_sigma': 1e-4, 'gnss.time_sigma': 0.0,
         'odometer.time_sigma': 0.0, 'imu.accel_scale_sigma': 0.0})
-    for module in (problem, imperfect):
-        monkeypatch.setattr(module, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
+    monkeypatch.setattr(problem, 'imperfect_sigmas', lambda *_: np.zeros(len(USUAL)))
     for slip, quantum, table in ((0.05 / math.sqrt(10), 0.0, white), (0.0, 0.02, pulses)):
         method = predict_smoother(drive(), Sigmas(config=config, slip=slip, quantum=quantum))
         assert 1e6 * method.estimates[NAMES[0]].sigma == pytest.approx(
@@ -131,7 +130,8 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
 
 @pytest.fixture
 def town_sigmas():
-    return Sigmas(config=with_settings(Config(), WHITE))
+    # of an Imu whose gyro feels no force, which else is most of a consumer grade's pitch
+    return Sigmas(config=with_settings(Config(), WHITE | {'imu.gyro_by_force_sigma': 0.0}))
 
 
 def test_fixes_are_thinned_without_loss(town_sigmas):
@@ -145,9 +145,10 @@ def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     drive = stop_and_go()
     fine, coarse = (sigmas_of(predict_smoother(drive, town_sigmas, spacing))
                     for spacing in (1.0, WIDEST_SPACING))
-    # each keeps what a second has, but for what happens within: a tenth or so, to the safe side
+    # each keeps what a second has, but for what happens within, to the safe side: a tenth or so,
+    # twice that of the yaw, which how a turn sets in tells from axes of the Imu that are off
     assert (coarse >= fine).all()
-    assert (coarse < 1.15 * fine).all()
+    assert (coarse < 1.2 * fine).all()
     assert spacing_for(drive) == 1.0
     assert spacing_for(replace(drive, t=drive.t * 3)) == pytest.approx(3.0, rel=0.01)
     assert spacing_for(replace(drive, t=drive.t * 10)) == WIDEST_SPACING

@@ -17,10 +17,10 @@ from smoother_legs import made, truth
 
 from odocal_ros.calib.smoother import bound
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.priors import START_SIGMAS
+from odocal_ros.calib.smoother.priors import SIZE, START_SIGMAS
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.rests import STILL_SPEED, STILL_TURN
-from odocal_ros.calib.smoother.state import BARE, E, M, SLOW, WITH_SLOW
+from odocal_ros.calib.smoother.state import BARE, E, IMPERFECT, M, SLOW, WITH_SLOW
 
 
 @pytest.mark.parametrize('correlation_time', [0.0, 40.0])
@@ -89,7 +89,9 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     add(single[:15], (block(0),), np.diag(1 / first))
     if n == WITH_SLOW:
         add(single[SLOW], (block(0),), np.diag(1 / np.sqrt(power)))
-    add(np.eye(M), (border,), np.diag(1 / problem.priors.constants))
+    prior = problem.priors.constants.copy()
+    prior[IMPERFECT] *= np.sqrt(SIZE)         # the first sizes
+    add(np.eye(M), (border,), np.diag(1 / prior))
     A = np.concatenate(rows)
     # by QR of the rows, which does not square their condition: scaled columns
     scale = np.linalg.norm(A, axis=0)

@@ -18,12 +18,15 @@ from smoother_legs import leg_of, made, truth, with_velocity
 from odocal_ros.calib.smoother.chain import Normal, solve
 from odocal_ros.calib.smoother.equations import Equations, PARTS
 from odocal_ros.calib.smoother.motion import D
+from odocal_ros.calib.smoother.priors import PriorRows, SIZE
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SlowError, TIME_SPREAD, USUAL_TIME
 from odocal_ros.calib.smoother.state import (
     ACCEL,
     BA,
     BG,
+    CONSTANTS,
+    constants_from,
     E,
     GNSS_DELAY,
     GYRO,
@@ -68,7 +71,7 @@ def shaken():
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
     c[SPEED_OFFSET] = 0.0
-    c[IMPERFECT] *= [*[1] * 6, *[0.1] * 6, *[1] * 6, 0.0, 0.03, 0.003, *[0.0] * 6, 1e3]
+    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.03, 0.003, *[0.0] * 6, 1e3]
     return problem, state.moved(step, c)
 
 
@@ -185,6 +188,21 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
     levels = problem.first_levels.but(correlation_time=20.0, slow=0.01, slow_up=0.02,
                                       fix=1e4, fix_up=1e4)
 
+    weighted, solved, at = least(problem, state, levels)
+    quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
+    score = (quadratic - expected) / 2
+    if name == 'correlation_time':      # a score as it is, and what is believed of the time
+        score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
+    assert score == pytest.approx(slope(at, levels, name), rel=1e-3)
+    assert abs(score) > 0.1
+
+
+def least(problem, state, levels):
+    """
+    Return rows and step near the least cost, where it does not change with the state.
+
+    And what gives them at other levels, with the logarithm of the restricted likelihood.
+    """
     def at(levels):
         weighted = Equations(problem, state, sums).at(levels)
         solved = solve(weighted.normal())
@@ -192,17 +210,55 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
         return weighted, solved, -0.5 * (weighted.cost() + weighted.log_R_total()
                                          + solved.log_determinant)
 
-    for _ in range(3):      # to the least cost, where it does not change with the state
+    for _ in range(3):
         sums = problem.sums(state)
-        weighted, solved, _ = at(levels)
+        _, solved, _ = at(levels)
         state = state.moved(solved.step, solved.step_border)
     sums = problem.sums(state)
-    weighted, solved, _ = at(levels)
-    quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
-    score = (quadratic - expected) / 2
-    if name == 'correlation_time':      # a score as it is, and what is believed of the time
-        score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
+    return *at(levels)[:2], at
+
+
+def slope(at, levels, name):
+    """Return by how much the likelihood rises with the logarithm of a level."""
     h = 1e-2      # at 1e-3 rounding of the cost is 1e-3 of the score
     above, below = (at(levels.but(**{name: levels[name] * np.exp(x)}))[2] for x in (h, -h))
-    assert score == pytest.approx((above - below) / (2 * h), rel=1e-3)
-    assert abs(score) > 0.1
+    return (above - below) / (2 * h)
+
+
+def sized(problem, where, sigma, centre):
+    """Return a problem with other priors of some constants."""
+    constants, centres = problem.priors.constants.copy(), problem.priors.centre.copy()
+    constants[where], centres[where] = sigma, centre
+    return replace(problem, priors=replace(problem.priors, constants=constants, centre=centres),
+                   kept=None)
+
+
+# alone and two of a kind. The drive knows them to 1e-4 s^2 and 6e-4: of their priors by 1e-4
+@pytest.mark.parametrize(('name', 'where', 'prior'), [
+    ('size_fix_lag_square', constants_from('fix_lag_square', 'fix_lag_square'), 1.0),
+    ('size_scale_by_force', constants_from('scale_by_pull', 'scale_by_braking'), 0.1)])
+def test_sizes_of_what_is_well_known_climb_the_restricted_likelihood(shaken, name, where, prior):
+    problem, state = shaken
+    problem = sized(problem, where, prior, 1.5 * prior)
+    levels = problem.first_levels
+    weighted, solved, at = least(problem, state, levels)
+    quadratic, expected = weighted[PriorRows].components(solved.neighbours())[name]
+    # 1.5 of the prior squared, by the size, for each; each is known
+    count = where.stop - where.start
+    assert quadratic == pytest.approx(count * 1.5**2 / SIZE, rel=0.02)
+    assert expected == pytest.approx(count, rel=1e-3)
+    score = (quadratic - expected) / 2
+    assert score == pytest.approx(slope(at, levels, name), rel=1e-3)
+
+
+def test_what_the_drive_hardly_knows_has_no_say_in_its_size(shaken):
+    problem, state = shaken
+    where = CONSTANTS.index('squat_by_jerk')
+    # known to 1e-3 by the drive, to 7e-6 by the prior; a misfit pulls by 100 sigmas of the drive
+    problem = sized(problem, where, 1e-5, 0.1)
+    levels = problem.first_levels
+    weighted, solved, at = least(problem, state, levels)
+    name = 'size_squat_by_jerk'
+    assert slope(at, levels, name) > 0.1         # the likelihood would have it grow
+    # (7e-6 / 1e-3)^2 of that: 5e-5
+    assert max(weighted[PriorRows].components(solved.neighbours())[name]) < 2e-4

@@ -119,21 +119,6 @@ def test_what_is_decided_once_is_decided_anew_when_the_leg_has_grown_by_half(loo
     assert [x.once_s > 0 for x in looks] == [False, False, True, False, True, False, True, False]
 
 
-def test_fixes_that_went_astray_stay_left_out(config):
-    drive = drive_of(fix_noise='rtk')
-    t = (drive.fix.stamp_ns - drive.truth.start_ns) * 1e-9
-    wrong = (t > 30.0) & (t < 50.0)
-    fix = replace(drive.fix, height=drive.fix.height + 4.0 * wrong,
-                  latitude=drive.fix.latitude + 5e-7 * wrong)     # rad: 3 m
-    first, second = (seen.running.method for seen in looked(
-        replace(drive, fix=fix), config, looks=(100.0, 120.0)))
-    for method in (first, second):
-        said = [r.text for r in method.reasons if r.code is Code.FIXES_ASTRAY]
-        assert len(said) == 1
-        assert 'in a stretch' in said[0]
-    assert second.details['iterations'] < first.details['iterations']
-
-
 def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, looks, monkeypatch):
     so_far = SmootherSoFar()
 
@@ -192,25 +177,23 @@ def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(con
     assert last.sigmas[0] > 1.5 * blind.sigmas[0]      # it does decide
 
 
-def test_what_is_believed_of_it_grows_with_what_the_drive_tells(config):
-    error = 3e-3
-    drive = drive_of(accel_scale_error=error)
+def test_the_size_of_an_imperfection_is_carried_on(config):
+    drive = drive_of(accel_scale_error=3e-3)        # as large as is usual for the grade
     graded = with_settings(config, {'imu.accel_scale_sigma': math.nan})
     first, later = looked(drive, graded, (40.0, 60.0))
-    assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no fit from nothing
+    assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
     leg = SmootherSoFar().look(later.leg, graded)
 
-    def prior(running):
-        details = running.method.details
-        return (details['accelerometer_scale_x']['sigma']
-                / details['posterior_to_prior']['accelerometer_scale_x'])
+    def size(running):
+        return running.method.details['noise']['size_accelerometer_scale']
 
-    assert prior(first.running) < 0.5 * error       # there might well be none
-    assert prior(leg) == pytest.approx(error)       # now it is; the grade has such an error
-    assert prior(later.running) == pytest.approx(error)
+    # two passes of a level that one fit settles: within a tenth of its own sigma of about 1
+    assert size(later.running) == pytest.approx(size(leg), rel=0.1)
     (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
-    assert abs(off) < 0.2           # as of any look that goes on from the last
-    assert ratio == pytest.approx(1.0, abs=0.1)
+    # as of any look that goes on from the last; in 80 s the level of slow errors is good to a
+    # factor of e in its variance, and still falls by a tenth a pass where a fit may end
+    assert abs(off) < 0.3
+    assert ratio == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize('allowed', [0, 3])
@@ -239,8 +222,8 @@ def test_slow_errors_are_allowed_for_before_they_can_be_seen(config, looks):
                                                                 seen(leg, whites)))
     assert abs(slow.value - drive.truth.scale) < 3 * slow.sigma
     assert abs(white.value - drive.truth.scale) > 5 * white.sigma
-    # white fixes that scatter as they say leave nothing hidden
-    assert seen(looks[0].leg, config).sigmas == pytest.approx(seen(looks[0].leg, whites).sigmas)
+    # white fixes pay for the slow part that they might have: never with a smaller sigma
+    assert (seen(looks[0].leg, config).sigmas >= 0.95 * seen(looks[0].leg, whites).sigmas).all()
 
 
 def test_an_imu_that_faces_down_is_read_as_such(config, looks):
@@ -365,7 +348,8 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     known = {'distance_m': 300.0, 'max_speed': 10.0}
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
-    assert ' m/pulse +- 2000 ppm so far; 500 m more bring it to the asked 1000 ppm; yaw ' in told
+    # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
+    assert ' m/pulse +- 2000 ppm so far; 710 m more bring it to the asked 1000 ppm; yaw ' in told
     assert told.endswith('; stop and start 12 times, or turn as often, for the yaw')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; as it was 40 s ago; ' in told

@@ -71,8 +71,7 @@ def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
 
 def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     leg = made.leg()
-    # one part tells that the Imu has no errors of scale and axes, the other cannot; tyres that
-    # walk by a tenth in a day do not between two parts of one leg
+    # tyres that walk by a tenth in a day do not between two parts of one leg
     config = settings(made, heading_sigma=None, method='smoother', verdict__max_yaw_sigma=0.0087,
                       verdict__max_scale_sigma=0.001, verdict__scale_drift_per_day=0.1)
     cut = silent(leg, GAP)
@@ -90,8 +89,9 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     for name, true in ((SCALE, truth.scale), (YAW, truth.yaw), (PITCH, truth.pitch)):
         e = whole.estimates[name]
         assert abs(e.value - true) < 4 * e.sigma, name
-        assert e.sigma < min(one.methods['smoother'].estimates[name].sigma
-                             for one in results), name
+        # sizes of imperfections are the mean of both parts', of which one may be smaller: a tenth
+        assert e.sigma < 1.1 * min(one.methods['smoother'].estimates[name].sigma
+                                    for one in results), name
 
 
 def test_where_no_part_carries_the_leg_is_rejected_as_it_is(made):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
 WALK_SPEED = 1.0     # m/s, below which a slope is not its rise over its way: judgement
+WARM_TIME = 600.0    # s, physical: tyres warm within ten minutes of driving
 RATE_WINDOW = 0.1    # s, judgement: about a keyframe, in which vibration averages down
 
 
@@ -104,13 +105,18 @@ class Axle:
         way = np.linalg.norm(sums.S @ (state.scale * state.forward), axis=1)
         t = (state.t[1:] + state.t[:-1]) / 2
         share = way / max(way.sum(), 1e-9)
-        mean: Floats = share @ varies_with(way / sums.T, t, self.speeding_up())
+        mean: Floats = share @ varies_with(way / sums.T, t - state.t[0], self.speeding_up())
         return mean
 
 
 def varies_with(speed: Floats, t: Floats, faster: Floats) -> Floats:
-    """Return what the scale varies with, docs/method.md (S11), as TYRES has it: (..., 4)."""
+    """
+    Return what the scale varies with, docs/method.md (S11), as TYRES has it: (..., 4).
+
+    t : s since the begin of the leg.
+    """
     # m/s^2, 1/m: what a car's tyres pull at a steady speed, against rolling and air
     force = faster + 0.1 + 1e-4 * speed**2
-    return np.stack([speed**2 / (2 * FAST_SPEED), t, np.maximum(force, 0.0),
+    warm = WARM_TIME * (1 - np.exp(-t / WARM_TIME))
+    return np.stack([speed**2 / (2 * FAST_SPEED), warm, np.maximum(force, 0.0),
                      np.minimum(force, 0.0)], -1)

@@ -14,28 +14,22 @@ import numpy as np
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.priors import PriorRows
-from odocal_ros.calib.smoother.problem import imperfect_sigmas
-from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT
+from odocal_ros.calib.smoother.state import CONSTANTS
 from odocal_ros.data.arrays import Floats
-from odocal_ros.settings.grades import Grade
 
 
-def border_of(fit: Fit, configured: Floats, grade: Grade) -> Border:
+def border_of(fit: Fit, configured: Floats) -> Border:
     """
     Return the border of a fit, at its last linearisation.
 
     The Schur complement of the constants less their priors, which the elimination leaves as they
     are.
 
-    configured : (M,) values of the settings that constants are corrections to.   grade : Grade,
-    that the Imu is taken for.
+    configured : (M,) values of the settings that constants are corrections to.
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
-    weight, usual = 1 / priors.constants**2, np.zeros(len(at))
-    if not fit.levels.correlation_time:       # no evidence of what is imperfect otherwise
-        t = fit.weighted.state.t
-        usual[IMPERFECT] = imperfect_sigmas(grade, t[-1] - t[0])
+    weight = 1 / priors.constants**2
     return Border(
         CONSTANTS, at + configured, fit.solved.reduced - np.diag(weight),
         fit.solved.g_reduced + weight * (at - priors.centre), priors.centre + configured,
-        fit.first.constants, priors.constants, usual)
+        fit.first.constants, priors.constants)

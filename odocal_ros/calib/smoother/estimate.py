@@ -24,13 +24,13 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
 from odocal_ros.calib.smoother.motion_rows import MotionRows
-from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.noise import Levels, ROAD
 from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
 from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
+from odocal_ros.calib.smoother.priors import SIZE, SIZES
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.state import (
-    GYRO_SCALE,
     IMPERFECT,
     M,
     PITCH,
@@ -60,10 +60,9 @@ class Settling:
     others: float = 0.3         # weight of what is not scale or mounting, in that
     nearly: float = 0.1         # scale and mounting, after the last pass
     creeping: float = 0.5       # the same: values that are worth having, with wider sigmas
-    sigmas: float = 0.01        # relative change of the sigmas of scale and mounting
+    sigmas: float = 0.02        # relative change of the sigmas of scale and mounting
     # rad, sigma: an angle known no better drifts where the cost is flat, and is refused
     flat_angle: float = 0.1
-    spread: float = 0.05        # relative change of a slip's variance from which it moves
 
 
 @dataclass(frozen=True)
@@ -82,11 +81,12 @@ SETTLING, RELAXATION = Settling(), OverRelaxation()
 PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
 # levels of rows that slips and jumps are factors on
 SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
-JUMPING = ('slow', 'slow_up', 'correlation_time')
 # sigmas of a prior beyond which it gives way to the data. Statistical: one sound prior in 22
 PRIOR_GIVES_WAY = 2.0
-SMALL = np.isin(np.arange(M), np.r_[GYRO_SCALE, IMPERFECT])    # what is there or is not
-AGAIN_PASSES = 6    # of a fit that sets out from one that settled, but for a prior: few are needed
+# of the logarithm of a size. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
+# (docs/decisions/0016)
+SIZE_SPREAD = 1.0
+AGAIN_PASSES = 6    # judgement: of a fit that sets out from one that settled, but for a prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     spread = about.spread if about else np.ones((len(state.t) - 1, SPREAD))
     # passes in which heavy tails are looked for: before, residuals are none, and in the end they
     # rest
-    tails, last_tails, slipping = 1 if about else 3, 15, False
+    tails, last_tails = 1 if about else 3, 15
     of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
@@ -171,7 +171,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         move = np.abs(solved.step_border / sigma * weight).max()
         change = np.abs(np.log(sigma[:3] / before)).max()
         before = sigma[:3]
-        settled = bool(fitted and not slipping and move < SETTLING.moves
+        settled = bool(fitted and move < SETTLING.moves
                        and (frozen or change < SETTLING.sigmas and count > tails + 2))
         first_fitted, was_fitted = fitted and not was_fitted, fitted
         fitted = bool(first_fitted or move < (
@@ -184,14 +184,15 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             still = np.abs(solved.step_border / sigma)[:3].max()
             settled = settled or bool(max(still, change) < SETTLING.nearly)
             break
+        if about is None and count == 3:
+            problem.judge_effective(weighted)
         if not frozen:
             near = solved.neighbours()
-            tail = tails <= count <= last_tails
-            # slips and the levels of what slips are factors on the same rows: never in one pass
-            found = slips(weighted, near, spread) if tail and not slipping else spread
-            slipping = bool(np.abs(np.log(found / spread)).max() > SETTLING.spread)
-            levels = update(weighted, near, levels, problem, pace, slipping)
-            spread = found
+            tail, before_levels = tails <= count <= last_tails, levels
+            levels = update(weighted, near, levels, problem, pace, fitted)
+            # slips and the levels of what slips are factors on the same rows: judged at the new
+            if tail:
+                spread = slips(weighted, near, spread, before_levels, levels)
             if tail:
                 priors = widened(first, priors, state, solved, near, fitted)
             del near
@@ -203,18 +204,20 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
 
 
 def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
-           pace: dict[str, tuple[float, float]], slipping: bool = False) -> Levels:
+           pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
     """
     Return levels one step on to the maximum of the restricted likelihood: docs/method.md (S27).
 
-    pace : power and last step of each level, kept up to date.   slipping : leave levels alone that
-    slips and jumps are factors on.
+    pace : power and last step of each level, kept up to date.
     """
     new = {}
     for name, (quadratic, expected) in weighted.components(neighbours).items():
-        if slipping and name in SLIPPING + JUMPING:
-            continue
         level = levels[name]
+        if name in SIZES:
+            if not fitted:      # what multiplies noise waits until residuals are noise
+                continue
+            new[name] = max(level * _size_step(level, quadratic, expected), problem.least[name])
+            continue
         # the others have one that a level is as it is: more end the way to a small noise too early
         pseudo = PRIOR_ROWS.get(name, 1.0)
         pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
@@ -229,14 +232,30 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
     return levels.but(**new)
 
 
-def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats) -> Floats:
-    """Return factors on variances where an interval lies far out: (K, SPREAD)."""
+def _size_step(level: float, quadratic: float, expected: float) -> float:
+    """Return the factor on a size, log-normal about the usual one: a safeguarded Newton step."""
+    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / SIZE_SPREAD**2
+    ratio = gradient / (max(expected, quadratic) / 2 + SIZE_SPREAD**-2)
+    step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio
+    return float(np.exp(min(step, 2.0)))
+
+
+def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Levels,
+          onward: Levels) -> Floats:
+    """
+    Return factors on variances where an interval lies far out: (K, SPREAD).
+
+    levels, onward : of this pass and of the next, by which they are judged.
+    """
     noise, found = weighted[MotionRows].road_noise(neighbours)
     jumps = np.zeros((2, len(noise), 1))
     if 'slow' in weighted.parts:
         jumps = weighted[SlowError].jumps(neighbours)
     noise, found = (np.concatenate(x, axis=1) for x in zip((noise, found), jumps, strict=True))
-    z2 = noise**2 / np.maximum(found, 1e-12)
+    grown = weighted[MotionRows].noise.grown({n: onward[n] / levels[n] for n in ROAD})
+    jumped = onward['slow'] / levels['slow'] if 'slow' in weighted.parts else 1.0
+    grown = np.concatenate([grown, np.full((len(grown), 1), jumped)], axis=1)
+    z2 = noise**2 / np.maximum(found, 1e-12) / grown
     z2[found < 0.02] = 0.0          # of a noise that the data hardly see nothing is said
     wanted = np.clip(spread * z2 / TAIL_SIGMAS**2, 1.0, 1e6)
     # half way in the logarithm: neighbours share a slip, and would hand it to and fro
@@ -250,17 +269,13 @@ def widened(first: Priors, now: Priors, state: State, solved: Solved, neighbours
     """
     Return priors widened where the data are far from their centre, docs/method.md (S30).
 
-    Those of what is small give way only where the data know more than they do: nothing would
-    gainsay a wide one. Nor do they while derivatives hold noise (fitted: they do not), which calls
-    for a smaller signal: a slow drive would shrink to nothing.
+    Those of imperfections stay: their sizes are levels.
     """
     n = solved.step.shape[1]
     P0 = np.diagonal(neighbours[0])[:n]
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    # of the prior's variance half is left where the data know as much
-    untold = SMALL & ((variance > now.constants**2 / 2) | (not fitted))
-    constants[untold] = now.constants[untold]
+    constants[IMPERFECT] = now.constants[IMPERFECT]       # whose sizes are levels
     constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
     return replace(
         now,

@@ -10,10 +10,9 @@
 """
 The fit of a leg that grows: each starts from the one before.
 
-It takes over state, noise levels, priors and slips, is reckoned on over what is new, and is there
-after two passes. The accelerometer's scale error is judged on the way. What is decided once for a
-leg, the sort of fix errors and where the Imu faces, is decided anew from nothing whenever the leg
-has grown by half.
+It takes over state, noise levels, priors and slips, is extended over what is new, and converges
+in two passes. Whether it has found the right minimum is checked against a coarse fit from a cold
+start whenever the leg has grown by half.
 """
 
 from collections.abc import Callable
@@ -24,17 +23,14 @@ import numpy as np
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.failed import raised_if_wild
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.astray import leave_out, Stretch
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
-from odocal_ros.calib.smoother.imperfect import judge_imperfect, judge_running, with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
 from odocal_ros.calib.smoother.problem import Problem, SPACING
-from odocal_ros.calib.smoother.remarks import model_floor
-from odocal_ros.calib.smoother.smoother import best_fit, likeliest_fit
-from odocal_ros.calib.smoother.state import IMPERFECT, LN_K, PITCH, State, YAW
+from odocal_ros.calib.smoother.smoother import best_fit
+from odocal_ros.calib.smoother.state import LN_K, PITCH, State, YAW
 from odocal_ros.calib.smoother.warm_start import carried, rows_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
@@ -46,7 +42,7 @@ LONG_LEG = 660.0
 FEW_KEYS = 150
 LOOK_PASSES = 2         # judgement: from the last fit; AGAIN_PASSES where that is too few
 ANEW_GROWTH = 1.5       # judgement: of the leg, until what is decided once is decided anew
-BEARS_OUT_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
+CONFIRM_SIGMAS = 3.0  # statistical: of three values chance reaches it once in 120 at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,6 @@ class GrowingFit:
         self.once_s = 0.0
         self._last: WarmStart | None = None
         self._per_effective: dict[str, float] = {}
-        self._astray: list[Stretch] = []
         self._judged = 0.0       # s of the leg when it was last fit from nothing
 
     def forget(self) -> None:
@@ -102,7 +97,7 @@ class GrowingFit:
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
             raise BadData(f'the smoother cannot solve the way so far: {error}') from None
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
-        self._per_effective, self._astray = problem.per_effective, problem.astray
+        self._per_effective = problem.per_effective
         return so_far
 
     def _fit(self, last: WarmStart | None, view: SmootherLeg, config: Config,
@@ -112,8 +107,6 @@ class GrowingFit:
         problem = Problem.of(view, config, rows_of(view, spacing))
         problem.per_effective = self._per_effective
         begun = None if last is None else carried(last, problem)
-        if begun is not None:
-            leave_out(problem, self._astray, begun.state.constants)
         if begun is None:
             begin = self._cpu_s()
             best = best_fit(problem, config, trace)
@@ -122,58 +115,36 @@ class GrowingFit:
                 self.once_s += self._cpu_s() - begin
             return best, problem
         # the levels are let alone until the state is on the new stretch too
-        near = judge_running(      # more of a drive tells more of what is imperfect
-            fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun, trace=trace),
-            problem.grade).outline()
+        near = fit(problem, begun.state, begun.levels, 1, frozen=True, about=begun,
+                   trace=trace).outline()
         best = fit(problem, near.state, near.levels, LOOK_PASSES, about=near, trace=trace)
-        if not best.settled:
+        if not best.settled or best.creeping:
             best = fit(problem, best.state, best.levels, AGAIN_PASSES, about=best, trace=trace)
         if duration > ANEW_GROWTH * self._judged:
-            best = self._borne_out(best, problem, config, trace)
+            best = self._confirmed(best, problem, config, trace)
         return best, problem
 
-    def _borne_out(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
-        """Return the fit as a coarse one from nothing bears it out, else one from nothing."""
+    def _confirmed(self, best: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
+        """Return the fit if a coarse one from a cold start agrees with it, else a new one."""
         begin = self._cpu_s()
         view = problem.leg
         duration = view.t_stop - view.t_begin
         other = Problem.of(view, config, rows_of(view, max(SPACING, duration / FEW_KEYS)))
-        anew = likeliest_fit(other, config, trace)
+        anew = best_fit(other, config, trace)
         self._judged = duration
         if anew.settled:
             problem.per_effective = other.per_effective
-            leave_out(problem, other.astray, anew.state.constants)
-            best = _decided_anew(best, anew, problem, config, trace)
+            sigma = np.sqrt(np.diag(anew.solved.covariance))
+            apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
+            if apart.max() > CONFIRM_SIGMAS:
+                best = best_fit(problem, config, trace)
         self.once_s += self._cpu_s() - begin
         return best
 
 
-def _decided_anew(best: Fit, anew: Fit, problem: Problem, config: Config, trace: Trace) -> Fit:
-    """Return a fit with the fix errors of another, and judged as one from nothing is."""
-    slow = anew.levels.correlation_time or best.levels.correlation_time
-    none = with_imperfect(best.first, problem.priors.constants[IMPERFECT])
-    unjudged = (none.constants == best.first.constants).all()
-    state, levels = best.state, best.levels
-    if slow:
-        fixes = {name: anew.levels[name] for name in ('fix', 'fix_up', 'slow', 'slow_up')}
-        levels = levels.but(correlation_time=anew.levels.correlation_time, **fixes)
-    if not levels.correlation_time:
-        state = replace(state, slow_n=np.zeros_like(state.slow_n))
-    if slow or not unjudged:
-        about = replace(best, first=none, priors=with_imperfect(
-            best.priors, problem.priors.constants[IMPERFECT]))
-        best = fit(problem, state, levels, AGAIN_PASSES, about=about, trace=trace)
-    sigma = np.sqrt(np.diag(anew.solved.covariance))
-    apart = np.abs(anew.state.constants - best.state.constants)[:3] / sigma[:3]
-    if apart.max() > BEARS_OUT_SIGMAS:
-        return best_fit(problem, config, trace)
-    return judge_imperfect(problem, best, trace)
-
-
 def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> SoFar:
     method = outcome(view, problem, best, config)
-    covariance = floored(best.solved.covariance * method.details['widened']**2,
-                         model_floor(best.state.constants, best.priors.constants))
+    covariance = floored(best.solved.covariance * method.details['widened']**2)
     sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     found = dict(method.estimates)

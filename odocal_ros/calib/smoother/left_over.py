@@ -54,6 +54,26 @@ def left_over(leg: SmootherLeg, problem: Problem, fit: Fit) -> dict[str, NDArray
             for name, pair in rows.items()} | {'left_fix_t': leg.t_fix[problem.use]}
 
 
+def correlation(t: Floats, residual: Floats, width: float = 2.0) -> tuple[float, float]:
+    """
+    Return the correlation of neighbouring bins of residuals and its sigma, were they white.
+
+    t : (m,) s.   residual : (m, c) in sigmas.   width : of a bin, s.
+    """
+    if len(t) < 4:
+        return 0.0, 1.0
+    cell = np.floor((t - t[0]) / width).astype(int)
+    at, first = np.unique(cell, return_index=True)
+    count = np.diff(np.append(first, len(t)))
+    mean = np.add.reduceat(residual, first, axis=0) / np.sqrt(count)[:, None]
+    beside = np.flatnonzero(np.diff(at) == 1)
+    power = (mean**2).mean()
+    if len(beside) < 5 or power == 0:
+        return 0.0, 1.0
+    return (float((mean[beside] * mean[beside + 1]).mean() / power),
+            float(1 / np.sqrt(residual.shape[1] * len(beside))))
+
+
 def normalised(weighted: Weighted) -> dict[str, dict[str, float]]:
     """Return the whitened residuals' rms and tails by sensor, before weights take off tails."""
     motion, fixes = weighted[MotionRows].r, weighted[Fixes]

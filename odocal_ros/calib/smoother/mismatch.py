@@ -15,6 +15,7 @@ from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.outside import Heading
+from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
@@ -49,7 +50,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; estimated from the drive instead',
                               '' if any('gyro' in x for x in worse) else OF_FORCE))
-    odd = ['the noise levels had not settled'] * fit.creeping
+    move = 0.0 if fit.settled and not fit.creeping else moving(fit)
+    odd = [f'after {fit.iterations} passes the estimates still moved by {move:.2g} of their '
+           'sigmas'] * bool(move)
     odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
     if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
         odd.append(BY_SHAKING)
@@ -66,7 +69,15 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     if odd:
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
                               SHAKEN if odd == [BY_SHAKING] else ''))
-    return 2.0 if odd else 1.0, reasons      # judgement: nothing tells by how much it is off
+    # judgement: nothing tells by how much a model is off; a fit that has not settled may be off by
+    # what it still moves, several times
+    return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
+
+
+def moving(fit: Fit) -> float:
+    """Return by how much of their sigmas scale, yaw and pitch moved in the last pass, at most."""
+    step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
+    return float(np.abs(step[:WANTED]).max())
 
 
 def _heading(heading: Heading, error: float) -> list[Reason]:

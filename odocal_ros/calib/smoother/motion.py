@@ -149,7 +149,7 @@ class Motion:
         speed = np.linalg.norm(self.sums.S @ self.f, axis=1) / T[:, 0]
         t = (state.t[1:] + state.t[:-1]) / 2
         self.from_mean = varies_with(
-            speed, t, self.axle.speeding_up()) - self.axle.means_by_way(self.sums)
+            speed, t - state.t[0], self.axle.speeding_up()) - self.axle.means_by_way(self.sums)
         self.varied = 1 + self.from_mean @ c[TYRES, None]
         pitch, yaw = (self.pushed * c[LEAN]).reshape(-1, 2, 2).sum(axis=1).T
         self.leaned = state.scale * (np.outer(pitch, self.up) - np.outer(yaw, self.left))

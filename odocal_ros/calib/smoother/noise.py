@@ -121,6 +121,13 @@ class IntervalNoise:
             out[:, D, column] = self.axes[rows, axis] * root[:, None]
         return out
 
+    def grown(self, by: dict[str, float]) -> Floats:
+        """Return by how much the road's variances along, left and up grow with levels: (K, 3)."""
+        out = np.ones((len(self.road), 3))
+        for column, (name, axis) in enumerate(ROAD.items()):
+            out[:, axis] = np.where(self.road[:, column] > 0, by[name], out[:, axis])
+        return out
+
     def covariance(self, levels: Levels, rows: slice = slice(None)) -> Floats:
         """Return the covariance of the rows of the intervals of a slice, (k, 18, 18)."""
         root = np.sqrt([levels[INTERVAL[i]] for i in self.component])

@@ -22,16 +22,15 @@ from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.fixes import Fixes
-from odocal_ros.calib.smoother.left_over import bias_sigmas, left_over, normalised
+from odocal_ros.calib.smoother.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, model_floor, remarks
+from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, MODEL_FLOOR, remarks
 from odocal_ros.calib.smoother.shares import shares
-from odocal_ros.calib.smoother.slide import assumed, NO_TURN
+from odocal_ros.calib.smoother.slide import assumed
 from odocal_ros.calib.smoother.slip import find_slips, slip_reasons, SLIP_VARIANCE
-from odocal_ros.calib.smoother.slow_fix import correlation
 from odocal_ros.calib.smoother.state import (
     BG,
     CONSTANTS,
@@ -67,21 +66,6 @@ def refused(reasons: Iterable[Reason], scale_unit: str,
                         details or {})
 
 
-def not_settled(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
-    """Return the refusal of a fit that goes to and fro: what moves, and what may be the cause."""
-    move = np.abs(fit.solved.step_border[:3]) / np.sqrt(np.diag(fit.solved.covariance))[:3]
-    worst = int(np.argmax(move))
-    text = (f'after {fit.iterations} passes {in_words([CONSTANTS[worst]])} still moves by '
-            f'{move[worst]:.2g} of its sigma')
-    lacks = [f'has turns of {np.rad2deg(problem.turned):.0f} deg in all'] * (
-        problem.turned < NO_TURN)
-    lacks += ['does not stop'] * (not problem.still.any())
-    if lacks:
-        text += f'; the drive {" and ".join(lacks)}'
-    _, odd = mismatch(problem, fit, config)
-    return refused([Reason(Code.NOT_CONVERGED, text), *odd], leg.scale_unit)
-
-
 def no_imu(fit: Fit) -> list[Reason]:
     """Return why a fit is implausible whose Imu no maker would sell, empty else."""
     c = fit.state.constants
@@ -108,8 +92,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     slips = find_slips(fit, near, count)
     reasons += slip_reasons(fit, slips, count)
     state, c = fit.state, fit.state.constants
-    floor = model_floor(c, fit.priors.constants)
-    covariance = floored(fit.solved.covariance * widen**2, floor)
+    covariance = floored(fit.solved.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))
     reasons += remarks(problem, fit, sigma, config)
     after = np.sqrt(np.diag(fit.solved.covariance)) / fit.first.constants
@@ -130,7 +113,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
-               Source('model', np.diag(floor))]
+               Source('model', np.diag(MODEL_FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
                         | left_over(leg, problem, fit)
@@ -138,13 +121,13 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                            'slips': [vars(s) for s in slips],
                            'beside': beside(c, covariance, problem.grade),
                            'level_pitch_angle': level_pitch(fit, near, widen)},
-                        border_of(fit, configured(leg), problem.grade).widened(widen))
+                        border_of(fit, configured(leg)).widened(widen))
 
 
-def floored(covariance: Floats, floor: Floats) -> Floats:
-    """Return the covariance with a floor, (3,) sigmas, of the model: docs/method.md (S31)."""
-    covariance = covariance.copy()
-    covariance[range(len(floor)), range(len(floor))] += floor**2
+def floored(covariance: Floats) -> Floats:
+    """Return the covariance with the floor of the model: docs/method.md (S31)."""
+    covariance, at = covariance.copy(), range(len(MODEL_FLOOR))
+    covariance[at, at] += MODEL_FLOOR**2
     return covariance
 
 

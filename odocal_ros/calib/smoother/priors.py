@@ -10,17 +10,22 @@
 """Priors as a part, docs/method.md (S21): of biases, constants, and where a leg begins."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, Normal
+from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.part import Here, hold, Part, WANTED
 from odocal_ros.calib.smoother.state import (
     BA,
     BG,
     constants_from,
     GNSS_ARM,
+    IMPERFECT,
+    KIND_OF,
+    KIND_SIZES,
     M,
     ODO_ARM,
     P,
@@ -33,6 +38,9 @@ from odocal_ros.data.arrays import Floats
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
 
+# sizes of imperfections, by the square of the usual one: names of the levels, and their median.
+# Judgement: usual sizes are those of data sheets, which most sensors keep
+SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
 # where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up.
 # Judgement, far wider than any data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
@@ -45,7 +53,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'gyro_axes': constants_from('gyro_axis_xy', 'gyro_axis_zy'),
           'gyro_by_force': constants_from('gyro_x_by_force_x', 'gyro_z_by_force_y'),
           'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
-          'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_zy'),
+          'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
           'receiver_smoothing': constants_from('fix_lag_square'),
           'tyre_changes': TYRES,
           'body_lean': constants_from('squat', 'pitch_centre'),
@@ -59,10 +67,39 @@ class PriorRows(Part):
     name = 'priors'
 
     def __init__(self, problem: 'Problem', here: Here) -> None:
-        self.state, self.priors = here.state, here.priors
+        self.state, self.base = here.state, here.priors
         absent = {'heading'} - {*problem.outside}
         absent |= {'speed_truncation'} if problem.leg.travel.coarse is None else set()
         self.shared = {name: where for name, where in SHARED.items() if name not in absent}
+
+    @classmethod
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
+        """Return first sizes of imperfections, by the square of the usual one, and the least."""
+        return dict.fromkeys(SIZES, SIZE), dict.fromkeys(SIZES, 1e-6)
+
+    def weigh(self, levels: Levels) -> None:
+        """Set the priors by the sizes of imperfections: docs/method.md (S28)."""
+        size = np.array([levels[name] for name in SIZES])[KIND_OF]
+        constants = self.base.constants.copy()
+        constants[IMPERFECT] *= np.sqrt(size)
+        self.priors = replace(self.base, constants=constants)
+        self.log_R = float(np.log(size).sum())
+
+    def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
+        """
+        Return of each size its quadratic sum and what is expected of it: docs/method.md (S29).
+
+        An imperfection has a say as far as the drive knows it beside its usual size: what a drive
+        hardly sees a misfit elsewhere would drive far off.
+        """
+        at = 2 * self.n + np.arange(IMPERFECT.start, IMPERFECT.stop)
+        variance = near[0][at, at]
+        weight = 1 / self.priors.constants[IMPERFECT]**2
+        data = np.maximum(1 / variance - weight, 0.0)
+        known = data / (data + 1 / (SIZE * self.base.constants[IMPERFECT]**2))
+        off = self._constants_off()[IMPERFECT]
+        q, e = (np.bincount(KIND_OF, known * x) for x in (weight * off**2, 1 - weight * variance))
+        return {name: (float(a), float(b)) for name, a, b in zip(SIZES, q, e, strict=True)}
 
     def _biases(self) -> Iterator[tuple[slice, Floats, Floats]]:
         """Yield columns, value and sigma of the biases at the first keyframe."""

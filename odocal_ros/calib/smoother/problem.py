@@ -10,12 +10,11 @@
 """A leg made ready for the smoother: keyframes, priors, first noise levels, sums over samples."""
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.axle import rates_at
-from odocal_ros.calib.smoother.equations import PARTS
+from odocal_ros.calib.smoother.axle import rates_at, WARM_TIME
+from odocal_ros.calib.smoother.equations import PARTS, Weighted
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
 from odocal_ros.calib.smoother.imu_rows import ImuRows
@@ -23,9 +22,10 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside import Heading, Velocity
 from odocal_ros.calib.smoother.outside_rows import used
-from odocal_ros.calib.smoother.point_rows import PointRows
+from odocal_ros.calib.smoother.point_rows import alike, PointRows
 from odocal_ros.calib.smoother.preintegrate import Intervals, owners, Points, preintegrate
 from odocal_ros.calib.smoother.slide import turned
+from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
     ACCEL,
@@ -35,7 +35,6 @@ from odocal_ros.calib.smoother.state import (
     GNSS_DELAY,
     GYRO,
     GYRO_AXIS,
-    GYRO_SCALE,
     GYRO_SIGNAL,
     HEADING,
     IMPERFECT,
@@ -51,9 +50,6 @@ from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen
-
-if TYPE_CHECKING:
-    from odocal_ros.calib.smoother.astray import Stretch
 
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
 # forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
@@ -89,7 +85,6 @@ class Problem:
     shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
     # velocity, heading, steps of speed: errors that are one
     per_effective: dict[str, float] = field(default_factory=dict)
-    astray: list['Stretch'] = field(default_factory=list)     # fixes left out of use
     kept: 'Sums | None' = None                    # the last, which the next fit may do with
 
     @classmethod
@@ -117,6 +112,12 @@ class Problem:
         """Return what the fixes usually state, m on a level axis."""
         out: float = np.sqrt(np.median(self.leg.covariance_n[self.use][:, 0, 0]))
         return out
+
+    def judge_effective(self, weighted: Weighted) -> None:
+        """Estimate from residuals how many errors of a sensor in a row are one."""
+        self.per_effective = {
+            name: alike(part) for name, part in weighted.parts.items()
+            if name in (*self.outside, SpeedSteps.name) and isinstance(part, PointRows)}
 
     def sums_near(self, state: State) -> 'Sums':
         """Return the last sums where they were made near a state, else those about it."""
@@ -208,7 +209,7 @@ def _errors(signals: Floats, constants: Floats, axes: tuple[int, ...],
     return signals @ matrix.T
 
 
-def imperfect_sigmas(grade: Grade, duration: float) -> Floats:
+def imperfect_sigmas(grade: Grade) -> Floats:
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
@@ -225,12 +226,19 @@ def imperfect_sigmas(grade: Grade, duration: float) -> Floats:
         'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
         'fix_lag_square': 1.0,                      # s^2
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
-        'scale_by_time': 2.5e-3 / max(duration, 600.0),     # 1 / s
+        'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
         'squat': 3e-3, 'sideslip': 5e-3,            # rad per m/s^2
         'squat_by_jerk': 3e-4, 'sideslip_by_jerk': 5e-4,    # rad per m/s^3
         'pitch_centre': 1.5}                        # m: a car's 1.4, a truck's 2.5
     return np.repeat([usual[kind] for kind in KIND_SIZES], list(KIND_SIZES.values()))
+
+
+def with_imperfect(priors: Priors, sigmas: Floats) -> Priors:
+    """Return priors with these sigmas of imperfections, (k,)."""
+    constants = priors.constants.copy()
+    constants[IMPERFECT] = sigmas
+    return replace(priors, constants=constants)
 
 
 def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
@@ -239,11 +247,10 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     sigma[ODO_DELAY] = max(config.odometer.time_sigma, 1e-5)
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[HEADING] = leg.heading.sigma
-    sigma[GYRO_SCALE] = max(grade.gyro_scale_error, NO_ERROR)
-    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade, leg.t_stop - leg.t_begin), NO_ERROR)
+    sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade), NO_ERROR)
     # what gravity makes of the scale is a bias too
     up = np.hypot(grade.accel_bias, grade.accel_scale_error * G)
-    accel_bias = np.maximum([grade.level_bias, grade.level_bias, up], 1e-6)
+    accel_bias = np.maximum([grade.accel_bias, grade.accel_bias, up], 1e-6)
     centre = np.zeros(M)
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)

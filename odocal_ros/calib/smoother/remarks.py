@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.receiver_lag import lag_reasons
-from odocal_ros.calib.smoother.astray import astray_reasons
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -35,7 +34,6 @@ from odocal_ros.calib.smoother.state import (
     YAW,
 )
 from odocal_ros.data.arrays import Floats
-from odocal_ros.nav.dead_reckoning import forward_b
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_of
@@ -47,22 +45,6 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
-
-
-def model_floor(value: Floats, prior: Floats) -> Floats:
-    """
-    Return what the model does not hold of scale, yaw and pitch, 1 sigma: (3,) relative, rad.
-
-    The z accelerometer of an Imu that is mounted nose up feels a push ahead; what of its signal
-    the y accelerometer has too, elsewhere a bias, is then taken for yaw. It is as far off a right
-    angle as the priors of the other axes are, as the drive left them.
-
-    value : (M,) constants.   prior : (M,) their prior sigmas, as the drive left them.
-    """
-    floor = MODEL_FLOOR.copy()
-    nose_up = forward_b(value[YAW], value[PITCH])[2]
-    floor[YAW] = np.hypot(floor[YAW], prior[[AXIS_XY, AXIS_ZX]].max() * nose_up)
-    return floor
 
 
 def beside(value: Floats, covariance: Floats, grade: Grade) -> dict[str, Any]:
@@ -116,9 +98,9 @@ def level_pitch(fit: Fit, near: Neighbours, widen: float) -> dict[str, Any]:
 def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
     c, leg = fit.state.constants, problem.leg
-    said = [*_noisy(problem, fit.levels), *astray_reasons(problem),
-            *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]), *_varies(fit, sigma)]
-    usual = imperfect_sigmas(grade_of(config.imu), leg.t_stop - leg.t_begin)
+    said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
+            *_varies(fit, sigma)]
+    usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))
     off[IMPERFECT] = np.abs(c[IMPERFECT]) / np.maximum(usual, 1e-300)
     off *= np.abs(c) > REMARK_SIGMAS * sigma

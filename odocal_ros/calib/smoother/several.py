@@ -10,6 +10,7 @@
 """Several legs of the smoother to one result, on the border of their equations."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,11 @@ from odocal_ros.calib.combine import newest
 from odocal_ros.calib.joint import Joint, joint
 from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
-from odocal_ros.calib.smoother.imperfect import weighed_together
 from odocal_ros.calib.smoother.outcome import determined, floored, in_words, OPTIONAL, SCALES
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED
-from odocal_ros.calib.smoother.remarks import beside, model_floor
-from odocal_ros.calib.smoother.state import CONSTANTS, LN_K
+from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
+from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, LN_K
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -64,18 +64,14 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     legs = [results[i] for i in order]
     names = [(numbers or range(1, len(results) + 1))[i] for i in order]
     days = np.diff(np.asarray(times_ns)[order]) / DAY
-    borders = [leg.border for leg in legs]
+    borders = _of_one_vehicle([leg.border for leg in legs])
     steps = config.verdict.scale_drift_per_day * np.sqrt(days)
     changes = scale_steps(borders, steps, CONSTANTS[LN_K], CONSTANTS[LN_K + 1:WANTED]) \
         if config.leg.automatic else []
     steps[[change.leg - 1 for change in changes]] = FREE_STEP
     found = _joint(borders, steps)
-    if not found.spread and found.factor == 1:
-        # legs that agree tell together what is imperfect; what they differ in would seem to be it
-        found = _joint(weighed_together(borders, steps), steps)
     at = [found.names.index(name) for name in CONSTANTS]
-    floor = model_floor(found.value[at], found.used[at])
-    C = floored(found.covariance[np.ix_(at, at)], floor)
+    C = floored(found.covariance[np.ix_(at, at)])
     sigma = np.sqrt(np.diag(C))
     ratio = sigma / found.factor / found.sigma[at]
     scale = legs[-1].estimates['scale_factor']
@@ -87,12 +83,25 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     if unsaid:
         why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
                           f'{in_words(unsaid)}; what the settings say of it is kept'))
-    sources = _sources(found.used[at] * found.factor, C, floor)
+    sources = _sources(found.used[at] * found.factor, C)
     said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
     return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
                         | {'beside': beside(found.value[at], C, grade_of(config.imu))},
                         found.carried)
+
+
+def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
+    """Return borders with the same sizes of imperfections: the geometric mean of the legs'."""
+    imperfect = set(CONSTANTS[IMPERFECT])
+    sizes: dict[str, list[float]] = {}
+    for border in borders:
+        for name, used in zip(border.names, border.used.tolist(), strict=True):
+            sizes.setdefault(name, []).append(used)
+    return [replace(border, used=np.array([
+        np.exp(np.mean(np.log(sizes[name]))) if name in imperfect and min(sizes[name]) > 0
+        else used for name, used in zip(border.names, border.used, strict=True)]))
+        for border in borders]
 
 
 def _joint(borders: list[Border], steps: Floats) -> Joint:
@@ -132,15 +141,15 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
 
 
-def _sources(used: Floats, C: Floats, floor: Floats) -> tuple[Source, ...]:
+def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
     """Return the budget: priors of the vehicle, shared, and what is the legs' own."""
     alike = np.abs(C[:WANTED] / np.sqrt(np.outer(np.diag(C)[:WANTED], np.diag(C)))).max(axis=0)
     shared = [Source(name, C[:WANTED, i] / used[i], True) for name, i in SHARED.items()
               if alike[i].max() > 1e-9]      # of a correlation: rounding
-    apart = np.diag(floor**2) + sum(s.effects @ s.effects.T for s in shared)
+    apart = np.diag(MODEL_FLOOR**2) + sum(s.effects @ s.effects.T for s in shared)
     size, V = np.linalg.eigh(C[:WANTED, :WANTED] - apart)
     return (*shared, Source('legs', V * np.sqrt(np.maximum(size, 0.0))),
-            Source('model', np.diag(floor)))
+            Source('model', np.diag(MODEL_FLOOR)))
 
 
 def _details(found: Joint, value: Floats, C: Floats, sources: tuple[Source, ...],

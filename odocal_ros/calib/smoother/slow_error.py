@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # prior of the correlation time, log-normal: s, and sigma of the logarithm. Physical: errors of
 # receivers over open land stay for a minute or several (docs/decisions/0009)
 USUAL_TIME, TIME_SPREAD = 100.0, 0.6
+WHITE_SHARE = 0.2       # of the variance, beside a slow part of 0.9, to start from: judgement
 
 
 class SlowError(Part):

@@ -14,28 +14,24 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.result import MethodResult
-from odocal_ros.calib.smoother.astray import left_out
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import Fit, fit, Outline, Trace
-from odocal_ros.calib.smoother.imperfect import judge_imperfect, with_imperfect
+from odocal_ros.calib.smoother.estimate import Fit, fit, Trace
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import no_imu, not_settled, outcome, refused
-from odocal_ros.calib.smoother.part import JUMP
-from odocal_ros.calib.smoother.point_rows import alike, PointRows
-from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
-from odocal_ros.calib.smoother.slow_fix import are_slow, have_gap, with_slow_errors
+from odocal_ros.calib.smoother.outcome import no_imu, outcome, refused
+from odocal_ros.calib.smoother.problem import Problem, with_imperfect
+from odocal_ros.calib.smoother.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.calib.smoother.speed_offset import judge_offset
-from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.start import first_state
+from odocal_ros.calib.smoother.start import first_state, Start
 from odocal_ros.calib.smoother.state import State
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
-ROUNDS = 4      # judgement: fits, fixes that go astray left out between; large steps show first
+# rad, passes, judgement: a heading by accelerations that is known worse is one of two, and both
+# are tried for so long
+TWO_HEADINGS, START_PASSES = 0.1, 3
 
 
 def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> MethodResult:
@@ -65,60 +61,40 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}; '
                                'samples are missing or wild there')], leg.scale_unit)
-    if not best.settled:
-        return not_settled(leg, problem, best, config)
-    if astray := no_imu(best):
-        return refused(astray, leg.scale_unit)
+    if implausible := no_imu(best):
+        return refused(implausible, leg.scale_unit)
     return outcome(leg, problem, best, config)
 
 
 def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
-    """Return the likeliest fit, what is imperfect in odometer and Imu judged."""
+    """
+    Return the fit of a leg.
+
+    From one start, or from two where accelerations do not tell the heading: then the likelier
+    after a few passes goes on. A coarse speed's offset is then tried for its two usual values.
+    """
     # no name for what is passed on: the equations of one fit at a time
-    return judge_imperfect(problem, judge_offset(
-        problem, likeliest_fit(problem, config, trace), trace), trace)
+    return judge_offset(problem, _fit(problem, config, trace), trace)
 
 
-def likeliest_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fit:
-    """Return the likeliest fit of those from several starts, slow fix errors judged."""
-    fits = []
+def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     start = first_state(problem.leg, problem.imu, problem.priors)
-    starts = [start]
-    if start.yaw_sigma > 0.1:       # rad: a heading by accelerations worse than this is one of two
-        yaw = config.imu.nominal_yaw
-        starts.append(first_state(problem.leg, problem.imu, problem.priors,
-                                  0.0 if np.isnan(yaw) else yaw))
-    for one in starts:
-        sigma = float(np.sqrt(np.median(problem.leg.covariance_n[:, 0, 0])))
-        wide = max(1.0, (one.fix_spread / sigma)**2)
-        levels = problem.first_levels.but(fix=wide, fix_up=4.0 * wide, **problem.shaken)
-        # passes that tell starts apart, and slow fix errors from white ones
-        fits.append(fit(problem, one.state, levels, 3, trace=trace))
-    best = max(fits, key=lambda f: f.likelihood)
-    problem.per_effective = {
-        name: alike(part) for name, part in best.weighted.parts.items()
-        if name in (*problem.outside, SpeedSteps.name) and isinstance(part, PointRows)}
-    del fits        # the equations of one fit at a time
-    for left in reversed(range(ROUNDS)):
-        slow, about = are_slow(problem, best), best.outline()
-        del best
-        best = _settled(problem, about, slow, trace)
-        if not (left and left_out(problem, best)):
-            break
-        state = replace(best.state, slow_n=0.0 * best.state.slow_n)
-        del best
-        best = fit(problem, state, problem.first_levels.but(**problem.shaken), 3, trace=trace)
-    return best
+    if start.yaw_sigma <= TWO_HEADINGS:
+        return fit(problem, start.state, _first_levels(problem, start), trace=trace)
+    yaw = config.imu.nominal_yaw
+    other = first_state(problem.leg, problem.imu, problem.priors, 0.0 if np.isnan(yaw) else yaw)
+    about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
+                 for one in (start, other)), key=lambda f: f.likelihood).outline()
+    last = fit(problem, about.state, about.levels, about=about, trace=trace)
+    return replace(last, iterations=about.iterations + last.iterations)
 
 
-def _settled(problem: Problem, about: Outline, slow: bool, trace: Trace | None) -> Fit:
-    """Return the fit from a rough one, slow fix errors in it, or such as jump in a gap."""
-    if slow or have_gap(problem):
-        best = with_slow_errors(problem, about, trace)
-        if slow or best.spread[:, JUMP].max() > SLIP_VARIANCE:
-            return best
-        del best
-    return fit(problem, about.state, about.levels, about=about, trace=trace)
+def _first_levels(problem: Problem, start: Start) -> Levels:
+    """Return levels to start from: fixes no better than the track by the odometer fits them."""
+    wide = max(1.0, (start.fix_spread / problem.fix_sigma)**2)
+    time = USUAL_TIME if np.isnan(problem.fix_time) else problem.fix_time
+    return problem.first_levels.but(fix=WHITE_SHARE * wide, fix_up=4.0 * WHITE_SHARE * wide,
+                                    correlation_time=time, **problem.shaken)
 
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:

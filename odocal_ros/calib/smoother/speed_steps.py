@@ -75,7 +75,7 @@ class SpeedSteps(PointRows):
         c = state.constants
         axle = Axle(problem, state)
         self.from_mean = varies_with(
-            self.speed, state.t[self.k] + points.tau, axle.speeding_up()[self.k]
+            self.speed, state.t[self.k] - state.t[0] + points.tau, axle.speeding_up()[self.k]
         ) - axle.means_by_way(here.intervals)
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.instants.value + self.instants.side * c[SPEED_OFFSET]

@@ -34,10 +34,11 @@ P, V, PHI, BG, BA, TRAVEL, SLOW = (slice(end - size, end) for size, end in zip(
 E = TRAVEL.start
 BARE, WITH_SLOW = SLOW.start, SLOW.stop     # unknowns of a block
 
-# Errors of the Imu: of what a signal measures, the part that an axis has too much, by the axis it
-# enters and the signal: of (w_x, w_y, w_z, f_x, f_y), and of (f_x, f_y, f_z). The others of the 18
-# are a bias (f_z into x and y), or zero by the definition of the axes (z: about which the gyro
-# feels a turn on level ground; x: the direction of a push that the y accelerometer does not feel).
+# Errors of the IMU's axes: (axis that is wrong, signal that it wrongly contains). Signals of the
+# gyro are (w_x, w_y, w_z, f_x, f_y), of the accelerometer (f_x, f_y, f_z); f_z in x and y is a
+# bias of a level IMU, not of one mounted at an angle. Three of the 18 are zero by the definition
+# of the axes: z is the axis of turns on level ground, x the direction of a push that the y
+# accelerometer does not show.
 GYRO_ERRORS = {
     'gyro_scale_z': (2, 2), 'gyro_scale_x': (0, 0), 'gyro_scale_y': (1, 1),
     'gyro_axis_xy': (0, 1), 'gyro_axis_yx': (1, 0), 'gyro_axis_zx': (2, 0), 'gyro_axis_zy': (2, 1),
@@ -46,7 +47,8 @@ GYRO_ERRORS = {
 ACCEL_ERRORS = {
     'accelerometer_scale_x': (0, 0), 'accelerometer_scale_y': (1, 1),
     'accelerometer_scale_z': (2, 2), 'accelerometer_axis_xy': (0, 1),
-    'accelerometer_axis_zx': (2, 0), 'accelerometer_axis_zy': (2, 1)}
+    'accelerometer_axis_zx': (2, 0), 'accelerometer_axis_zy': (2, 1),
+    'accelerometer_axis_xz': (0, 2), 'accelerometer_axis_yz': (1, 2)}
 GYRO_AXIS, GYRO_SIGNAL = zip(*GYRO_ERRORS.values(), strict=True)
 ACCEL_AXIS, ACCEL_SIGNAL = zip(*ACCEL_ERRORS.values(), strict=True)
 
@@ -75,28 +77,27 @@ ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_d
                                                        'heading_offset'))
 GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
 GYRO_SCALE = GYRO.start
-ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_zy')
+ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
 # s^2, square of the time constant by which a receiver smooths
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
-# relative change of the scale with the square of the speed (its slope at FAST_SPEED, s/m), with
-# time, 1 / s, and with what the tyres pull and brake, 1 / (m/s^2), from their means by travel.
-# Pull and braking are two: a wheel that does not drive brakes only
+# relative change of the scale from its mean by distance: with the square of the speed (its slope
+# at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
+# what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
 TYRES = constants_from('scale_by_speed', 'scale_by_braking')
 BY_SPEED, BY_TIME = map(CONSTANTS.index, ('scale_by_speed', 'scale_by_time'))
 FAST_SPEED = 20.0           # m/s, definition: where the slope is said, of a road out of town
 # of the forward axis, pitch and yaw by forward and left acceleration, rad per m/s^2, and by their
 # change, rad per m/s^3: a body answers late, tyres at once
 LEAN = constants_from('squat', 'sideslip_by_jerk')
-# what a good vehicle has not: all to here, but for the gyro's scale, which every turn tells
+# what an ideal vehicle has not: all to here
 PITCH_CENTRE = CONSTANTS.index('pitch_centre')
-IMPERFECT = constants_from('gyro_scale_x', 'pitch_centre')
-# kinds of these, each there or not, and how many constants each has
-KIND_SIZES = {'gyro_scale': 2, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
-              'accelerometer_axis': 3, 'fix_lag_square': 1, 'scale_by_speed': 1,
+IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre')
+# kinds of these, whose sizes are alike, and how many constants each has
+KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
+              'accelerometer_axis': 5, 'fix_lag_square': 1, 'scale_by_speed': 1,
               'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1, 'sideslip': 1,
               'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
-KINDS = tuple(slice(end - size, end) for size, end in zip(
-    KIND_SIZES.values(), accumulate(KIND_SIZES.values()), strict=True))
+KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: of a speed sent in steps, what a value of it lacks, half a step where the
 # sender truncates
 SPEED_OFFSET = CONSTANTS.index('speed_offset')

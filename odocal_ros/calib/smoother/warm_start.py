@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.smoother.estimate import WarmStart
-from odocal_ros.calib.smoother.imperfect import with_imperfect
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
@@ -27,7 +26,7 @@ from odocal_ros.calib.smoother.part import SPREAD
 from odocal_ros.calib.smoother.preintegrate import preintegrate
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import SPEED_WINDOW
-from odocal_ros.calib.smoother.state import IMPERFECT, ODO_DELAY, State
+from odocal_ros.calib.smoother.state import ODO_DELAY, State
 from odocal_ros.data.arrays import Floats
 
 OF_LEG = ('constants', 'up_b')    # of a state what has no row for each keyframe
@@ -65,9 +64,8 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
     spread = np.concatenate([slipped, np.ones((len(t) - n, SPREAD))])
     levels = problem.first_levels.but(**last.levels.values)
-    first = with_imperfect(problem.priors, last.first.constants[IMPERFECT])
     return WarmStart(_reckoned(state, problem) if n < len(t) else state, levels, last.priors,
-                     first, spread)
+                     problem.priors, spread)
 
 
 def _reckoned(state: State, problem: Problem) -> State:
