@@ -11,6 +11,7 @@
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
+from weakref import ref
 
 import numpy as np
 
@@ -71,6 +72,7 @@ class MotionRows(Part):
     def weigh(self, levels: Levels) -> None:
         """Whiten the rows by the Cholesky root of their covariance."""
         self._kept: dict[int, Floats] = {}
+        self._found: tuple[ref[Neighbours], Floats, Floats] | None = None
         self.whiten = room(len(self.raw), ROWS, ROWS)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
         for rows in blocks(len(self.raw)):
@@ -110,8 +112,8 @@ class MotionRows(Part):
         return begin, end, constants
 
     def forget(self) -> None:
-        """Let go of the derivatives."""
-        self._kept = {}
+        """Let go of the derivatives, and of what was found with them."""
+        self._kept, self._found = {}, None
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
@@ -154,16 +156,26 @@ class MotionRows(Part):
 
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return for each level its quadratic sum and what is expected of it."""
-        estimates, power, taken = [], Total(), Total()
-        for rows, block in near.blocks():
-            A, Y = self._units(rows)
-            estimates.append(np.einsum('kic,ki->kc', A, self.r[rows]))
-            power.add((A**2).reshape(-1, A.shape[2]))
-            taken.add((Y * (block @ Y)).reshape(-1, A.shape[2]))
-        quadratic = (np.concatenate(estimates)**2).sum(axis=0)
-        expected = power.sum - taken.sum
+        estimates, seen = self._noises(near)
+        quadratic, expected = (estimates**2).sum(axis=0), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
+
+    def _noises(self, near: Neighbours) -> tuple[Floats, Floats]:
+        """
+        Return the best estimates of the unit noises, and the variances these should have.
+
+        (K, c) each; made once for one ``near``, since levels and slips both ask for them.
+        """
+        if self._found is None or self._found[0]() is not near:
+            found = []
+            for rows, block in near.blocks():
+                A, Y = self._units(rows)
+                found.append((np.einsum('kic,ki->kc', A, self.r[rows]),
+                              (A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1)))
+            estimates, variances = (np.concatenate(x) for x in zip(*found, strict=True))
+            self._found = ref(near), estimates, variances
+        return self._found[1:]
 
     def effects(self, near: Neighbours) -> Iterator[tuple[str, Floats]]:
         """Yield what the unit noises of each level do."""
@@ -186,12 +198,7 @@ class MotionRows(Part):
         First the best estimate in its own sigmas, second the variance that it should have: of 1,
         what the data can see.
         """
-        estimates, variances = [], []
-        for rows, block in near.blocks():
-            A, Y = self._units(rows)
-            estimates.append(np.einsum('kic,ki->kc', A, self.r[rows]))
-            variances.append((A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1))
-        estimate, seen = np.concatenate(estimates), np.concatenate(variances)
+        estimate, seen = self._noises(near)
         columns = [self.of(*names) for names in ODOMETER_AXES]
         return (np.stack([estimate[:, c].sum(axis=1) for c in columns], -1),
                 np.stack([seen[:, c].sum(axis=1) for c in columns], -1))
