@@ -191,7 +191,7 @@ def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
     weighted, solved, at = least(problem, state, levels)
     quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]
     score = (quadratic - expected) / 2
-    if name == 'correlation_time':      # a score as it is, and what is believed of the time
+    if name == 'correlation_time':      # a score as it is, and the prior of the time
         score = quadratic - expected + np.log(20.0 / USUAL_TIME) / TIME_SPREAD**2
     assert score == pytest.approx(slope(at, levels, name), rel=1e-3)
     assert abs(score) > 0.1

@@ -89,8 +89,9 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     for name, true in ((SCALE, truth.scale), (YAW, truth.yaw), (PITCH, truth.pitch)):
         e = whole.estimates[name]
         assert abs(e.value - true) < 4 * e.sigma, name
-        # sizes of imperfections are the mean of both parts', of which one may be smaller: a tenth
-        assert e.sigma < 1.1 * min(one.methods['smoother'].estimates[name].sigma
+        # each part has sizes of imperfections of its own; the joint ones lie between them, so that
+        # an angle that they dominate may be a hundredth less certain than by the lucky part
+        assert e.sigma < 1.02 * min(one.methods['smoother'].estimates[name].sigma
                                     for one in results), name
 
 

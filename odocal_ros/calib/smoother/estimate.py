@@ -194,7 +194,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             if tail:
                 spread = slips(weighted, near, spread, before_levels, levels)
             if tail:
-                priors = widened(first, priors, state, solved, near, fitted)
+                priors = widened(first, priors, state, solved, near)
             del near
         del sums, weighted, solved      # the most that a long leg takes
     creeping = not settled and bool(max(still, change) < SETTLING.creeping)
@@ -264,8 +264,8 @@ def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Le
     return out
 
 
-def widened(first: Priors, now: Priors, state: State, solved: Solved, neighbours: Neighbours,
-            fitted: bool) -> Priors:
+def widened(first: Priors, now: Priors, state: State, solved: Solved,
+            neighbours: Neighbours) -> Priors:
     """
     Return priors widened where the data are far from their centre, docs/method.md (S30).
 

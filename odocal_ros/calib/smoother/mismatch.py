@@ -11,7 +11,7 @@
 
 import numpy as np
 
-from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.estimate import Fit, SETTLING
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.outside import Heading
@@ -50,9 +50,12 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; estimated from the drive instead',
                               '' if any('gyro' in x for x in worse) else OF_FORCE))
-    move = 0.0 if fit.settled and not fit.creeping else moving(fit)
-    odd = [f'after {fit.iterations} passes the estimates still moved by {move:.2g} of their '
-           'sigmas'] * bool(move)
+    odd, move = [], 0.0
+    if fit.creeping or not fit.settled:
+        move = moving(fit)
+        odd.append(f'after {fit.iterations} passes ' + (
+            f'the estimates still moved by {move:.2g} of their sigmas'
+            if move > SETTLING.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
     if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
         odd.append(BY_SHAKING)

@@ -24,7 +24,7 @@ from odocal_ros.calib.result import MethodResult, Source
 from odocal_ros.calib.scale_steps import FREE_STEP, scale_steps, ScaleStep
 from odocal_ros.calib.smoother.outcome import determined, floored, in_words, OPTIONAL, SCALES
 from odocal_ros.calib.smoother.part import WANTED
-from odocal_ros.calib.smoother.priors import SHARED
+from odocal_ros.calib.smoother.priors import SHARED, SIZE
 from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
 from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, LN_K
 from odocal_ros.data.arrays import Floats, Ints
@@ -92,16 +92,27 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
 
 
 def _of_one_vehicle(borders: Sequence[Border]) -> list[Border]:
-    """Return borders with the same sizes of imperfections: the geometric mean of the legs'."""
+    """
+    Return borders with the same sizes of imperfections.
+
+    The geometric mean of the legs' sizes, each leg weighted as far as it knows the constant: one
+    that knows nothing of it has the usual size.
+    """
     imperfect = set(CONSTANTS[IMPERFECT])
-    sizes: dict[str, list[float]] = {}
+    logs: dict[str, list[tuple[float, float]]] = {}
     for border in borders:
-        for name, used in zip(border.names, border.used.tolist(), strict=True):
-            sizes.setdefault(name, []).append(used)
-    return [replace(border, used=np.array([
-        np.exp(np.mean(np.log(sizes[name]))) if name in imperfect and min(sizes[name]) > 0
-        else used for name, used in zip(border.names, border.used, strict=True)]))
-        for border in borders]
+        prior = 1 / border.used**2
+        data = 1 / np.diag(np.linalg.inv(border.information + np.diag(prior))) - prior
+        known = data / (data + 1 / (SIZE * border.sigma**2))        # docs/method.md (S29)
+        for name, used, weight in zip(border.names, border.used, known, strict=True):
+            if name in imperfect:
+                logs.setdefault(name, []).append((np.log(used), max(weight, 1e-9)))
+    sizes = {}
+    for name, pairs in logs.items():
+        log, weight = np.transpose(pairs)
+        sizes[name] = float(np.exp(np.average(log, weights=weight)))
+    return [replace(border, used=np.array([sizes.get(name, used) for name, used in zip(
+        border.names, border.used, strict=True)])) for border in borders]
 
 
 def _joint(borders: list[Border], steps: Floats) -> Joint:
