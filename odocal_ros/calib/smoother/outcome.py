@@ -89,8 +89,9 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     near = fit.neighbours()
     widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
-    slips = find_slips(fit, near, count)
-    reasons += slip_reasons(fit, slips, count)
+    # of a coarse speed only its steps are used: its way along shows no slip
+    slips = () if leg.by_steps else find_slips(fit, near, count)
+    reasons += [] if leg.by_steps else slip_reasons(fit, slips, count)
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.solved.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))
