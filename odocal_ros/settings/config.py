@@ -148,6 +148,10 @@ class LegConfig:
                              'survives uncut.')
     standstill: float = setting(2.0, 's', 0.2, 600.0, about='Shortest stop that counts as one.')
     preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Seconds kept before the start mark.')
+    compute_limit: int = setting(40, 'passes', 5, 1000, about='Passes that the fit of a leg may '
+                                 'take; a pass goes over one keyframe for each second of the leg. '
+                                 'At the limit the best estimate so far is stated, with a sigma '
+                                 'of four times what still moves.')
     automatic: bool = setting(False, about='Legs begin and end by themselves, at standstills, '
                               'else every leg.automatic_minutes; a change of the scale beyond 3 '
                               'sigma is said.')

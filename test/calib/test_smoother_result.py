@@ -10,7 +10,7 @@
 """The smoother's results on simulated legs: near the truth, from any start, refused where due."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 import re
 from types import SimpleNamespace
@@ -205,7 +205,7 @@ def still_moved(method, passes):
 def test_a_fit_cut_off_gives_what_it_has_with_wider_sigmas(monkeypatch):
     drive, config, leg = made(**SHORT)
     _, whole = result()
-    monkeypatch.setattr(smoother, 'fit', partial(fit, most=3))
+    monkeypatch.setattr(smoother, 'fit', lambda *given, **more: fit(*given[:3], 3, **more))
     method = smooth(leg, config)
     assert method.verdict is Verdict.CAUTION
     assert 0.1 < still_moved(method, 3) < 0.5

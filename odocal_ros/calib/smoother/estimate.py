@@ -86,6 +86,9 @@ PRIOR_GIVES_WAY = 2.0
 # of the logarithm of a size. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
 # (docs/decisions/0016)
 SIZE_SPREAD = 1.0
+# share of the last step from which on a step that turns back is shortened. Judgement: those that
+# turn back by less are halved with each pass by themselves
+TURNS_BACK = -0.5
 AGAIN_PASSES = 6    # judgement: of a fit that sets out from one that settled, but for a prior
 
 
@@ -160,12 +163,13 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
-    count, state = 0, state.level()
+    count, state, taken = 0, state.level(), np.zeros(M)
     while True:
         count += 1
         sums = problem.sums_near(state)
         weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
-        solved = solve(weighted.normal())
+        solved = damped(solve(weighted.normal()), taken)
+        taken = solved.step_border
         sigma = np.sqrt(np.diag(solved.covariance))
         weight = np.where(sigma < flat, of_all, 0.0)
         move = np.abs(solved.step_border / sigma * weight).max()
@@ -201,6 +205,20 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,
                likelihood, weighted, solved)
+
+
+def damped(solved: Solved, taken: Floats) -> Solved:
+    """
+    Return a step shortened where it turns back on the one before, docs/method.md (S27a).
+
+    Residuals times the second derivatives, which Gauss and Newton leave out, may be as much as
+    what the data know of a constant: full steps then go to and fro.
+    """
+    before = float(taken @ solved.reduced @ taken)
+    along = float(taken @ solved.reduced @ solved.step_border)
+    back = along / before if before > 0 else 0.0
+    by = 1 / (1 - back) if back < TURNS_BACK else 1.0
+    return replace(solved, step=by * solved.step, step_border=by * solved.step_border)
 
 
 def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,

@@ -80,12 +80,14 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     start = first_state(problem.leg, problem.imu, problem.priors)
     if start.yaw_sigma <= TWO_HEADINGS:
-        return fit(problem, start.state, _first_levels(problem, start), trace=trace)
+        return fit(problem, start.state, _first_levels(problem, start),
+                   config.leg.compute_limit, trace=trace)
     yaw = config.imu.nominal_yaw
     other = first_state(problem.leg, problem.imu, problem.priors, 0.0 if np.isnan(yaw) else yaw)
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
                  for one in (start, other)), key=lambda f: f.likelihood).outline()
-    last = fit(problem, about.state, about.levels, about=about, trace=trace)
+    last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
+               trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
 
 
