@@ -127,12 +127,12 @@ def measure(args) -> None:
         used = cpu_percent((node.process, bare), args.seconds)
         latencies = called(client)
         asked = time.perf_counter()
-        client.call('stop_leg')          # messages come while it is computed
+        client.result(client.ask('stop_leg'))    # messages come while it is computed
         computed = time.perf_counter() - asked
         load.terminate()
         sent = [int(x) for x in load.communicate()[0].split()[-3:]]
         report(args, client, sent, (*idle, *used), latencies)
-        print(f'answer of stop_leg after {computed:.1f} s')
+        print(f'result of stop_leg after {computed:.1f} s')
     finally:
         for process in (load, bare):
             process.terminate()

@@ -154,6 +154,7 @@ def one_leg(day, client, node, folder, leg, truth) -> Look:
     if not asked.done():
         sys.exit(f'the node has ended with {node.process.poll()}: {node.lines[-5:]}')
     stop_s = time.perf_counter() - begin
+    wait_for(lambda: client.status['state'] != 'computing', 'the result', LONGEST_S)
     status = client.status
     value, sigma = (float(status[k]) for k in ('scale_factor', 'scale_factor_sigma'))
     proc = Path(f'/proc/{node.process.pid}')

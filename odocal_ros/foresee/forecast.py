@@ -125,6 +125,11 @@ class Forecast:
         """Return what to drive besides metres."""
         return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
 
+    def ended(self) -> 'Forecast':
+        """Return the running estimate alone, as of a leg that has ended."""
+        scale, yaw = (Prospect(None, one.asked, None) for one in (self.scale, self.yaw))
+        return Forecast(scale, yaw, estimates=self.estimates, until_ns=self.until_ns)
+
     def age_s(self, stamp_ns: int) -> float:
         """Return how long it lies before a stamp, s; NaN where that is no time after it."""
         age = (stamp_ns - self.until_ns) * 1e-9

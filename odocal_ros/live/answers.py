@@ -14,7 +14,8 @@ from collections.abc import Iterable, Sequence
 from odocal_ros.calib.result import Calibration, LegResult
 from odocal_ros.errors import OdocalError
 from odocal_ros.live.restored import Restored
-from odocal_ros.output.summary import sentence
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.output.summary import sentence, values_in_words
 from odocal_ros.outside.names import said_by
 from odocal_ros.reasons import Reason, Verdict
 
@@ -41,6 +42,28 @@ def outcome(calibration: Calibration, parts: Sequence[LegResult] = (), leg_id: i
     if advice and advice not in said:
         said.append(f'Next: {advice}')
     return calibration.verdict is not Verdict.REJECTED, _sentences(said)
+
+
+def provisional(at_stop: SessionView) -> str:
+    """
+    Return the answer that a leg is being computed, with its running estimate.
+
+    at_stop : as it was just before the stop mark.   The word *provisional* stands where the
+    answer with the result has its verdict.
+    """
+    session, forecast = at_stop.session, at_stop.forecast
+    known = forecast.estimates if forecast else {}
+    estimate = 'it has no running estimate'
+    if any(e.value is not None for e in known.values()):
+        estimate = (f'its running estimate is {values_in_words(known)}, as it was '
+                    f'{at_stop.forecast_age_s:.0f} s before its end')
+    faults = [f'As driven it would be rejected: {r.code.name}: {r.text}'
+              for r in at_stop.faults[:1] if at_stop.lost_cause]
+    of_all = ' of all legs' if session.legs else ''
+    return _sentences([
+        f'provisional: leg {session.leg_id} is being computed; {estimate}', *faults,
+        f'The final result{of_all} has a verdict and replaces this; it follows on ~/status and in '
+        'the parameters result.*, and ~/stop_leg called again waits for it'])
 
 
 def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:

@@ -10,6 +10,8 @@
 """The computation under way, and those who wait for what it brings."""
 
 from collections.abc import Callable
+import math
+import time
 from typing import Any
 
 from rclpy.task import Future
@@ -17,6 +19,10 @@ from rclpy.task import Future
 from odocal_ros.live import answers
 from odocal_ros.live.memory import give_back
 from odocal_ros.live.worker import Job, Worker
+
+# judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
+# busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
+PATIENCE_S = 4.0
 
 
 class Computing:
@@ -32,7 +38,7 @@ class Computing:
                  done: Callable[[], None], alive: Callable[[], bool]) -> None:
         self._worker, self._failed, self._done, self._alive = worker, failed, done, alive
         self._job: object | None = None
-        self._waiting: list[Future] = []
+        self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
         self.at: tuple[float, str] = 0.0, ''      # share done, and what is being done
 
     def tell(self, share: float, stage: str) -> None:
@@ -66,14 +72,22 @@ class Computing:
         """Let the job count no more."""
         self._job = None
 
-    def promise(self) -> Future:
-        """Return a future that the next answer will be set on."""
+    def promise(self, patience_s: float = math.inf) -> Future:
+        """Return a future that the next answer, or that of ``answer_late``, will be set on."""
         future = Future()
-        self._waiting.append(future)
+        self._waiting.append((future, time.monotonic() + patience_s))
         return future
 
     def answer(self, success: bool, text: str) -> None:
         """Answer all who wait."""
         waiting, self._waiting = self._waiting, []
-        for future in waiting:
+        for future, _ in waiting:
             future.set_result((success, text))
+
+    def answer_late(self, text: Callable[[], str]) -> None:
+        """Answer those whose patience is over: the job goes on."""
+        now = time.monotonic()
+        late = [future for future, until in self._waiting if until <= now]
+        self._waiting = [one for one in self._waiting if one[1] > now]
+        for future in late:
+            future.set_result((True, text()))

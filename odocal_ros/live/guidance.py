@@ -32,7 +32,7 @@ def hint(now: SessionView) -> str:
     if state is State.COMPUTING:
         share, stage = now.computed
         return (f'computing: {100 * share:.0f} %' + (f' ({stage})' if stage else '')
-                + ('' if session.by_itself else '; then ~/stop_leg answers'))
+                + '; the result follows on ~/status')
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')

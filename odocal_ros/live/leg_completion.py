@@ -10,6 +10,7 @@
 """A leg's way from its stop mark to the answer: closed, computed, combined, told, saved."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from math import nan
 import time
@@ -68,6 +69,7 @@ class LegCompletion:
         self._ability: Ability | None = None  # of the leg last started
         self._close_by_ns: int | None = None  # steady time; a leg waits for its last samples
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
+        self._at_stop: SessionView | None = None   # of the open leg: its last running estimate
         self._distance_m = 0.0                # of the leg last touched
         self._silent = False                  # the Imu, in the leg
         self._console = Console(self._log)
@@ -88,6 +90,8 @@ class LegCompletion:
             self._start_time_anew()
         self._stop_when_too_long()
         self._close_when_complete()
+        if self._at_stop is not None and self.session.state is State.COMPUTING:
+            self._computing.answer_late(partial(answers.provisional, self._at_stop))
         if self.session.state is State.RECORDING:
             self._watch.look(self._recording.newest_imu_ns)
             self._hear_silence()
@@ -141,6 +145,8 @@ class LegCompletion:
             self._distance_m = self._recording.progress.distance_m()
         end_ns = session.stop_ns or self._recording.newest_imu_ns
         forecast = self._watch.forecast
+        if self._at_stop is not None and session.state is State.COMPUTING:
+            forecast = self._at_stop.forecast
         return self._publishing.view(
             self._recording, session=session, saved=self._filing.saved,
             computed=self._computing.at,
@@ -203,7 +209,8 @@ class LegCompletion:
         self._end_leg(self._mark_ns())
 
     def _end_leg(self, mark_ns: int) -> None:
-        self._distance_m = self._recording.progress.distance_m()
+        now = self.view()
+        self._at_stop = replace(now, forecast=now.forecast and now.forecast.ended())
         self.session.stop(mark_ns)
         self._watch.end()
         self._close_by_ns = self._steady.now().nanoseconds + round(LATE_TOPIC_S * 1e9)
@@ -237,7 +244,7 @@ class LegCompletion:
         self._computing.answer(False, f'failed: {trouble}; {remedy}')
 
     def _take_leg(self, done: jobs.Computed | jobs.LeftOut) -> None:
-        leg_id, self._snapshot = self.session.leg_id, None
+        leg_id, self._snapshot, self._at_stop = self.session.leg_id, None, None
         self._distance_m = sum(one.distance for one in done.results)
         if isinstance(done, jobs.LeftOut):
             self.session.leave_out(done.why)
@@ -278,7 +285,7 @@ class LegCompletion:
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         self.session.cancel(lost)
         self._watch.end()
-        self._close_by_ns = self._snapshot = None
+        self._close_by_ns = self._snapshot = self._at_stop = None
         self._computing.drop()
         self.show_status()
         self._journal.end()

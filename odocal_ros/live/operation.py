@@ -17,6 +17,7 @@ from odocal_ros.calib.result import Calibration
 from odocal_ros.foresee.quantities import words
 from odocal_ros.live import answers, jobs, result_files as outputs
 from odocal_ros.live.automatic_way import AutomaticWay
+from odocal_ros.live.computing import PATIENCE_S
 from odocal_ros.live.guidance import after_result, hint, quantities_ok
 from odocal_ros.live.session import Refused, State
 
@@ -41,7 +42,7 @@ class Operation(AutomaticWay):
         return True, self._begin_leg(mark_ns)
 
     def stop_leg(self) -> tuple[bool, str] | Future:
-        """End the leg; the answer carries the result."""
+        """End the leg; the answer carries the result, a provisional one where it takes long."""
         session = self.session
         if session.state is State.RECORDING:
             self.end_leg_now()
@@ -50,7 +51,7 @@ class Operation(AutomaticWay):
             self._compute(self._snapshot)
         elif session.state is not State.COMPUTING:
             return self._last_result()
-        return self._computing.promise()
+        return self._computing.promise(PATIENCE_S)
 
     def _last_result(self) -> tuple[bool, str]:
         """Return the answer to a stop without a leg."""

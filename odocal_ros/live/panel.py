@@ -83,11 +83,12 @@ def _bars(status: dict[str, str]) -> Table:
 
 
 def _values(status: dict[str, str]) -> str:
-    running = status.get('state') == 'recording'
-    prefix = 'estimate_' if running else ''
+    state = status.get('state')
+    prefix = 'estimate_' if state in ('recording', 'computing') else ''
     keys = (('scale factor', 'scale_factor', 'scale_factor_sigma', 1.0, ''),
             ('yaw', 'yaw_mounting_angle_rad', 'yaw_mounting_angle_sigma_rad', degrees(1), ' deg'))
     said = [f'{label} {with_sigma(found, number(status, prefix + sigma) or None, factor)}{unit}'
             for label, value, sigma, factor, unit in keys
             if (found := number(status, prefix + value))]
-    return '   '.join(said) or 'no value yet'
+    provisional = 'provisional: ' if state == 'computing' and said else ''
+    return provisional + ('   '.join(said) or 'no value yet')

@@ -90,8 +90,8 @@ class Session:
     def start(self, mark_ns: int, config: Config, by_itself: bool = False) -> None:
         """Open a leg at a mark, under the configuration in force."""
         if self.state is State.COMPUTING:
-            raise Refused(f'leg {self.leg_id} is being computed: call again when ~/stop_leg has '
-                          'answered, or drop it with ~/cancel_leg')
+            raise Refused(f'leg {self.leg_id} is being computed: call again when its result is on '
+                          '~/status, or drop it with ~/cancel_leg')
         if self.open_leg:
             raise Refused(f'leg {self.leg_id} failed and is kept: call ~/stop_leg to compute it '
                           'again, or drop it with ~/cancel_leg')

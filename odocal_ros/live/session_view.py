@@ -38,7 +38,7 @@ class SessionView:
     still_s: float = 0.0
     two_wheels: bool = False                     # the right wheel is heard by itself
     ability: Ability | None = None               # of the leg that is recorded
-    forecast: Forecast | None = None               # of the leg that is recorded
+    forecast: Forecast | None = None               # of the leg that is recorded or computed
     faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
     forecast_age_s: float = nan                   # since the way it is of
     computed: tuple[float, str] = (0.0, '')      # share of a leg's result, and what is at work

@@ -88,8 +88,8 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
 
 
 def in_force(now: SessionView, name: str) -> float:
-    """Return a value or a sigma: of the running estimate in a leg, else of the result."""
-    if now.session.state is not State.RECORDING:
+    """Return a value or a sigma: of the leg's running estimate until it has a result."""
+    if now.session.state is not State.RECORDING and now.forecast is None:
         return float(now.results[f'result.{name}'])
     estimates = now.forecast.estimates if now.forecast else {}
     estimate = estimates.get(name.removesuffix('_sigma'))

@@ -169,6 +169,13 @@ class Client:
         """Call one of the node's Trigger services and return its answer."""
         return answer_of(self.ask(name))
 
+    def result(self, stopping):
+        """Return the answer with the result, asked for again while it is provisional."""
+        answer = answer_of(stopping)
+        while answer.message.startswith('provisional'):     # the fit takes long on a busy machine
+            answer = self.call('stop_leg')
+        return answer
+
     def start(self):
         """Start a leg as soon as the node has heard what was just sent; return the answer."""
         def begun():

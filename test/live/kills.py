@@ -133,7 +133,7 @@ def killed_at_files(driven, stage: str, moment_s: float, folder: Path, *args: st
         asked, begin = client.ask('stop_leg'), time.monotonic()
         player.play(part(sent, LAST_S, LAST_S + 2), 3 * SPEED)
         if stage == 'save':
-            wait_for(asked.done, 'the result')
+            client.result(asked)
             client.ask('save')
             begin = time.monotonic()
         time.sleep(max(0.0, moment_s - (time.monotonic() - begin)))

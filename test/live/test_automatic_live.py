@@ -16,7 +16,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, ROOT, wait_for
+from bench import Client, NodeProcess, ROOT, wait_for
 from player import messages_of, part, Player
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -100,7 +100,7 @@ def _a_day_later(found, node, client, player, drive):
         found.waits = client.until(automatic='waiting')
         client.until(state='recording', automatic='leg')
         wait_for(lambda: float(client.status['distance_m']) > 500.0, 'half a kilometre')
-        found.stop = answer_of(client.ask('stop_leg'))
+        found.stop = client.result(client.ask('stop_leg'))
         found.later = client.until(legs='1')
         client.until(state='recording', automatic='leg')       # and goes on
         found.carried = wait_for(lambda: _saved(client.status['saved'], 1), 'the save')['carried']

@@ -15,7 +15,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, ROOT, wait_for
+from bench import Client, NodeProcess, ROOT, wait_for
 from player import messages_of, part, Player
 import pytest
 
@@ -55,7 +55,7 @@ def seen(tmp_path_factory, domain):
         player.play(part(sent, 130, 190), SPEED)
         stopping = client.ask('stop_leg')
         player.play(part(sent, 190, 192), SPEED)
-        found.answer = answer_of(stopping)
+        found.answer = client.result(stopping)
         found.status = client.until(state='calibrated')
         saved = wait_for(lambda: client.status['saved'], 'the saved folder')
         found.written = json.loads((Path(saved) / 'calibration.json').read_text())

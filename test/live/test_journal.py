@@ -16,7 +16,7 @@ import resource
 import time
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, wait_for
+from bench import Client, NodeProcess, wait_for
 from kills import drive, killed, remains, replayed, wrong
 from player import by_now, messages_of, part, Player, sent_of
 import pytest
@@ -62,7 +62,7 @@ def session(domain, tmp_path_factory):
         stopping = client.ask('stop_leg')
         client.until(state='computing')
         player.play(part(sent, 115, 117), SPEED)
-        seen.stop = answer_of(stopping)
+        seen.stop = client.result(stopping)
         seen.status = wait_for(lambda: client.status['saved'] and client.status, 'saved files')
         seen.kept = Path(seen.status['journal'])
         seen.joined = wait_for((seen.kept / 'metadata.yaml').exists, 'the joined journal')
@@ -79,7 +79,7 @@ def session(domain, tmp_path_factory):
         player.play(part(sent, 123, 125), SPEED)
         stopping = client.ask('stop_leg')
         player.play(part(sent, 125, 127), SPEED)
-        answer_of(stopping)
+        client.result(stopping)
         seen.undone = Path(wait_for(lambda: client.status['journal'] != str(seen.cancelled)
                                     and client.status['journal'], 'the third journal'))
         wait_for((seen.undone / 'metadata.yaml').exists, 'its end')
@@ -181,7 +181,7 @@ def test_pulses_without_stamps_keep_the_times_they_were_sent_at(start, connect, 
         client.until(state='idle')
         client.start()
         wait_for(lambda: float(client.status['distance_m']) > 50.0, 'fifty metres driven')
-        answer_of(client.ask('stop_leg'))
+        client.result(client.ask('stop_leg'))
     journal = Path(client.status['journal'])
     assert client.call('save').success
     wait_for((journal / 'metadata.yaml').exists, 'the joined journal')
@@ -222,7 +222,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_more(start, connect
     assert 'output.directory' in status['message']
     stopping = client.ask('stop_leg')
     player.play(part(slow[1], 55, 60), SPEED)
-    assert 'scale factor' in answer_of(stopping).message
+    assert 'scale factor' in client.result(stopping).message
     assert node.text.count('the journal cannot be written') == 1
     assert not client.call('save').success
     status = wait_for(lambda: client.status['save_trouble'] and client.status, 'the other warning')

@@ -105,8 +105,7 @@ def test_lateness_is_no_slip_and_slip_is_found(domain, tmp_path):
         assert [one.result().message for one in starting if not one.result().success] == []
         load.close()
         stopping = {name: client.ask('stop_leg') for name, client in clients.items()}
-        answers = {name: wait_for(lambda one=one: one.done() and one.result(), 'a result', 60.0)
-                   for name, one in stopping.items()}
+        answers = {name: clients[name].result(one) for name, one in stopping.items()}
         for client in clients.values():
             wait_for(lambda client=client: client.status['saved'], 'the saved folder')
         reasons = {name: one.until(state='calibrated')['reasons'] for name, one in

@@ -213,7 +213,7 @@ def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(
     stopping = client.ask('stop_leg')
     client.until(state='computing')
     player.play(part(sent[1], 20, 23), 20)
-    assert 'restored' not in answer_of(stopping).message
+    assert 'restored' not in client.result(stopping).message
     assert client.until(restored='', legs='1')['scale_factor'] != '0.0213'
     assert client.call('undo_leg').success
     client.until(restored='an unknown date', legs='2', scale_factor='0.0213', scale_ok='yes')

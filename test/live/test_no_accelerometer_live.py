@@ -12,7 +12,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, wait_for
+from bench import Client, NodeProcess, wait_for
 import numpy as np
 from player import messages_of, part, Player
 import pytest
@@ -50,7 +50,7 @@ def session(drive, domain, tmp_path_factory):
         player.play(part(sent, MARK_S, STOP_S), SPEED)
         stopping = client.ask('stop_leg')
         player.play(part(sent, STOP_S, END_S), SPEED)
-        seen.stop = answer_of(stopping)
+        seen.stop = client.result(stopping)
         seen.status = client.until(state='calibrated')
         seen.scale, seen.sigma = client.get('result.scale_factor', 'result.scale_factor_sigma')
         yield seen

@@ -17,7 +17,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, PATIENCE, ROOT, wait_for
+from bench import Client, NodeProcess, PATIENCE, ROOT, wait_for
 from player import messages_of, part, Player
 import pytest
 from rclpy.serialization import serialize_message
@@ -104,7 +104,7 @@ def _first_leg(seen, client, player, sent):
     player.play(part(sent, 115, 117), SPEED)
     stopping = client.ask('stop_leg')
     seen.computing = client.until(state='computing')
-    seen.stop = answer_of(stopping)
+    seen.stop = client.result(stopping)
     seen.calibrated = client.until(state='calibrated')
     seen.saved = client.until(state='calibrated', saved=wait_for(
         lambda: client.status['saved'], 'the saved folder'))
@@ -129,7 +129,7 @@ def _second_leg(seen, client, player, sent):
     player.play(part(sent, 119, 125), SPEED)
     stopping = client.ask('stop_leg')
     player.play(part(sent, 125, 127), SPEED)
-    seen.second = answer_of(stopping)
+    seen.second = client.result(stopping)
     seen.two_legs = client.until(leg_id='3', leg_event='stopped', legs='2')
 
 

@@ -43,7 +43,7 @@ def leg(driven, clients, between=lambda: None):
     player.play(part(sent, 100, LAST_S), SPEED)
     asked = [client.ask('stop_leg') for client in clients]
     player.play(part(sent, LAST_S, LAST_S + 2), SPEED)
-    answers = [answer_of(one) for one in asked]
+    answers = [client.result(one) for client, one in zip(clients, asked, strict=True)]
     assert all(answer.success for answer in answers), answers
     return answers
 

@@ -60,7 +60,7 @@ def driven(domain, tmp_path_factory):
             player.play(part(sent, begin, mark), SPEED)
             future = ask(client.node, name, kind)
             player.play(part(sent, mark, end), SPEED)
-            seen.answers[name] = answer_of(future)
+            seen.answers[name] = client.result(future)
         client.until(leg_event='stopped')
         seen.graph = lambda: dict(client.node.get_topic_names_and_types())
         yield seen

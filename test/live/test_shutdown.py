@@ -13,7 +13,7 @@ import json
 import signal
 import time
 
-from bench import answer_of, wait_for
+from bench import wait_for
 from player import messages_of, part, Player
 import pytest
 
@@ -49,7 +49,7 @@ def test_a_signal_right_after_a_leg_ends_well_with_whole_files(
     stopping = client.ask('stop_leg')
     client.until(state='computing')
     player.play(part(sent[1], 115, 117), 30)
-    answer = answer_of(stopping)
+    answer = client.result(stopping)
     assert answer.success, answer.message
     if before:      # the numbers are there, the report is being drawn
         wait_for(lambda: list(tmp_path.glob('2*/calibration.json')), 'the numbers')

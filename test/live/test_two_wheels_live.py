@@ -12,7 +12,7 @@
 import re
 from types import SimpleNamespace
 
-from bench import answer_of, Client, NodeProcess, wait_for
+from bench import Client, NodeProcess, wait_for
 from player import part, Player, sent_of
 import pytest
 
@@ -64,7 +64,7 @@ def session(drive, domain, tmp_path_factory):
         stopping = client.ask('stop_leg')
         client.until(state='computing')
         player.play(part(sent, start_s + 160, start_s + 163), SPEED)
-        seen.stop = answer_of(stopping)
+        seen.stop = client.result(stopping)
         seen.result = wait_for(lambda: client.status['state'] in ('calibrated', 'rejected')
                                and client.status, 'the result')
         yield seen

@@ -9,6 +9,7 @@
 
 """One line to watch, typed topics to plot, and the panel of ``odocal watch``."""
 
+import io
 import math
 import os
 from pathlib import Path
@@ -60,6 +61,23 @@ def test_the_panel_shows_a_running_node(start, connect):
     assert ended.returncode == 0, ended.stderr
     for words in ('/calibrator', 'waiting', 'no Imu on /imu/data', 'way', 'asked 1000 ppm'):
         assert words in ended.stdout
+
+
+def test_while_a_leg_is_computed_the_panel_shows_its_running_estimate():
+    rich = pytest.importorskip('rich.console')
+    from odocal_ros.live.panel import panel
+    status = {'state': 'computing', 'scale_factor': '0.03', 'scale_factor_sigma': '0.0001',
+              'estimate_scale_factor': '0.02', 'estimate_scale_factor_sigma': '0.0001'}
+
+    def shown(**values):
+        console = rich.Console(width=100, record=True, file=io.StringIO())
+        console.print(panel(b'\0', 'calibrator', status | values, 'computing'))
+        return console.export_text()
+    assert 'provisional: scale factor 0.02000 ± 0.00010' in shown()
+    assert 'provisional' not in shown(state='recording')
+    done = shown(state='calibrated')
+    assert 'provisional' not in done
+    assert 'scale factor 0.03000 ± 0.00010' in done
 
 
 def test_the_bars_are_shares_of_what_is_asked():

@@ -1,0 +1,159 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A leg whose fit takes long: ~/stop_leg answers with the running estimate; the result follows."""
+
+import math
+import time
+from types import SimpleNamespace
+
+from bench import answer_of, Client, NodeProcess, PATIENCE, wait_for
+from player import messages_of, part, Player
+import pytest
+
+from odocal_ros.live import answers
+from odocal_ros.live.computing import PATIENCE_S
+from odocal_ros.live.session import Session
+from odocal_ros.live.session_view import SessionView
+from odocal_ros.output.figures import with_sigma
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.config import Config
+from odocal_ros.sim.scenarios import SimOptions, simulate
+
+SPEED = 30.0                         # times real time
+FIRST_S, MARK_S, STOP_S = 10, 25, 140    # of the drive: played from, start mark, stop mark
+MOST_S = 5.0                         # of an answer, as docs/node.md promises
+# a fit that ends as soon as a file is there
+HELD = """
+import os, time
+from odocal_ros.live import jobs
+compute = jobs.compute
+def held(*args, **kwargs):
+    while not os.path.exists({!r}):
+        time.sleep(0.01)
+    return compute(*args, **kwargs)
+jobs.compute = held
+"""
+
+
+@pytest.fixture(scope='module')
+def seen(domain, tmp_path_factory):
+    """Drive two legs, the second too short for a running estimate; keep what the node said."""
+    folder = tmp_path_factory.mktemp('out')
+    gate = folder / 'go on'
+    drive = simulate(SimOptions(scenario='town', duration=160.0, imu_rate=50.0, odometer='speed',
+                                odometer_rate=25.0, fix_noise='rtk', imu_grade='industrial'))
+    node = NodeProcess('-p', f'output.directory:={folder}', before=HELD.format(str(gate)))
+    client, found = Client(), SimpleNamespace(truth=drive.truth)
+    try:
+        types, sent = messages_of(drive)
+        player = Player(client.node, types)
+        wait_for(player.matched, 'subscriptions of the node')
+        player.play(part(sent, FIRST_S, MARK_S), SPEED)
+        client.until(state='idle')
+        client.start()
+        player.play(part(sent, MARK_S, STOP_S), SPEED)
+        wait_for(lambda: client.status['estimate_yaw_mounting_angle_rad'] != 'nan',
+                 'a running estimate', 4 * PATIENCE)
+        _held_leg(found, client, player, sent, gate)
+        _without_estimate(found, client, player, sent, gate)
+        yield found
+    finally:
+        gate.touch()      # the node's end waits for what its worker was given
+        node.end()
+        client.close()
+
+
+def _held_leg(found, client, player, sent, gate):
+    found.first = _answered(client, player, sent, STOP_S, STOP_S + 2)
+    found.computing = client.until(state='computing')
+    found.recording = [s for s in client.statuses if s['state'] == 'recording'][-1]
+    found.valid_before = client.get('result.valid')
+    found.again = _answered(client)
+    waiting = client.ask('stop_leg')
+    gate.touch()
+    found.last = client.result(waiting)
+    found.calibrated = client.until(state='calibrated')
+    found.valid, found.scale, found.sigma = client.get(
+        'result.valid', 'result.scale_factor', 'result.scale_factor_sigma')
+
+
+def _without_estimate(found, client, player, sent, gate):
+    gate.unlink()
+    player.play(part(sent, STOP_S + 2, STOP_S + 4), SPEED)
+    client.start()
+    player.play(part(sent, STOP_S + 4, STOP_S + 8), SPEED)
+    found.short = _answered(client, player, sent, STOP_S + 8, STOP_S + 10)
+    waiting = client.ask('stop_leg')
+    client.until(state='computing', leg_id='2')
+    client.call('cancel_leg')
+    found.cancelled = answer_of(waiting)
+
+
+def _answered(client, player=None, sent=(), first_s=0.0, last_s=0.0):
+    """Return the answer of ~/stop_leg and the seconds that it took."""
+    begin, asked = time.monotonic(), client.ask('stop_leg')
+    if player:
+        player.play(part(sent, first_s, last_s), SPEED)
+    return SimpleNamespace(answer=answer_of(asked), seconds=time.monotonic() - begin)
+
+
+def test_the_answer_does_not_wait_for_a_fit_that_takes_long(seen):
+    for one in (seen.first, seen.again, seen.short):
+        assert PATIENCE_S <= one.seconds < MOST_S
+        assert one.answer.success
+        assert one.answer.message.startswith('provisional: leg ')
+
+
+def test_it_holds_the_running_estimate_as_the_status_had_it(seen):
+    value, sigma = (float(seen.recording[f'estimate_scale_factor{end}'])
+                    for end in ('', '_sigma'))
+    text = seen.first.answer.message
+    assert f'its running estimate is scale factor {with_sigma(value, sigma)},' in text
+    for end in ('', '_sigma'):
+        angle = f'estimate_yaw_mounting_angle{end}_rad'
+        assert seen.computing[angle] == seen.recording[angle] != 'nan'
+    assert text == seen.again.answer.message
+    assert 's before its end' in text
+
+
+def test_nothing_in_it_can_be_taken_for_the_result(seen):
+    text = seen.first.answer.message
+    for word in ('accepted', 'caution', 'rejected', 'OK:'):
+        assert word not in text
+    assert 'The final result has a verdict and replaces this' in text
+    assert '~/status' in text
+    assert seen.valid_before == [False]
+    assert (seen.computing['verdict'], seen.computing['scale_factor']) == ('', 'nan')
+    assert 'the result follows on ~/status' in seen.computing['hint']
+
+
+def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_again(seen):
+    assert seen.last.success
+    assert 'accepted: scale factor ' in seen.last.message
+    assert seen.valid
+    assert with_sigma(seen.scale, seen.sigma) in seen.last.message
+    assert float(seen.calibrated['scale_factor']) == seen.scale
+    assert seen.calibrated['estimate_scale_factor'] == 'nan'
+    assert abs(seen.scale - seen.truth.scale) < 4 * seen.sigma
+
+
+def test_a_leg_without_running_estimate_says_so_and_may_be_dropped(seen):
+    assert 'leg 2 is being computed; it has no running estimate' in seen.short.answer.message
+    assert 'The final result of all legs' in seen.short.answer.message
+    assert (seen.cancelled.success, seen.cancelled.message) == (False, 'leg 2 is cancelled')
+
+
+def test_a_leg_that_would_be_rejected_is_no_good_news():
+    session = Session()
+    session.start(1, Config())
+    now = SessionView(session, Config(), faults=(
+        Reason(Code.IMU_GAP, 'the Imu is missing for 9 s'),), forecast_age_s=math.nan)
+    assert ('As driven it would be rejected: IMU_GAP: the Imu is missing for 9 s. '
+            in answers.provisional(now))
