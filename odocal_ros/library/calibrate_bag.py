@@ -21,6 +21,7 @@ from odocal_ros.library.asked import config_of, Leg, legs_of, Settings
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.hearer import Hearer, Notes
 from odocal_ros.library.read_bag import read_bag, readers_of, Recording
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -184,9 +185,8 @@ def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[
             which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
 
-            def of_leg(share: float, stage: str, done: int = number - 1,
-                       which: str = which) -> None:
-                progress((done + share) / len(spans), which + stage)
+            def of_leg(stage: Stage, which: str = which) -> None:
+                progress(None, which + stage.words())
             parts = calibrate_parts(leg, bag.config, notes=notes[number - 1], holdout=holdout,
                                     progress=of_leg)
             results += [replace(one, bag=bag.name) for one in parts]

@@ -12,7 +12,8 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
-Progress = Callable[..., None]      # of the share done, 0 to 1, and what is being done
+# of the share done, 0 to 1 or None where nobody knows it, and what is being done
+Progress = Callable[..., None]
 
 
 class Hearer:

@@ -19,6 +19,7 @@ from rclpy.task import Future
 from odocal_ros.live import answers
 from odocal_ros.live.memory import give_back
 from odocal_ros.live.worker import Job, Worker
+from odocal_ros.pipeline.stage import Stage
 
 # judgement: s that ~/stop_leg waits for the result. It answers within 5 s, of which one is for a
 # busy machine; the last samples take up to 1 s, the fit of a leg of ten minutes 1 to 2 s
@@ -39,17 +40,17 @@ class Computing:
         self._worker, self._failed, self._done, self._alive = worker, failed, done, alive
         self._job: object | None = None
         self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
-        self.at: tuple[float, str] = 0.0, ''      # share done, and what is being done
+        self.at = Stage()
 
-    def tell(self, share: float, stage: str) -> None:
+    def tell(self, stage: Stage) -> None:
         """Take over how far the job is; called by the worker's thread."""
-        self.at = share, stage
+        self.at = stage
         give_back()      # what the pass before needed
 
     def submit(self, job: Job, take: Callable[[Any], object]) -> None:
         """Run a job in the worker and hand its result to ``take``."""
         self._job = token = object()
-        self.at = 0.0, ''
+        self.at = Stage()
 
         def then(result: Any, error: Exception | None) -> None:
             if token is not self._job:

@@ -30,9 +30,7 @@ def hint(now: SessionView) -> str:
     """Return what is missing, or what to do next."""
     session, state = now.session, now.session.state
     if state is State.COMPUTING:
-        share, stage = now.computed
-        return (f'computing: {100 * share:.0f} %' + (f' ({stage})' if stage else '')
-                + '; the result follows on ~/status')
+        return f'computing: {now.computed.words() or "begun"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')

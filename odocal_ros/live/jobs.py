@@ -25,6 +25,7 @@ from odocal_ros.output.stored import known_imu
 from odocal_ros.pipeline.automatic import fold, refusal
 from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.pipeline.parts import calibrate_parts
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason
 from odocal_ros.settings.config import Config
 
@@ -57,7 +58,7 @@ class LeftOut:
 
 def compute(recorder: LegRecorder, start_ns: int, stop_ns: int,
             kept: list[tuple[LegResult, ...]], config: Config, carried: Carried | None = None,
-            by_itself: bool = False, progress: Callable[[float, str], None] | None = None,
+            by_itself: bool = False, progress: Callable[[Stage], None] | None = None,
             ) -> Computed | LeftOut:
     """Return a leg's result, its combination with the legs kept, and the paths to show."""
     leg = recorder.close(start_ns, stop_ns, config.leg.preroll)

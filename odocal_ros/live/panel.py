@@ -39,8 +39,7 @@ def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
 def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     """Return how much of what is asked is there: label -> (0 to 1, in words)."""
     if status.get('state') == 'computing':
-        percent = number(status, 'computing_percent')
-        return {'computing': (min(percent / 100, 0.99), f'{percent:.0f} %')}
+        return {}      # the hint has the passes: nobody knows how many there will be
     way, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
     found = {'way': (way / (way + lacks) if way + lacks > 0 else 0.0, f'{lacks:.0f} m to go'),

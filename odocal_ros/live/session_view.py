@@ -16,6 +16,7 @@ from typing import Any
 from odocal_ros.foresee.ability import Ability
 from odocal_ros.foresee.forecast import Forecast
 from odocal_ros.live.session import Session, State
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -41,7 +42,7 @@ class SessionView:
     forecast: Forecast | None = None               # of the leg that is recorded or computed
     faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
     forecast_age_s: float = nan                   # since the way it is of
-    computed: tuple[float, str] = (0.0, '')      # share of a leg's result, and what is at work
+    computed: Stage = Stage()                    # how far the result of a leg is
     saved: str = ''
     lost: str = ''                               # a leg that nobody wanted dropped
     save_trouble: str = ''                       # why the newest result is in no folder

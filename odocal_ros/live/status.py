@@ -26,6 +26,7 @@ from odocal_ros.live.guidance import (
 from odocal_ros.live.health import Health
 from odocal_ros.live.session import Session, State
 from odocal_ros.live.session_view import SessionView
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Verdict
 
 SHORT = (Code.LEG_TOO_SHORT, Code.SPEED_TOO_LOW)     # a move in a yard is no fault
@@ -36,7 +37,7 @@ PLACES = dict.fromkeys((
     'metres_to_least', 'seconds_to_stand', 'estimate_age_s', 'metres_to_go_scale',
     'metres_to_go_yaw', 'computing_percent'), 1) | {
         'max_speed_mps': 2, 'predicted_scale_sigma_ppm': 2, 'predicted_yaw_sigma_deg': 4,
-        'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4}
+        'asked_scale_sigma_ppm': 1, 'asked_yaw_sigma_deg': 4, 'computing_change_sigmas': 4}
 # key: result.* parameter
 VALUES = {
     'scale_factor': 'scale_factor', 'scale_factor_sigma': 'scale_factor_sigma',
@@ -78,10 +79,9 @@ def calibration_status(now: SessionView) -> DiagnosticStatus:
         'missing': '; '.join(now.missing), 'reasons': _reason_codes(now), 'saved': now.saved,
         'save_trouble': now.save_trouble, 'lost': now.lost,
         'automatic': _automatic(now), 'unused': _unused(session),
-        'computing_percent': 100 * now.computed[0] if session.state is State.COMPUTING else 0.0,
         'carried_legs': session.carried.legs if session.carried else 0,
         'journal': now.journal, 'journal_trouble': now.journal_trouble,
-    } | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
+    } | _computing(now) | quantities.as_keys(ok) | as_keys(now.forecast, now.forecast_age_s)
     return DiagnosticStatus(
         level=level(now), name=NAME, message=sentence(now, text, ok), hardware_id='odocal',
         values=[KeyValue(key=k, value=_bare(v, PLACES.get(k))) for k, v in keys.items()])
@@ -138,6 +138,13 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
         ('the journal cannot be written', now.journal_trouble)) if trouble]
     return '; '.join(filter(None, (seen, *_changes(session), good, now.lost, text,
                                    _unused(session), *now.doubled, *troubles)))
+
+
+def _computing(now: SessionView) -> dict[str, object]:
+    """Return the keys of how far the result of a leg is."""
+    stage = now.computed if now.session.state is State.COMPUTING else Stage()
+    return {'computing_stage': stage.name, 'computing_passes': stage.passes,
+            'computing_change_sigmas': stage.change, 'computing_percent': 100 * stage.done}
 
 
 def _changes(session: Session) -> list[str]:

@@ -46,13 +46,13 @@ class Phase:
             self._ticker.start()
         return self
 
-    def __call__(self, share: float, title: str = '') -> None:
-        """Tell the share done, and what comes now if it has a name of its own."""
+    def __call__(self, share: float | None, title: str = '') -> None:
+        """Tell the share done, None if unknown, and what comes now if it has its own name."""
         if self._shown:
-            self._bar.bar_format = BAR
+            self._bar.bar_format = CLOCK if share is None else BAR
             if title:
                 self._bar.set_description_str(title, refresh=False)
-            self._bar.n = min(max(share, 0.0), 1.0)
+            self._bar.n = min(max(share or 0.0, 0.0), 1.0)
             self._bar.refresh()
 
     def __exit__(self, *_: object) -> None:

@@ -29,6 +29,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.pipeline.combination import combine
 from odocal_ros.pipeline.leg_run import leg_result, run_leg
 from odocal_ros.pipeline.prepare import prepare
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.reversing import BY_FIT, doubled, said_of
 from odocal_ros.screening.sanity import imu_sanity, UNUSABLE
@@ -50,7 +51,7 @@ class Screened(NamedTuple):
 
 def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
               notes: tuple[Reason, ...] = (), holdout: bool = False,
-              progress: Callable[[float, str], None] | None = None) -> LegResult:
+              progress: Callable[[Stage], None] | None = None) -> LegResult:
     """
     Take one leg from samples to result.
 
@@ -67,15 +68,14 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
     holdout : bool
         Keep the last fifth of the distance back from the fit and check the correction on it.
     progress : callable, optional
-        Called now and then with the share that is done, 0 to 1, and what is being done. Of a fit
-        nobody knows the end: its share is that of usual ones.
+        Called with each stage of the work, and with each pass of a fit.
 
     Returns
     -------
     LegResult; a leg that cannot be calibrated says why in its reasons.
 
     """
-    progress = progress or (lambda share, stage: None)
+    progress = progress or (lambda stage: None)
     seen = screened(leg, config, notes)
     inputs = seen.inputs
 

@@ -21,9 +21,11 @@ from odocal_ros.calib.drive import way_and_chord
 from odocal_ros.calib.result import LegResult, MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
+from odocal_ros.pipeline.method_run import Passed
 from odocal_ros.pipeline.methods import found_by, METHODS, run_methods
 from odocal_ros.pipeline.prepare import judged_by
 from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.pipeline.tracks import check_of, tracks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.fix_screen import origin_amid
@@ -56,12 +58,12 @@ def _way_of(t_fix: Floats, geodetic: Floats) -> float:
     return way_and_chord(t_fix, fixes_n)[0]
 
 
-def run_leg(prepared: PreparedLeg, progress: Callable[[float, str], None]) -> LegResult:
+def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
     """Return what a leg gives; ``progress`` is called as ``calibrate`` says."""
     leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
     names = _methods_of(prepared)
     runs = run_methods(names, prepared, _teller(names, progress))
-    progress(1.0 - TRACKS / _effort(names), 'tracks')
+    progress(Stage('tracks', 1.0 - TRACKS / _effort(names)))
     methods = {name: run.result for name, run in runs.items()}
     found = [*found_by(runs, prepared), *disagreements(methods)]
     found += passed_over(methods, asked, {r.code for r in (*prepared.reasons, *found)})
@@ -107,16 +109,14 @@ def _effort(names: Iterable[str]) -> int:
 
 
 def _teller(names: Iterable[str],
-            progress: Callable[[float, str], None]) -> Callable[[str], Callable[[int], None]]:
+            progress: Callable[[Stage], None]) -> Callable[[str], Passed]:
     """Return what tells that a method begins, and gives what tells of its passes."""
     done = 0.0
 
-    def begun(name: str) -> Callable[[int], None]:
+    def begun(name: str) -> Passed:
         nonlocal done
-        begin, width = done, METHOD_EFFORT[name] / _effort(names)
-        progress(begin, name)
-        done += width
-        usual_passes = 6.0    # of a fit, in which it comes to two thirds of its way: 10 are usual
-        return lambda passes: progress(
-            begin + width * (1 - float(np.exp(-passes / usual_passes))), name)
+        stage = Stage(name, done)
+        progress(stage)
+        done += METHOD_EFFORT[name] / _effort(names)
+        return lambda passes, change: progress(replace(stage, passes=passes, change=change))
     return begun

@@ -16,6 +16,7 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Reason
 
+Passed = Callable[[int, float], None]      # called with the passes made, and Stage.change
 Path = Callable[[Floats], Floats]     # t (n,) s to (n, 3) m, or t () to (3,)
 
 

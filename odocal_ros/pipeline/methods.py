@@ -21,7 +21,7 @@ from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
 from odocal_ros.pipeline.delay_note import delay_notes
-from odocal_ros.pipeline.method_run import MethodRun
+from odocal_ros.pipeline.method_run import MethodRun, Passed
 from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.slow_slip import held
@@ -30,12 +30,12 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.screen import Inputs
 
 
-def _wheels(prepared: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
+def _wheels(prepared: PreparedLeg, passed: Passed) -> MethodRun:
     from odocal_ros.pipeline.wheels_run import wheels
     return wheels(prepared, passed)
 
 
-def _smoother(prepared: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
+def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
     from odocal_ros.pipeline.smoother_run import smoother
     return smoother(prepared, passed)
 
@@ -51,7 +51,7 @@ def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
 
 
 # as they are shown; two_point, the operator's own marks, is always computed
-METHODS: dict[str, Callable[[PreparedLeg, Callable[[int], None]], MethodRun]] = {
+METHODS: dict[str, Callable[[PreparedLeg, Passed], MethodRun]] = {
     'two_point': two_point, 'wheels': _wheels, 'smoother': _smoother}
 # what each gives where it refuses: (inputs, reason) to MethodResult
 UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
@@ -62,12 +62,12 @@ ALIGNED = ('two_point', 'wheels')
 
 
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
-                begun: Callable[[str], Callable[[int], None]]) -> dict[str, MethodRun]:
+                begun: Callable[[str], Passed]) -> dict[str, MethodRun]:
     """
     Run methods on a leg; what breaks in one costs this method, not the leg.
 
     names : in any order.   begun : called with the name of each before it runs, returns what to
-    call with the passes that it has made.
+    call with each pass of its fit.
 
     Returns
     -------

@@ -19,6 +19,7 @@ from odocal_ros.data.arrays import Ints
 from odocal_ros.data.leg import Leg, part_of
 from odocal_ros.data.pieces import by_step
 from odocal_ros.pipeline.calibrate import calibrate
+from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
@@ -62,7 +63,7 @@ def _near(stamps: Ints, first_ns: int, stop_ns: int) -> Ints:
 
 def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
                     holdout: bool = False,
-                    progress: Callable[[float, str], None] | None = None) -> list[LegResult]:
+                    progress: Callable[[Stage], None] | None = None) -> list[LegResult]:
     """
     Take a leg from samples to results: one, or one of each part that carries.
 
@@ -72,9 +73,9 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     parts = parts_of(leg, config.leg.max_gap)
     results = []
     for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
-        def told(share: float, stage: str, k: int = k) -> None:
+        def told(stage: Stage, k: int = k) -> None:
             if progress is not None:
-                progress((k + share) / len(parts), stage)
+                progress(replace(stage, done=(k + stage.done) / len(parts)))
         results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=told))
     good = [one for one in results if one.verdict is not Verdict.REJECTED]
     if not good:

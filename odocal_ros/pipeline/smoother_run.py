@@ -9,7 +9,7 @@
 
 """The smoother on one leg: all samples at once, no outside heading."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -22,7 +22,7 @@ from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
-from odocal_ros.pipeline.method_run import MethodRun, Path, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
@@ -31,11 +31,11 @@ from odocal_ros.settings.config import Config
 NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
 
 
-def smoother(ready: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
+def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     """
     Run the smoother on a leg.
 
-    ready : PreparedLeg.   passed : called with the passes made.
+    ready : PreparedLeg.   passed : called with each pass.
 
     The Paths are by the smoother's own attitude, the calibrated one with all values found, delays
     and lever arms too; t is as the fixes stamp it.
@@ -45,7 +45,7 @@ def smoother(ready: PreparedLeg, passed: Callable[[int], None]) -> MethodRun:
     leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
                        ready.rough, ready.t_fit)
     passes = count(1)
-    method = smooth(leg, ready.config, lambda *_: passed(next(passes)))
+    method = smooth(leg, ready.config, lambda *seen: passed(next(passes), seen[-1]))
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}

@@ -9,7 +9,7 @@
 
 """The two-point method on one leg: its marks, its chord, and the checks of its track."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +37,7 @@ from odocal_ros.calib.two_point import (
     unsolved,
 )
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Passed, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured, near
 from odocal_ros.reasons import Code, Reason
@@ -46,7 +46,7 @@ from odocal_ros.screening.facing import toward
 NAMES = ('start', 'end')
 
 
-def two_point(ready: PreparedLeg, passed: Callable[[int], None] | None = None) -> MethodRun:
+def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
     """
     Run the two-point method on a leg.
 

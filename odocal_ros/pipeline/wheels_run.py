@@ -9,7 +9,6 @@
 
 """The method ``wheels`` on one leg: the estimate and, where asked for, the patent's search."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +23,7 @@ from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.rotations import matrix_from_quat, quat_from_rotvec, quat_multiply
-from odocal_ros.pipeline.method_run import MethodRun, Paths
+from odocal_ros.pipeline.method_run import MethodRun, Passed, Paths
 from odocal_ros.pipeline.patent_run import search_of
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.tracks import as_configured
@@ -36,7 +35,7 @@ OF_TWO = {Code.WHEELS_NOT_SEPARABLE, Code.TRACK_WIDTH_NOT_DETERMINED}
 UNEVEN = {Code.WHEEL_DEAD, Code.WHEEL_REVERSED, Code.WHEELS_SWAPPED}
 
 
-def wheels(ready: PreparedLeg, passed: Callable[[int], None] | None = None) -> MethodRun:
+def wheels(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
     """
     Run the method on a leg.
 

@@ -29,15 +29,23 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 SPEED = 30.0                         # times real time
 FIRST_S, MARK_S, STOP_S = 10, 25, 140    # of the drive: played from, start mark, stop mark
 MOST_S = 5.0                         # of an answer, as docs/node.md promises
-# a fit that ends as soon as a file is there
+# until a file is there, the first leg's fit makes three passes and the next leg's none
 HELD = """
 import os, time
 from odocal_ros.live import jobs
 compute = jobs.compute
-def held(*args, **kwargs):
+def wait():
     while not os.path.exists({!r}):
         time.sleep(0.01)
-    return compute(*args, **kwargs)
+def held(*args):
+    *samples, tell = args
+    def told(stage):
+        tell(stage)
+        if stage.passes == 3:
+            wait()
+    if args[3]:      # the legs kept
+        wait()
+    return compute(*samples, told)
 jobs.compute = held
 """
 
@@ -72,7 +80,7 @@ def seen(domain, tmp_path_factory):
 
 def _held_leg(found, client, player, sent, gate):
     found.first = _answered(client, player, sent, STOP_S, STOP_S + 2)
-    found.computing = client.until(state='computing')
+    found.computing = client.until(state='computing', computing_passes='3')
     found.recording = [s for s in client.statuses if s['state'] == 'recording'][-1]
     found.valid_before = client.get('result.valid')
     found.again = _answered(client)
@@ -132,6 +140,20 @@ def test_nothing_in_it_can_be_taken_for_the_result(seen):
     assert seen.valid_before == [False]
     assert (seen.computing['verdict'], seen.computing['scale_factor']) == ('', 'nan')
     assert 'the result follows on ~/status' in seen.computing['hint']
+
+
+def test_meanwhile_passes_and_remaining_change_are_said(seen):
+    status = seen.computing
+    assert (status['computing_stage'], status['computing_passes']) == ('smoother', '3')
+    change = float(status['computing_change_sigmas'])
+    assert change > 0
+    assert status['hint'].startswith('computing: smoother, 3 passes done, remaining change ')
+    left = float(status['hint'].split('change ')[1].split(' sigma')[0])
+    assert left == pytest.approx(change, abs=0.5 if change >= 10 else 0.0051)
+    assert '%' not in status['hint']
+    done = seen.calibrated
+    assert (done['computing_stage'], done['computing_passes']) == ('', '0')
+    assert (done['computing_change_sigmas'], done['computing_percent']) == ('nan', '0.0')
 
 
 def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_again(seen):

@@ -95,5 +95,4 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, asked 1000 ppm')
     assert shares(done)['yaw'] == (1.0, '0.25 deg, asked 0.5 deg')
     assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, asked 1000 ppm')
-    assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {
-        'computing': (0.4, '40 %')}
+    assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}

@@ -19,6 +19,7 @@ from odocal_ros.offline.phases import Phase
 with Phase('reading town', quiet={quiet}) as phase:
     phase(0.25)
     phase(0.5, 'leg 2 of 2')
+    phase(None, 'smoother, 7 passes done')
 with Phase('drawing the report'):
     pass
 print('the result')
@@ -48,6 +49,8 @@ def test_a_terminal_shows_each_phase_and_is_left_clean():
     assert out == 'the result\n'
     for part in ('reading town', '25 %', 'leg 2 of 2', '50 %', 'drawing the report'):
         assert part in told, part
+    *_, last = (line for line in told.split('\r') if 'smoother' in line)
+    assert '%' not in last
     assert told.split('\r')[-1].strip() == ''      # the line is wiped
     assert '\n' not in told.replace('\r\n', '')
 

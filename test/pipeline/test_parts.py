@@ -78,7 +78,7 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     alone = calibrate(cut, config)
     assert Code.IMU_GAP in {r.code for r in alone.reasons}
     told = []
-    results = calibrate_parts(cut, config, progress=lambda share, stage: told.append(share))
+    results = calibrate_parts(cut, config, progress=lambda stage: told.append(stage.done))
     assert len(results) == 2
     assert told == sorted(told)
     whole = combine(results, config)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.choice import leg_estimates
+from odocal_ros.calib.smoother.estimate import SETTLING
 from odocal_ros.nav.dead_reckoning import dead_reckon
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.pipeline.calibrate import calibrate, combine
@@ -59,14 +60,19 @@ def test_the_result_is_its_own_and_a_missing_standstill_is_no_matter(made, held)
 def test_auto_takes_it_and_computes_two_point_beside_it(made):
     told = []
     leg = calibrate(made.leg(), settings(made, method='auto', heading_sigma=None),
-                    progress=lambda share, stage: told.append((share, stage)))
+                    progress=told.append)
     # how far it is, pass by pass, and never all before the end
-    shares = [share for share, _ in told]
+    shares = [stage.done for stage in told]
     assert shares == sorted(shares)
     assert shares[0] == 0
     assert 0.8 < shares[-1] < 1
-    assert list(dict.fromkeys(stage for _, stage in told)) == ['two_point', 'smoother', 'tracks']
-    assert len(told) > 8
+    assert list(dict.fromkeys(s.name for s in told)) == ['two_point', 'smoother', 'tracks']
+    passes = [stage for stage in told if stage.passes]
+    assert [stage.passes for stage in passes] == list(range(1, len(passes) + 1))
+    assert {(stage.name, stage.done) for stage in passes} == {('smoother', shares[1])}
+    # the change that is left falls from a first guess some sigmas off to what may be left
+    assert passes[0].change > SETTLING.fitted_below
+    assert passes[-1].change < SETTLING.moves
     assert set(leg.methods) == {'smoother', 'two_point'}
     assert leg_estimates(leg)['yaw_mounting_angle'].method == 'smoother'
 

@@ -41,7 +41,8 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.data.arrays import Floats
 
-Trace = Callable[[int, State, Levels, Weighted, Solved], None]     # called with each pass
+# called with each pass, last with its largest move of a constant, in sigmas
+Trace = Callable[[int, State, Levels, Weighted, Solved, float], None]
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
         state = state.moved(solved.step, solved.step_border)
         weighted.after(solved)
         if trace is not None:
-            trace(count, state, levels, weighted, solved)
+            trace(count, state, levels, weighted, solved, float(move))
         if settled or count >= most:
             still = np.abs(solved.step_border / sigma)[:3].max()
             settled = settled or bool(max(still, change) < SETTLING.nearly)

@@ -1,0 +1,24 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What is said of the work on a leg."""
+
+import pytest
+
+from odocal_ros.pipeline.stage import Stage
+
+
+@pytest.mark.parametrize(('stage', 'words'), [
+    (Stage(), ''),
+    (Stage('two_point', 0.0), 'two_point'),
+    (Stage('smoother', 0.1, 1, 51234.5), 'smoother, 1 pass done, remaining change 51234 sigma'),
+    (Stage('smoother', 0.1, 7, 0.4249), 'smoother, 7 passes done, remaining change 0.42 sigma'),
+])
+def test_it_says_passes_and_change_and_no_share(stage, words):
+    assert stage.words() == words
