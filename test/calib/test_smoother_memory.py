@@ -9,16 +9,20 @@
 
 """What a longer leg costs the smoother of memory: by the keyframe, in one pass."""
 
+from pathlib import Path
 import tracemalloc
 
+import numpy as np
 import pytest
 from smoother_legs import made
 
+from odocal_ros.calib.smoother.axle import rates_at
 from odocal_ros.calib.smoother.chain import solve
 from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.start import first_state
+from odocal_ros.data.mapped import HELD_BYTES, let_go, room
 
 MOST = 36e3     # bytes a keyframe: the chain and its covariances are 12e3, sums and rows the rest
 
@@ -49,3 +53,23 @@ def test_a_longer_leg_costs_a_pass_little(monkeypatch):
     (few, small), (many, large) = peak_of_a_pass(400.0), peak_of_a_pass(1200.0)
     assert many - few > 700
     assert (large - small) / (many - few) == pytest.approx(MOST / 2, abs=MOST / 2)
+
+
+def resident(peak=False):
+    """Return the resident bytes of this process, or their peak since it was last asked."""
+    name = 'VmHWM' if peak else 'VmRSS'
+    found = Path('/proc/self/status').read_text().split(f'{name}:')[1].split()[0]
+    Path('/proc/self/clear_refs').write_text('5')
+    return 1024 * int(found)
+
+
+def test_turn_rates_in_a_file_are_read_piece_by_piece():
+    rows, step = 6_000_000, 1e-3        # 100 min at 1 kHz
+    t, w_b = room(rows), room(rows, 3)
+    t[:] = np.arange(rows) * step
+    assert w_b.nbytes > HELD_BYTES
+    let_go()
+    before = resident()
+    rates_at(t, w_b, np.arange(1.0, rows * step - 1.0))
+    # all times are touched; the rates, if held as a whole, would add their own size
+    assert resident(peak=True) - before - t.nbytes < w_b.nbytes / 2

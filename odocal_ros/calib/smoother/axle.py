@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.chain import stepping
 from odocal_ros.calib.smoother.preintegrate import Intervals, turn
 from odocal_ros.calib.smoother.state import FAST_SPEED, ODO_ARM, State
 from odocal_ros.data.arrays import Floats
@@ -35,7 +36,7 @@ def rates_at(t: Floats, w_b: Floats, at: Floats) -> Floats:
     """Return measured turn rates at some times, means over RATE_WINDOW: (N, 3) rad/s."""
     first = np.searchsorted(t, at - RATE_WINDOW / 2)
     last = np.maximum(np.searchsorted(t, at + RATE_WINDOW / 2, side='right'), first + 1)
-    return np.stack([w_b[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
+    return np.stack([w_b[first[k]:last[k]].mean(axis=0) for k in stepping(range(len(at)))])
 
 
 class Axle:
