@@ -20,6 +20,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.data.arrays import Floats
+from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
@@ -84,7 +85,9 @@ def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
         onward = 0.2    # s, whose motion goes on beyond the data, by the delay
         before = track.at(inside - np.copysign(onward, beyond))
         P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
+        let_go()        # of hours of sums, before hours of attitude are read
         at: Floats = P @ f + track.C_nb_at(inside) @ lever_b
+        let_go()
         return at
     return path
 
