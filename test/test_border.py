@@ -37,7 +37,7 @@ ROOMS = {
     'pipeline': 'calib data nav patent screening settings',
     'planning': 'calib data nav screening settings',
     'foresee': 'calib data nav pipeline planning screening settings',
-    'apply': 'calib data nav settings',
+    'apply': 'calib data nav screening settings',
     'sim': 'data nav settings',
     'paper': 'calib data nav pipeline settings sim',
     'output': 'calib data nav outside paper patent pipeline settings',

@@ -21,6 +21,7 @@ from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.rotations import skew
 from odocal_ros.settings.grades import Grade
+from odocal_ros.settings.levels import FAULT_SIGMAS
 
 # definition: where the unknowns stand in the error state
 P, PHI, BG, BA = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -29,7 +30,8 @@ BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable by it, of a body nearly level: 
 BY_REST = np.r_[3:9]
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
-HIDDEN_IN_GAP = 0.1    # rad/s; judgement: of a turn that may hide in a gap of the Imu
+# rad/s, s; judgement: of a turn that may hide in a gap of the Imu; a shorter gap hides its cube
+HIDDEN_IN_GAP, HIDING_GAP = 0.1, 0.1
 # m/s^2; judgement: of driving, that a second of odometer, or more, does not tell
 SHAKING = 0.4
 # physical: rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the
@@ -60,13 +62,13 @@ class Errors:
         self.cov[5, 14] = self.cov[14, 5] = -vehicle.yaw_sigma**2
 
     def grow(self, T: float, C_nb: Floats, way_n: Floats, turn_n: Floats, axes_n: Floats,
-             doubt: float = 0.0, hidden: float = 0.0) -> None:
+             doubt: float = 0.0, gaps: Floats | None = None) -> None:
         """
         Carry the errors over an interval.
 
         T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : (3,) m, rad.
         axes_n : (3, 3) columns forward, left, up.   doubt : m^2 of the way that are not certain.
-        hidden : s of the interval of which the Imu tells nothing.
+        gaps : (k,) s, parts of the interval of which the Imu tells nothing.
         """
         F = np.eye(N)
         cross = skew(way_n)
@@ -75,9 +77,11 @@ class Errors:
         F[P, BG], F[P, G] = cross @ C_nb * (T / 2), cross @ turn_n / 2
         cov = F @ self.cov @ F.T
         road = self.road(float(np.linalg.norm(way_n))) + [doubt, 0.0, 0.0]
-        cov[P, P] += axes_n * road @ axes_n.T
+        hidden = 0.0 if gaps is None else float(np.sum(
+            HIDDEN_IN_GAP * gaps * np.minimum(1.0, gaps / HIDING_GAP)**2))
+        cov[P, P] += axes_n * road @ axes_n.T + cross @ cross.T * hidden**2
         diagonal = np.zeros(N)
-        diagonal[PHI] = self.grade.gyro_noise**2 * T + (HIDDEN_IN_GAP * hidden)**2
+        diagonal[PHI] = self.grade.gyro_noise**2 * T + hidden**2
         diagonal[3:5] += self._earth_left**2 * T
         diagonal[BG] = self.grade.gyro_bias_walk**2 * T
         diagonal[BA] = self.grade.accel_bias_walk**2 * T
@@ -94,22 +98,39 @@ class Errors:
         """Take in a way, m, of which nobody knows where it led."""
         self.cov[range(3), range(3)] += way**2
 
-    def by_gravity(self, C_nb: Floats, off_n: Floats, T: float, sigma: float) -> Floats:
+    def turned(self, variance: Floats) -> None:
+        """Take in a turn, (3, 3) rad^2 in n, of which nobody knows how far it led."""
+        self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
+
+    def by_gravity(self, C_nb: Floats, off_n: Floats, T: float, sigma: float) -> Floats | None:
         """
         Return the correction, (16,), by the level part of force less acceleration, m/s^2.
 
         C_nb : (3, 3) over the T s that it is the mean of.   sigma : m/s^2, beside the sensor's.
+        At rest sigma is 0: a force that the errors do not explain then has driving's. None, and
+        nothing is taken, where not even that explains it.
         """
         H = np.zeros((2, N))
         H[0, 4], H[1, 3] = -GRAVITY, GRAVITY
         H[:, BA] = C_nb[:2]
-        return self._correction(H, off_n[:2], np.eye(2) * (
-            self.grade.accel_noise**2 / T + sigma**2), BY_GRAVITY)
+        noise = self.grade.accel_noise**2 / T
+        explained = np.diag(H @ self.cov @ H.T) + noise + sigma**2
+        if not (off_n[:2]**2 < FAULT_SIGMAS**2 * explained).all():
+            sigma = max(sigma, SHAKING)
+            if not (off_n[:2]**2 < FAULT_SIGMAS**2 * (explained + sigma**2)).all():
+                return None
+        return self._correction(H, off_n[:2], np.eye(2) * (noise + sigma**2), BY_GRAVITY)
 
     def by_rest(self, rate_b: Floats, variance: Floats) -> Floats:
-        """Return the correction by a mean turn rate at rest, rad/s, bias taken out."""
+        """
+        Return the correction by a mean turn rate at rest, rad/s, bias taken out.
+
+        One that is off by more than the errors explain says first that the bias may be off so.
+        """
         H = np.zeros((3, N))
         H[:, BG] = np.eye(3)
+        off = rate_b**2 > FAULT_SIGMAS**2 * (np.diag(self.cov)[BG] + variance)
+        self.cov[range(6, 9), range(6, 9)] += np.where(off, rate_b**2, 0.0)
         return self._correction(H, rate_b, np.diag(variance), BY_REST)
 
     def _correction(self, H: Floats, z: Floats, R: Floats, observed: list[int] | Ints) -> Floats:

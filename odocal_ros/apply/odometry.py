@@ -8,41 +8,27 @@
 # the License.
 
 """
-Dead reckoning as the samples come: the calibration's own strapdown and sum, corrected at stops.
+Odometry as the samples come: screened streams, a start, and the path from it on.
 
-From one Imu sample to the next attitude is turned by the calibration's rotation increments
-(``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
-as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
-attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
-gyro bias; the position never jumps.
+Where the path cannot be gone on with, it begins anew, at its origin, and says so.
 """
 
 import numpy as np
 
-from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
-from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
-from odocal_ros.apply.start import begin, Start
+from odocal_ros.apply.arrivals import Arrivals
+from odocal_ros.apply.pose import Pose
+from odocal_ros.apply.reckoning import ODOMETER_SILENCE, Reckoning
+from odocal_ros.apply.start import begin
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
-from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import COUNTER
-from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples
-from odocal_ros.nav.rotations import (
-    matrix_from_quat,
-    quat_from_matrix,
-    quat_from_rotvec,
-    quat_multiply,
-)
-from odocal_ros.nav.standstill import REST_TURN
-from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.data.samples import ImuSamples, OdometerForm, OdometerSamples, take
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
-from odocal_ros.settings.levels import FASTEST
+from odocal_ros.settings.levels import CLOCK_APART
 
-# judgement, all in s: between corrections; that a speed is taken over; without odometer, after
-# which attitude goes on alone; without Imu, that hide motion
-CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
+BEGINS_ANEW = 'odometry begins anew'      # so begins each sentence that says it
 
 
 class Odometry:
@@ -56,6 +42,8 @@ class Odometry:
     def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
         self.vehicle, self.config = vehicle, config
         self.grade = grade_of(config.imu)
+        self.restarts = 0
+        self._first_ahead: float | None = None
         self._told: list[str] = []
         self._anew()
 
@@ -66,168 +54,75 @@ class Odometry:
         return told
 
     def apart(self) -> float:
-        """Return by how many s the odometer's newest stamp is ahead of the Imu's, 0 unknown."""
-        ready = self.wheels.ready() and len(self.imu.t)
-        return self.wheels.newest() - float(self.imu.t[-1]) if ready else 0.0
+        """Return by how many s an odometer's clock is ahead of the Imu's, 0 if it may be delay."""
+        # arrivals of a bag that is played fast are of a coarser time
+        fast = max((one.rate for one in self._arrivals.values()), default=1.0)
+        ahead = self._ahead()
+        return ahead if abs(ahead) > CLOCK_APART * fast else 0.0
 
-    def begin_anew(self) -> None:
-        """Begin where a first message would, after a jump of time."""
-        self._told.append('time went back: odometry begins anew, at its origin')
+    def _ahead(self) -> float:
+        """Return by how many s an odometer's stamps are ahead of the Imu's, 0 unknown."""
+        lags = {slot: one.lag_ns for slot, one in self._arrivals.items() if one.lag_ns is not None}
+        imu_ns = lags.pop('imu', None)
+        ahead = [imu_ns - lag for lag in lags.values()] if imu_ns is not None else []
+        return max(ahead, key=abs, default=0.0) * 1e-9
+
+    def _begin_anew(self, why: str) -> None:
+        """Begin where a first message would."""
+        self.restarts += 1
+        self._told.append(f'{BEGINS_ANEW}, at its origin: {why}')
         self._anew()
 
     def _anew(self) -> None:
         self.wheels = Wheels(self.vehicle, self.config, self._told)
-        self.imu = ImuStream(self.config)
-        self._start: Start | None = None
+        self.imu = ImuStream(self.config, self._told)
+        self._arrivals: dict[str, Arrivals] = {}
+        self._path: Reckoning | None = None
 
     def feed(self, slot: str, block: ImuSamples | OdometerSamples,
              form: OdometerForm | None = None) -> None:
         """Take a block of 'imu', 'odometer' or 'odometer_right', the latter with their form."""
+        arrivals = self._arrivals.setdefault(slot, Arrivals())
+        believed = arrivals.believed(block.stamp_ns, block.received_ns)
+        if arrivals.anew:
+            self._begin_anew(f'the stamps of the {slot} jump by {arrivals.off_s:+.3g} s')
+            block = take(block, slice(arrivals.odd_from, None))
+            arrivals = self._arrivals[slot] = Arrivals()
+            believed = arrivals.believed(block.stamp_ns, block.received_ns)
+        if arrivals.dropped:
+            self._told.append(f'{slot}: {arrivals.dropped} messages dropped, whose stamps are not '
+                              f'those of their arrival (off by {arrivals.off_s:+.3g} s)')
+        block = take(block, believed)
         if isinstance(block, OdometerSamples):
             self.wheels.feed(slot, block, form or COUNTER)
-        elif not self.imu.feed(block):
-            self.begin_anew()
+        else:
             self.imu.feed(block)
         self.wheels.zero_ns = self.imu.zero_ns
 
     def poses(self) -> list[Pose]:
         """Return the poses that what was fed since the last call allows."""
-        out: list[Pose] = []
-        if self._start is None:
-            self._start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
-            if self._start is None:
-                return out
-            self._take_start(self._start)
-        while (last := self._next()) is not None:
-            speaks = self.imu.t[last] <= self.wheels.newest()
-            self._advance(last)
-            if speaks:
-                out.append(self._pose())
-            self._look()
-            self._leave_behind(last)
+        apart = self.apart()
+        if apart and self._path is not None:
+            self._begin_anew(f"the stamps of the odometer are {apart:+.3g} s from the Imu's")
+        if self._path is None and not apart:
+            self._path = self._begin()
+        if self._path is None:
+            self.imu.forget(ODOMETER_SILENCE)
+            return []
+        out = self._path.poses()
+        if self._path.failed:
+            self._begin_anew(self._path.failed)
         return out
 
-    def _take_start(self, start: Start) -> None:
-        self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
-        self.accel_bias = np.zeros(3)
-        self.position = np.zeros(3)      # of the odometer's point, from where it began
-        self.imu.drop(start.row)
-        self._earth_n = start.earth_n
-        self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
-        self._s = self._s_pose = float(self.wheels.at(self._t))
-        self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
-        self._w_look: list[Floats] = []
-        self._rested = False
-        self._v_look = self._velocity_n(self._t)
-        self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
-
-    def _next(self) -> int | None:
-        """Return the row to advance to: a pose is due and all it needs has come; else None."""
-        t, at = self.imu.t, self.imu.at
-        period = 1 / self.config.publish.rate
-        last = int(np.searchsorted(t, self._t_pose + period - 1e-6))
-        last = max(last, at + 1)
-        if last > len(t) - 2:            # a cubic needs the sample beyond
+    def _begin(self) -> Reckoning | None:
+        """Return the path from the first samples on, None while too few have come."""
+        start = begin(self.imu, self.wheels, self.vehicle, self.config, self.grade)
+        if start is None:
             return None
-        if t[last] > self.wheels.newest() and t[-1] - t[last] < ODOMETER_SILENCE:
-            return None
-        return last
-
-    def _advance(self, last: int) -> None:
-        """Go to a row of the Imu."""
-        imu, at = self.imu, self.imu.at
-        low = max(at - 1, 0)
-        t = imu.t[low:last + 2]
-        phi = rotation_increments(t, imu.w_b[low:last + 2] - self.bias)
-        phi = phi[:, at - low:last - low]
-        t = imu.t[at:last + 1]
-        q = prefix_product(np.concatenate([self.q[None], quat_from_rotvec(phi.T)]))
-        if self._earth_n.any():
-            turned = np.multiply.outer(self._t - t, self._earth_n)
-            q = quat_multiply(quat_from_rotvec(turned), q)
-        C = matrix_from_quat(q)
-        s = self.wheels.at(t)
-        lost, self._s = abs(float(s[0]) - self._s), float(s[-1])
-        mid = (C[:-1] + C[1:]) / 2
-        way_n = np.sum(mid @ self.vehicle.forward_b * np.diff(s)[:, None], axis=0)
-        self.position = self.position + way_n
-        T, turn_b = t[-1] - t[0], phi.sum(axis=1)
-        gaps = np.diff(t)
-        C_mid = C[len(C) // 2]
-        self.errors.grow(T, C_mid, way_n, C_mid @ turn_b, C_mid @ self.vehicle.C_vb.T,
-                         self.wheels.doubt(t[0], t[-1]), gaps[gaps > IMU_HOLE].sum())
-        if lost > self.wheels.quantum:
-            self.errors.lost(lost)
-        f = imu.f_b[at:last + 1] - self.accel_bias
-        self._felt &= bool(np.isfinite(f).all()) and not (gaps > IMU_HOLE).any()
-        f_n = np.einsum('kij,kj->ki', C, f)
-        self._felt_n = self._felt_n + gaps @ (f_n[:-1] + f_n[1:]) / 2
-        self._turn_b = self._turn_b + turn_b
-        self._w_look.append(imu.w_b[at + 1:last + 1])
-        self.q, self._t = q[-1] / np.linalg.norm(q[-1]), float(t[-1])
-        imu.at = last
-
-    def _velocity_n(self, t: float) -> Floats:
-        """Return the velocity of the Imu in n, by the odometer's last rows."""
-        v, C_nb = self.vehicle, matrix_from_quat(self.q)
-        now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
-        arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
-        rate = self.imu.w_b[self.imu.at] - self.bias
-        velocity: Floats = C_nb @ (
-            v.forward_b * (now - before) / SPEED_SPAN + np.cross(rate, arm_b))
-        return velocity
-
-    def _look(self) -> None:
-        """Correct tilt and gyro bias, a second after the last time."""
-        T = self._t - self._t_look
-        if T < CORRECTION_PERIOD - 1e-6:
-            return
-        velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
-        w = np.concatenate(self._w_look)
-        resting = heard and self.wheels.still(self._t_look, self._t) and bool(
-            (w.std(axis=0) < REST_TURN).all()
-            and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
-        # a rest that begins with this look may begin with the last of the braking
-        standing = resting and self._rested
-        if self.config.levelling and heard and self._felt:
-            off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
-            noise = 2 * self.wheels.quantum / SPEED_SPAN / T
-            self._correct(self.errors.by_gravity(
-                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise)))
-        if self.config.levelling and standing:
-            variance = np.maximum(self.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
-            earth_b = matrix_from_quat(self.q).T @ self._earth_n
-            self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
-        self._rested = resting
-        self._t_look, self._v_look = self._t, self._velocity_n(self._t)
-        self._felt_n, self._felt, self._w_look = np.zeros(3), True, []
-
-    def _correct(self, by: Floats) -> None:
-        self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
-        self.bias = self.bias + by[BG]
-        self.accel_bias = self.accel_bias + by[BA]
-
-    def _pose(self) -> Pose:
-        """Return the pose at the row reached."""
-        v, T = self.vehicle, self._t - self._t_pose
-        C_nb, C_vb = matrix_from_quat(self.q), v.C_vb
-        arm_n = -C_nb @ C_vb.T @ v.lever_arm
-        earth_b = C_nb.T @ self._earth_n
-        rate = C_vb @ (self._turn_b / T - earth_b)
-        speed = (self._s - self._s_pose) / T
-        velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
-        if abs(speed) > FASTEST:
-            self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
-        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
-        pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
-                    quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
-                    pose_covariance(v, self.errors, C_nb, arm_n, quantum),
-                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
-        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
-        return pose
-
-    def _leave_behind(self, last: int) -> None:
-        """Forget what lies behind."""
-        if last > 2000:
-            self.imu.drop(last - 2)
-            self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)
+        ahead = self._ahead()
+        if self._first_ahead is None:
+            self._first_ahead = ahead
+        # a clock that was set alone is now apart from the other by what nobody has calibrated
+        delay = float(np.hypot(self.config.odometer.time_sigma, ahead - self._first_ahead))
+        return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._told,
+                         delay)

@@ -37,17 +37,24 @@ class Pose:
     pose_cov: Floats
     twist_cov: Floats
 
+    def sound(self) -> bool:
+        """Return whether all is finite, and no variance negative."""
+        return all(bool(np.isfinite(x).all()) for x in (
+            self.position, self.q, self.velocity, self.rate, self.pose_cov, self.twist_cov)) and (
+            bool((np.diag(self.pose_cov) >= 0).all() and (np.diag(self.twist_cov) >= 0).all()))
+
 
 def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Floats,
-                    quantum: float) -> Floats:
+                    along: float) -> Floats:
     """
-    Return the covariance of position and rotation, with what a count hides along the way: (6, 6).
+    Return the covariance of position and rotation: (6, 6).
 
-    C_nb, arm_n : as ``Errors.pose`` takes them.   quantum : m, a count.
+    C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, what a count and the odometer's
+    delay hide along the way, at the moment.
     """
     cov = errors.pose(C_nb, arm_n)
     forward_n = C_nb @ vehicle.forward_b
-    cov[:3, :3] += np.outer(forward_n, forward_n) * quantum**2 / 6
+    cov[:3, :3] += np.outer(forward_n, forward_n) * along
     return cov
 
 

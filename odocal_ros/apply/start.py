@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.apply.errors import Errors
+from odocal_ros.apply.errors import Errors, GRAVITY
 from odocal_ros.apply.stream import ImuStream
 from odocal_ros.apply.vehicle import Vehicle
 from odocal_ros.apply.wheels import Wheels
@@ -25,9 +25,11 @@ from odocal_ros.nav.standstill import MOST_BIAS, REST_TURN
 from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import Grade
 
+MOST_TILTING = 0.5         # rad/s; physical: no vehicle rolls or pitches so for START_SPAN
 START_SPAN = 2.0           # s; judgement: of samples that a start is taken from
 GIVEN_TILT_SIGMA = 0.01    # rad; judgement: of an attitude from outside
 ROAD_TILT_SIGMA = 0.1      # rad; physical: a road of 10 %
+MOST_FORCE_OFF = 5.0       # m/s^2; physical: half of g, that driving may add over START_SPAN
 BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may hold of braking
 
 
@@ -60,7 +62,16 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
     t, w, f = imu.t[row:end + 1], imu.w_b[row:end + 1], imu.f_b[row:end + 1]
     resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
+    if not resting and np.linalg.norm(_tilting(w.mean(axis=0), f.mean(axis=0))) > MOST_TILTING:
+        imu.drop(end)       # a gyro that tells nonsense: wait until it is over
+        return None
     return _levelled(end, float(t[-1] - t[0]), w, f, resting, vehicle, grade)
+
+
+def _tilting(w: Floats, f: Floats) -> Floats:
+    """Return what of a mean turn rate, (3,) rad/s, is not about the vertical; 0 without force."""
+    up = f / np.linalg.norm(f)
+    return w - up * (w @ up) if np.isfinite(up).all() else np.zeros(3)
 
 
 def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
@@ -75,8 +86,9 @@ def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Sta
 def _levelled(row: int, length: float, w: Floats, f: Floats, resting: bool, vehicle: Vehicle,
               grade: Grade) -> Start:
     """Return the start by gravity, x along the vehicle; the bias by a rest, else as calibrated."""
-    felt = bool(np.isfinite(f).all())
-    C_Lb = level_frame(f.mean(axis=0)) if felt else vehicle.C_vb
+    mean = f.mean(axis=0)
+    felt = bool(abs(np.linalg.norm(mean) - GRAVITY) < MOST_FORCE_OFF)      # not NaN either
+    C_Lb = level_frame(mean) if felt else vehicle.C_vb
     forward = C_Lb @ vehicle.forward_b
     C_nb = C_nL(-np.arctan2(forward[1], forward[0])) @ C_Lb
     if resting:

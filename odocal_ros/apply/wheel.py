@@ -14,6 +14,7 @@ A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``)
 only its past, and a scale that is known: what no vehicle does in the time is no travel.
 """
 
+from bisect import bisect_left
 from collections import deque
 import math
 
@@ -21,12 +22,20 @@ import numpy as np
 
 from odocal_ros.data.arrays import FloatOrFloats, Floats, Values
 from odocal_ros.data.samples import OdometerForm
+from odocal_ros.settings.levels import FASTEST
 
-SPEED_TIME = 0.5    # s; judgement: over which the speed beside a row is taken
-# judgement: m/s that a speed may change by, s that a burst of stamps may hide
-SPEED_CHANGE, STAMP_BURST = 5.0, 0.25
-# judgement: rows before any is doubted; rows in turn that are refused, the next is believed
-SURE_ROWS, MOST_REFUSED = 5, 2
+# s, counts; judgement: over which the speed beside a row is taken, at least and at most
+LEAST_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
+# m/s^2; physical: half of g is hard braking; what a wheel that locks or spins shows at most
+SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
+# judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
+# rows that tell them
+STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
+# judgement: rows before any is doubted; rows in turn, and s, that are refused at least before one
+# is believed
+SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
+STRANGE_TIME = 1.0    # s; judgement: after it motion may explain a jump of speed
+KEPT_TIME = 60.0    # s; judgement: of rows without a message of the Imu
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals; judgement: messages are missing
 
 
@@ -48,6 +57,11 @@ class Wheel:
         self.doubts: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
         self._value: int | float | None = None
         self._rows = self._refused = 0
+        self._refused_since = 0.0
+        self._jitter = STAMP_BURST / JITTERS      # s, of the stamps, as the rows show it
+        # after rows that were refused: m/s that nothing explains yet, m it may have misled by, for
+        # s, m/s before it
+        self._strange = self._strange_way = self._strange_time = self._sure_speed = 0.0
 
     @property
     def quantum(self) -> float:
@@ -60,6 +74,8 @@ class Wheel:
         for row in zip(t.tolist(), value.tolist(), strict=True):
             if math.isfinite(row[1]) and (not self.t or row[0] > self.t[-1]):
                 self._take(*row)
+        if self.t:
+            self.forget(self.t[-1] - KEPT_TIME)
 
     def rescale(self, scale: float) -> None:
         """Take another factor, m per unit, for what was rolled too."""
@@ -77,6 +93,14 @@ class Wheel:
         """Return the variance of the travel between two times, m^2, each doubt once."""
         return sum((variance for t, variance in self.doubts if t_from < t <= t_to), 0.0)
 
+    def between(self, t: float) -> float:
+        """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
+        after = bisect_left(self.t, t)
+        if not 0 < after < len(self.t):
+            return 0.0
+        sag = SPEED_CHANGE / 2 * (t - self.t[after - 1]) * (self.t[after] - t) / 2
+        return sag**2
+
     def forget(self, t: float) -> None:
         """Drop rows that nobody asks for again."""
         while len(self.t) > 2 and self.t[1] < t:
@@ -93,24 +117,76 @@ class Wheel:
         dt, before = t - self.t[-1], self._value
         self._rows += 1
         step = self._step(value, before, dt) * self.scale
-        allowed = (1.5 * abs(self.speed) + SPEED_CHANGE) * max(dt, STAMP_BURST) + 3 * self.quantum
         gap = dt > max(MISSING_TIME, GAP_FACTOR * self.usual) and self._rows > SURE_ROWS
-        if gap and self.form.quantity != 'cumulative':
-            step += self._bridged(t, dt, step)
-        if abs(step) > allowed and self._rows > SURE_ROWS and self._refused < MOST_REFUSED:
-            self._refused += 1
+        if gap:
+            step += self._bridged(dt, step)
+        shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
+        off = abs(shown - self.speed) * dt
+        if self._is_false(t, dt, step, off):
             self.told.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or a '
                              f'false row, no motion; bridged at {self.speed:.1f} m/s')
             step = self.speed * dt
-            self.doubts.append((t, (step**2 + self.quantum**2) / 3))
+            lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
+            # a counter that hung for a moment catches up
+            lost = max(lost, off) if off < lost + abs(self.speed) * REFUSED_TIME else lost
+            self._doubt((lost**2 + self.quantum**2) / 3)
             value = before if self.form.quantity == 'rate' else value
         else:
-            self._refused = 0
+            self._follow(dt, step, shown, off)
         self._value = value
-        share = min(1.0, dt / SPEED_TIME)
-        self.speed += (step / dt - self.speed) * share
         self.usual += (dt - self.usual) * (0.1 if self.usual and not gap else not gap)
         self._add(t, self.s[-1] + step)
+
+    def _is_false(self, t: float, dt: float, step: float, off: float) -> bool:
+        """
+        Return whether a row is no motion: a step, m, that is off, m, from the speed before.
+
+        What stays for a while and is possible at all is believed.
+        """
+        possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum
+        usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
+        if possible and usual:
+            return False
+        self._refused += 1
+        self._refused_since = t if self._refused == 1 else self._refused_since
+        return not possible or self._refused <= MOST_REFUSED or (
+            t - self._refused_since < REFUSED_TIME)
+
+    def _limit(self, dt: float, change: float = WHEEL_CHANGE) -> float:
+        """Return how far a row may be off the speed before, m, that changes by so many m/s^2."""
+        return (change * (dt + self._lag()) * dt + 3 * self.quantum
+                + JITTERS * self._jitter * abs(self.speed))
+
+    def _lag(self) -> float:
+        """Return the time, s, that the speed is taken over: coarse counts want more."""
+        counts = SPEED_COUNTS * self.quantum
+        coarse = counts / max(abs(self.speed), counts) if counts else 0.0
+        return min(SPEED_TIME, LEAST_TIME + coarse)
+
+    def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
+        """Take over the speed of a row that is believed; doubt what followed a jump of speed."""
+        if self._refused:
+            back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
+            self._strange = 0.0 if back else abs(shown - self.speed)
+            self._sure_speed, self._strange_way, self._strange_time = self.speed, 0.0, 0.0
+            self.speed = shown if off > self._limit(dt) else self.speed
+        elif off > self._limit(dt, SPEED_CHANGE):
+            self._doubt(off**2)
+        self._refused = 0
+        if self._strange:
+            way = self._strange_way + self._strange * dt
+            self._doubt((way**2 - self._strange_way**2) / 3)
+            self._strange_way = way
+            self._strange_time += dt
+            if self._strange_time > STRANGE_TIME:      # motion itself may explain it
+                self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
+        self._jitter += (min(off / max(abs(self.speed), 1.0), STAMP_BURST)
+                         - self._jitter) / JITTER_ROWS
+        self.speed += (step / dt - self.speed) * min(1.0, dt / self._lag())
+
+    def _doubt(self, variance: float) -> None:
+        """Doubt the travel, m^2, from the last row on."""
+        self.doubts.append((self.t[-1] + 1e-6, variance))
 
     def _add(self, t: float, s: float) -> None:
         self.t.append(t)
@@ -127,12 +203,16 @@ class Wheel:
             step = (step + modulus // 2) % modulus - modulus // 2
         return step
 
-    def _bridged(self, t: float, dt: float, step: float) -> float:
-        """Return what to add to the travel of a gap in speeds or increments, m; doubt it."""
+    def _bridged(self, dt: float, step: float) -> float:
+        """Return what to add to the travel of a gap, m; doubt that of speeds or increments."""
+        if self.form.quantity == 'cumulative':
+            self.told.append(f'no odometer message for {dt:.2f} s: what was counted meanwhile is '
+                             'spread evenly')
+            return 0.0
         missing = dt - self.usual
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0
         size = max(abs(self.speed), abs(step) / dt)
-        self.doubts.append((t, (min(missing / 50, 0.3) * size * missing) ** 2 / 3))
+        self._doubt((min(missing / 50, 0.3) * size * missing) ** 2 / 3)
         self.told.append(f'no odometer message for {dt:.2f} s: the travel is taken from the '
                          'speeds beside')
         return lost

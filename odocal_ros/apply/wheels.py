@@ -54,9 +54,8 @@ class Wheels:
             self._wheels[slot] = Wheel(form, self._vehicle.scale, self._reversed)
             self._scale(form)
         wheel = self._wheels[slot]
-        good = block.stamp_ns > 0
-        stamp = block.stamp_ns[good] + self._offset_ns
-        wheel.feed(np.asarray((stamp - self.zero_ns) * 1e-9, float), block.value[good])
+        stamp = block.stamp_ns + self._offset_ns
+        wheel.feed(np.asarray((stamp - self.zero_ns) * 1e-9, float), block.value)
         self._told += wheel.told
         wheel.told.clear()
 
@@ -90,6 +89,10 @@ class Wheels:
     def doubt(self, t_from: float, t_to: float) -> float:
         """Return the variance of the travel between two times, m^2, beside that of the scale."""
         return sum(w.doubt(t_from, t_to) for w in self._wheels.values()) / len(self._wheels)**2
+
+    def between(self, t: float) -> float:
+        """Return the variance, m^2, of the travel at a time because rows lie only beside it."""
+        return sum(w.between(t) for w in self._wheels.values()) / len(self._wheels)**2
 
     @property
     def quantum(self) -> float:

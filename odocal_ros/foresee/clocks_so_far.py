@@ -15,9 +15,9 @@ import numpy as np
 
 from odocal_ros.data.arrays import Ints
 from odocal_ros.data.samples import Samples
-from odocal_ros.screening.clocks import CLOCK_APART, remedy
+from odocal_ros.screening.clocks import remedy
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.levels import DAY_NS
+from odocal_ros.settings.levels import CLOCK_APART, DAY_NS
 
 IMU_BLOCKS = 40       # judgement: newest, that rows of others are laid beside: some seconds
 CLOCK_ROWS = 10       # judgement: newest of a topic that its clock is told by

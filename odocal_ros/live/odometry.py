@@ -10,6 +10,7 @@
 """The node that applies a calibration: counter and Imu in, odometry and twist out."""
 
 from functools import partial
+import re
 import sys
 from typing import Any
 
@@ -19,11 +20,10 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 
-from odocal_ros.apply.odometry import Odometry
+from odocal_ros.apply.odometry import BEGINS_ANEW, Odometry
 from odocal_ros.apply.pose import Pose
 from odocal_ros.apply.vehicle import vehicle_of
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.samples import take
 from odocal_ros.errors import BadConfig
 from odocal_ros.live import params
 from odocal_ros.live.console import SILENCE_FIRST_NS, SILENCE_SELDOM_NS
@@ -33,8 +33,7 @@ from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.apply_config import ApplyConfig
 
 POSE_TURN_S = 0.01              # judgement: what a controller lets pose and twist be late
-CLOCKS_APART_S = 2.0       # judgement: between the stamps of two topics, from which it is said
-MOST_SENTENCES = 20        # judgement: on what comes in, of one run of the node
+SAID_AGAIN_NS = 10 * 10**9      # judgement: between two sentences of one kind
 HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
 
@@ -77,7 +76,8 @@ class OdometryNode(SettledNode):
         self._twist = publish(TwistWithCovarianceStamped, 'odometry/twist', 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._look_ns = self._silent_ns = 0
-        self._said, self._begun, self._pause_ns = 0, False, SILENCE_FIRST_NS
+        self._begun, self._pause_ns = False, SILENCE_FIRST_NS
+        self._said_ns: dict[str, int] = {}      # when, by kind of sentence
         self.add_on_set_parameters_callback(params.fixed)
         self.create_timer(POSE_TURN_S, self._tick, clock=self._steady)
         self.get_logger().info(f'applies the {kept.words("")}')
@@ -96,10 +96,14 @@ class OdometryNode(SettledNode):
             self._begun = True
             self.get_logger().info('odometry begins')
         for text in self._odometry.take_told():
-            self._said += 1
-            if self._said <= MOST_SENTENCES:
-                last = ' (more of this kind is not said)' if self._said == MOST_SENTENCES else ''
-                self.get_logger().warning(text + last)
+            self._say(text, now_ns)
+
+    def _say(self, text: str, now_ns: int) -> None:
+        """Say what was found: a new beginning each time, other kinds of sentence seldom."""
+        kind = re.sub(r'[-+.\de]*\d', '#', text)
+        if text.startswith(BEGINS_ANEW) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
+            self._said_ns[kind] = now_ns
+            self.get_logger().warning(text)
 
     def _pump(self, source: Input) -> None:
         """Hand on what has come on a topic."""
@@ -107,12 +111,9 @@ class OdometryNode(SettledNode):
         if not raws:
             return
         for slot, block in source.decode(raws, sent_ns, None):
-            self._odometry.feed(slot, take(block, source.sound),
-                                source.reader.form if source.reader else None)
-        if source.slot == 'imu' and source.health.jumped_back:
-            self._odometry.begin_anew()
-            for one in self._inputs.values():
-                one.health.forget()
+            self._odometry.feed(slot, block, source.reader.form if source.reader else None)
+        if source.health.jumped_back:
+            source.health.forget()
 
     def _look_around(self, now_ns: int) -> None:
         """Look for publishers, and say what is missing, seldom."""
@@ -122,7 +123,7 @@ class OdometryNode(SettledNode):
                 one.find(self.config)
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]
         apart = self._odometry.apart()
-        if not missing and abs(apart) > CLOCKS_APART_S:
+        if not missing and apart:
             missing = [f'the stamps of the odometer are {apart:+.3g} s from those of the Imu: two '
                        'clocks; mend the drivers, or set use_sim_time where a bag is played']
         if not missing:

@@ -19,8 +19,8 @@ from odocal_ros.data.pieces import by_step, median, pieces
 from odocal_ros.data.samples import ImuSamples, Samples, SomeSamples, take
 from odocal_ros.nav.gaps import GAP_INTERVALS
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import CLOCK_APART
 
-CLOCK_APART = 0.5      # s between topics, judgement: no driver is as late
 OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
 CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}

@@ -31,6 +31,13 @@ CLUMP_REACH = 50          # rows: a page or a packed block of a recording is abo
 DAMAGED_SHARE = 0.01      # of the rows beyond any sensor: so many are a damaged recording, or
 SEVERAL_ROWS = 4          # rows, wherever: about as many are wrong beside them and do not show
 ROWS_BESIDE = 5          # rows to either side that are still where a single row is false
+# judgement: of a spike: least step from row to row, rad/s and m/s^2 (potholes stay), and in usual
+# steps; s within which it is over (longer, and motion itself may do it); share of the step that
+# is then left
+TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
+# judgement: of a single row: least that it is off by, rad/s (0.003 rad in 0.1 s) and m/s^2; times
+# as far from its neighbours as those beside it are from theirs; of that, how alike the two are
+SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, NEIGHBOURS_ALIKE = 0.03, 2.0, 10.0, 0.3
 GLITCH_SHARE = 0.002      # of the rows: more of them are no glitches
 ROLLS = 0.1               # of the top speed: slower on the mean, a vehicle may as well stand
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
@@ -115,17 +122,14 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
     if not len(far):
         return found
     size = bound[far]
-    usual_steps = 20.0    # times the usual step from row to row
-    clear = size > usual_steps * median(bound)
+    clear = size > USUAL_STEPS * median(bound)
     done = -1
-    glitch_time = 0.4    # s within which a glitch is over: longer, and motion itself may do it
-    back_share = 0.5    # of the bound: nearer to the row before it, the glitch is over
     most_bounds = 2000    # bounds looked at
     for i, bound in zip(far[clear][:most_bounds], size[clear], strict=False):
         if i < done:
             continue
-        within = np.searchsorted(t, t[i] + glitch_time, side='right')
-        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= back_share * bound
+        within = np.searchsorted(t, t[i] + GLITCH_TIME, side='right')
+        home = np.abs(x[i + 2:within] - x[i]).max(axis=1) <= BACK_SHARE * bound
         if home.any():
             done = i + 2 + int(np.argmax(home))
             found[i + 1:done] = True
@@ -151,11 +155,8 @@ def single(x: Floats, least: float) -> Bools:
                                      for d in range(2, edge) for k in (-d, d)))
         at = far[ROWS_BESIDE:][:m]
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
-        # times as far from its neighbours as any of those beside it is from theirs
-        single_times = 10.0
-        neighbours_alike = 0.3    # of that, at which its neighbours are from each other at most
-        is_off: Bools = ((at > np.maximum(least, single_times * beside))
-                         & (apart < neighbours_alike * at))
+        is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
+                         & (apart < NEIGHBOURS_ALIKE * at))
         alone: Bools = across(np.logical_or, is_off)
         return alone
 
@@ -169,12 +170,8 @@ def single(x: Floats, least: float) -> Bools:
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
     """Return which Imu rows hold a spike that no vehicle makes, by the imu settings' factors."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
-    turn_step = 0.8    # rad/s, least bound from row to row that may be a glitch
-    force_step = 50.0    # m/s^2, the same bound: potholes stay
-    single_turn = 0.03    # rad/s, least that a single row is off by: 0.003 rad in 0.1 s
-    single_force = 2.0    # m/s^2, the same
-    return (alone(t, w_i, turn_step / gyro) | single(w_i, single_turn / gyro)
-            | alone(t, f_i, force_step / accel) | single(f_i, single_force / accel))
+    return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
+            | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
 
 
 def speed_glitches(t: Floats, speed: Floats) -> Bools:

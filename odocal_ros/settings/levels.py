@@ -36,6 +36,7 @@ RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
 SWAY = 0.05
 # judgement: stamps further back, so many in turn, are those of a time that began anew
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
+CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: no driver is as late
 # definition: units
 DAY_NS = 86_400 * 10**9
 RAD_PER_DEG = math.pi / 180

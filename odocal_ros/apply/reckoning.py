@@ -1,0 +1,243 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Dead reckoning from a start on: the calibration's own strapdown and sum, corrected at stops.
+
+From one Imu sample to the next attitude is turned by the calibration's rotation increments
+(``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
+as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
+attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
+gyro bias; the position never jumps.
+"""
+
+import numpy as np
+
+from odocal_ros.apply.errors import BA, BG, GRAVITY, PHI, SHAKING
+from odocal_ros.apply.pose import Pose, pose_covariance, twist_covariance
+from odocal_ros.apply.start import Start
+from odocal_ros.apply.stream import ImuStream
+from odocal_ros.apply.vehicle import Vehicle
+from odocal_ros.apply.wheels import Wheels
+from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.rotations import (
+    matrix_from_quat,
+    quat_from_matrix,
+    quat_from_rotvec,
+    quat_multiply,
+)
+from odocal_ros.nav.standstill import REST_TURN
+from odocal_ros.nav.strapdown import prefix_product, rotation_increments
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.levels import FASTEST
+
+# judgement, all in s: between corrections; that a speed is taken over; without odometer, after
+# which attitude goes on alone; without Imu, that hide motion
+CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
+HOLE_INTERVALS = 2.5      # judgement: usual intervals of the Imu, a longer one hides a turn
+# judgement: corrections in turn that force and motion disagree at, after which the attitude is
+# false; m/s^2 that the force is then as long as gravity to
+MOST_APART, AS_GRAVITY = 10, 1.0
+TILT_LOST = 0.5           # rad; judgement: sigma beyond which a straight line levels nothing
+
+
+class Reckoning:
+    """
+    A path from a start on.
+
+    ``failed`` says why it cannot be gone on with, for people; empty as long as it can.
+    """
+
+    def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,
+                 config: ApplyConfig, told: list[str], delay_sigma: float) -> None:
+        self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
+        self._told, self._delay_sigma, self.failed = told, delay_sigma, ''
+        self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
+        self.accel_bias = np.zeros(3)
+        self.position = np.zeros(3)      # of the odometer's point, from where it began
+        self.imu.drop(start.row)
+        self._earth_n = start.earth_n
+        self._t = self._t_pose = self._t_look = float(self.imu.t[self.imu.at])
+        self._s = self._s_pose = float(self.wheels.at(self._t))
+        self._turn_b, self._felt_n, self._felt = np.zeros(3), np.zeros(3), True
+        self._w_look: list[Floats] = []
+        self._rested, self._apart, self._strange_turn = False, 0, np.zeros(3)
+        self._v_look = self._velocity_n(self._t)
+        self._arm0_n = matrix_from_quat(self.q) @ self.vehicle.C_vb.T @ self.vehicle.lever_arm
+
+    def poses(self) -> list[Pose]:
+        """Return the poses that what has come since the last call allows."""
+        out: list[Pose] = []
+        while not self.failed and (last := self._next()) is not None:
+            heard = self.imu.t[last] <= self.wheels.newest()
+            self._advance(last)
+            if self.failed:
+                break
+            if heard:
+                out.append(self._pose())
+                if not out[-1].sound():
+                    del out[-1]
+                    self.failed = 'the pose was no number'
+                    break
+            self._look()
+            self._leave_behind(last)
+        return out
+
+    def _next(self) -> int | None:
+        """Return the row to advance to: a pose is due and all it needs has come; else None."""
+        t, at = self.imu.t, self.imu.at
+        period = 1 / self.config.publish.rate
+        last = int(np.searchsorted(t, self._t_pose + period - 1e-6))
+        last = max(last, at + 1)
+        if last > len(t) - 2:            # a cubic needs the sample beyond
+            return None
+        if t[last] > self.wheels.newest() and t[-1] - t[last] < ODOMETER_SILENCE:
+            return None
+        return last
+
+    def _advance(self, last: int) -> None:
+        """Go to a row of the Imu."""
+        imu, at = self.imu, self.imu.at
+        low = max(at - 1, 0)
+        t = imu.t[low:last + 2]
+        phi = rotation_increments(t, imu.w_b[low:last + 2] - self.bias)
+        phi = phi[:, at - low:last - low]
+        t = imu.t[at:last + 1]
+        q = prefix_product(np.concatenate([self.q[None], quat_from_rotvec(phi.T)]))
+        if self._earth_n.any():
+            turned = np.multiply.outer(self._t - t, self._earth_n)
+            q = quat_multiply(quat_from_rotvec(turned), q)
+        C = matrix_from_quat(q)
+        s = self.wheels.at(t)
+        lost, self._s = abs(float(s[0]) - self._s), float(s[-1])
+        mid = (C[:-1] + C[1:]) / 2
+        way_n = np.sum(mid @ self.vehicle.forward_b * np.diff(s)[:, None], axis=0)
+        self.position = self.position + way_n
+        T, turn_b = t[-1] - t[0], phi.sum(axis=1)
+        gaps = np.diff(t)
+        C_mid = C[len(C) // 2]
+        self.errors.grow(T, C_mid, way_n, C_mid @ turn_b, C_mid @ self.vehicle.C_vb.T,
+                         self.wheels.doubt(t[0], t[-1]),
+                         gaps[gaps > HOLE_INTERVALS * imu.usual])
+        self._doubt_turn(imu.strange[at + 1:last + 1], gaps, C_mid)
+        if lost > self.wheels.quantum:
+            self.errors.lost(lost)
+        f = imu.f_b[at:last + 1] - self.accel_bias
+        self._felt &= bool(np.isfinite(f).all()) and not (gaps > IMU_HOLE).any() and not (
+            self._strange_turn.any())
+        f_n = np.einsum('kij,kj->ki', C, f)
+        self._felt_n = self._felt_n + gaps @ (f_n[:-1] + f_n[1:]) / 2
+        self._turn_b = self._turn_b + turn_b
+        self._w_look.append(imu.w_b[at + 1:last + 1])
+        self.q, self._t = q[-1] / np.linalg.norm(q[-1]), float(t[-1])
+        imu.at = last
+
+    def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
+        """Doubt turns that no vehicle begins: (n, 3) rad/s over n gaps of s, in b."""
+        if not strange.any():
+            self._strange_turn = np.zeros(3)
+            return
+        if not self._strange_turn.any():
+            self._told.append(f'the gyro jumps by {strange.max():.2g} rad/s as no vehicle turns: '
+                              'what it tells is doubted')
+        turn = self._strange_turn + gaps @ strange
+        self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
+        self._strange_turn = turn
+        if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
+            self.failed = 'the tilt is not known any more'
+
+    def _velocity_n(self, t: float) -> Floats:
+        """Return the velocity of the Imu in n, by the odometer's last rows."""
+        v, C_nb = self.vehicle, matrix_from_quat(self.q)
+        now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
+        arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
+        rate = self.imu.w_b[self.imu.at] - self.bias
+        velocity: Floats = C_nb @ (
+            v.forward_b * (now - before) / SPEED_SPAN + np.cross(rate, arm_b))
+        return velocity
+
+    def _look(self) -> None:
+        """Correct tilt and gyro bias, a second after the last time."""
+        T = self._t - self._t_look
+        if T < CORRECTION_PERIOD - 1e-6:
+            return
+        velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
+        w = np.concatenate(self._w_look)
+        resting = heard and self.wheels.still(self._t_look, self._t) and bool(
+            (w.std(axis=0) < REST_TURN).all()
+            and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
+        # a rest that begins with this look may begin with the last of the braking
+        standing = resting and self._rested
+        if self.config.levelling and heard and self._felt:
+            off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
+            noise = 2 * self.wheels.quantum / SPEED_SPAN / T
+            by = self.errors.by_gravity(
+                matrix_from_quat(self.q), off_n, T, 0.0 if standing else np.hypot(SHAKING, noise))
+            if by is None:
+                self._take_apart(off_n[:2], velocity, T, w)
+            else:
+                self._apart = 0
+                self._correct(by)
+                # what a straight line takes of a large angle it may miss by as much
+                self.errors.turned(np.eye(3) * np.sum(by[PHI]**2)**2 / 4)
+        if self.config.levelling and standing:
+            variance = np.maximum(self.errors.grade.gyro_noise**2 / T, w.var(axis=0) / len(w))
+            earth_b = matrix_from_quat(self.q).T @ self._earth_n
+            self._correct(self.errors.by_rest(w.mean(axis=0) - self.bias - earth_b, variance))
+        self._rested = resting
+        self._t_look, self._v_look = self._t, self._velocity_n(self._t)
+        self._felt_n, self._felt, self._w_look = np.zeros(3), True, []
+
+    def _take_apart(self, off_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
+        """
+        Doubt what the Imu or the odometer told of the last T s, where they are apart.
+
+        off_n : (2,) m/s^2, force less acceleration.   velocity : (3,) m/s.   w : (n, 3) rad/s.
+        """
+        self._apart += 1
+        self._told.append('the force is not that of the motion: an Imu or an odometer is wrong; '
+                          f'not levelled by it ({np.linalg.norm(off_n):.3g} m/s^2)')
+        self.errors.turned(np.eye(3) * np.sum((w.mean(axis=0) - self.bias)**2) * T**2)
+        self.errors.lost(min(float(np.linalg.norm(off_n)) * T**2 / 2,
+                             float(np.linalg.norm(velocity - self._v_look)) * T))
+        length = float(np.linalg.norm(self._felt_n)) / T
+        if self._apart >= MOST_APART and abs(length - GRAVITY) < AS_GRAVITY:
+            self.failed = f'force and attitude are apart for {self._apart} s'
+
+    def _correct(self, by: Floats) -> None:
+        self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
+        self.bias = self.bias + by[BG]
+        self.accel_bias = self.accel_bias + by[BA]
+
+    def _pose(self) -> Pose:
+        """Return the pose at the row reached."""
+        v, T = self.vehicle, self._t - self._t_pose
+        C_nb, C_vb = matrix_from_quat(self.q), v.C_vb
+        arm_n = -C_nb @ C_vb.T @ v.lever_arm
+        earth_b = C_nb.T @ self._earth_n
+        rate = C_vb @ (self._turn_b / T - earth_b)
+        speed = (self._s - self._s_pose) / T
+        velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
+        if abs(speed) > FASTEST:
+            self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
+        quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
+        pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
+                    quat_from_matrix(C_nb @ C_vb.T), velocity, rate,
+                    pose_covariance(v, self.errors, C_nb, arm_n, quantum**2 / 6
+                                    + self.wheels.between(self._t)
+                                    + (speed * self._delay_sigma)**2),
+                    twist_covariance(v, self.errors, speed, rate, T, quantum**2 / 6 + doubt))
+        self._t_pose, self._s_pose, self._turn_b = self._t, self._s, np.zeros(3)
+        return pose
+
+    def _leave_behind(self, last: int) -> None:
+        """Forget what lies behind."""
+        if last > 2000:
+            self.imu.drop(last - 2)
+            self.wheels.forget(self._t - 2 * CORRECTION_PERIOD)

@@ -1,0 +1,169 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Rows of the Imu that no vehicle makes, found as they come.
+
+A leg is screened as a whole (``screening/glitches.py``); a stream has its past, and what follows
+within the time that a spike may take. The limits are those of the leg.
+"""
+
+import numpy as np
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import across
+from odocal_ros.screening.glitches import (
+    BACK_SHARE,
+    FORCE_STEP,
+    GLITCH_TIME,
+    NEIGHBOURS_ALIKE,
+    ROWS_BESIDE,
+    SINGLE_FORCE,
+    SINGLE_TIMES,
+    SINGLE_TURN,
+    TURN_STEP,
+    USUAL_STEPS,
+)
+
+# physical: twice the range of common gyros, 2000 deg/s; range of accelerometers for crashes, 200 g
+MOST_TURN, MOST_FORCE = 70.0, 2000.0      # rad/s, m/s^2
+USUAL_ROWS = 50           # judgement: rows over which the usual step is taken
+STUCK_TIME = 0.1          # s; judgement: of rows equal in every bit, after which the sensor hangs
+TURN_CHANGE = 10.0        # rad/s^2; physical: no vehicle starts to turn faster, but over a stone
+STRANGE_TURN_TIME = 1.0        # s; judgement: after which a turn that began so is one
+STEPS = np.repeat([TURN_STEP, FORCE_STEP], 3)
+SINGLES = np.repeat([SINGLE_TURN, SINGLE_FORCE], 3)
+
+
+def beyond_sensor(w_b: Floats, f_b: Floats) -> Bools:
+    """Tell which rows no sensor sends: (n, 3) rad/s, (n, 3) m/s^2; a force of NaN is none."""
+    with np.errstate(invalid='ignore'):
+        turn = across(np.logical_and, np.abs(w_b) <= MOST_TURN)
+        return ~turn | across(np.logical_or, np.abs(f_b) > MOST_FORCE)
+
+
+class SpikeScreen:
+    """
+    Sifts rows by what precedes and follows them.
+
+    A row that leaves the last one by more than a vehicle does is held until it is known whether
+    the values come back (a spike: dropped) or stay (motion, or a fault that stays: released).
+    """
+
+    def __init__(self) -> None:
+        self._usual = np.zeros(2)           # of steps from row to row, in STEPS: gyro, force
+        self._since = 0.0                   # s, since when the rows are equal
+        self._strange = np.zeros(3)         # rad/s, step of the gyro that no vehicle makes
+        self._before = np.zeros(3)          # rad/s, what the gyro told before it
+        self._until = 0.0                   # s
+
+    def sift(self, t: Floats, x: Floats) -> tuple[Bools, Floats, int]:
+        """
+        Return which rows to keep, what of their rates is strange, and which rows to hold.
+
+        t : (n,) s, the first row is the last one kept.   x : (n, 6) rad/s and m/s^2.
+        Returns (n,) bool, (n, 3) rad/s, 0 where the gyro tells what a vehicle may do, and the
+        index of the first row to hold, n for none.
+        """
+        keep, strange = np.ones(len(t), bool), np.zeros((len(t), 3))
+        if self._calm(t, x):
+            return keep, strange, len(t)
+        last, j = 0, 1
+        while j < len(t):
+            step = _size(x[j] - x[last])
+            back = None
+            if (step > self._allowed()).any() and not self._is_over(t[j], x[j, :3]):
+                within = int(np.searchsorted(t, t[last] + GLITCH_TIME, side='right'))
+                back = self._back(x[j + 1:within] - x[last], step)
+                if back is None and within == len(t):
+                    return keep, strange, j
+            self._learn(step[None])
+            if back is not None:
+                keep[j:j + 1 + back] = False
+                j += 1 + back
+                continue
+            if step.any() or not x[j, :3].any():      # a gyro may have a dead band
+                self._since = t[j]
+            keep[j] = t[j] - self._since <= STUCK_TIME
+            strange[j] = self._strange_of(t[j], x[j, :3], t[last], x[last, :3])
+            last, j = (j, j + 1) if keep[j] else (last, j + 1)
+        return keep, strange, len(t)
+
+    def _is_over(self, t: float, w: Floats) -> bool:
+        """Return whether the gyro is back where it was before a strange step."""
+        return bool(self._strange.any()) and (t > self._until or bool(
+            (np.abs(w - self._before) <= BACK_SHARE * np.abs(self._strange)).all(
+                where=self._strange != 0)))
+
+    def _strange_of(self, t: float, w: Floats, t_last: float, w_last: Floats) -> Floats:
+        """Return what of a rate no vehicle does, (3,) rad/s, from the step that began it on."""
+        if self._is_over(t, w):
+            self._strange = np.zeros(3)
+            return self._strange
+        step = np.abs(w - w_last)
+        most = max(TURN_CHANGE * (t - t_last), USUAL_STEPS * TURN_STEP * self._usual[0])
+        if not self._strange.any() and (step > most).any():
+            self._strange, self._before = np.where(step > most, step, 0.0), w_last
+            self._until = t + STRANGE_TURN_TIME
+        return self._strange
+
+    def _calm(self, t: Floats, x: Floats) -> bool:
+        """Return whether no row of a block needs a second look."""
+        if len(x) < 2:
+            return True
+        sizes = _size(np.diff(x, axis=0))
+        most = np.minimum(self._allowed(), [TURN_CHANGE / TURN_STEP * np.diff(t).min(), np.inf])
+        calm = not self._strange.any() and not (sizes > most).any() and bool(
+            sizes.any(axis=1).all())
+        if calm:
+            self._learn(sizes)
+            self._since = t[-1]
+        return calm
+
+    def _allowed(self) -> Floats:
+        allowed: Floats = np.maximum(1.0, USUAL_STEPS * self._usual)
+        return allowed
+
+    def _learn(self, steps: Floats) -> None:
+        most = 4 * self._usual + 1 / USUAL_STEPS       # one spike tells little of what is usual
+        share = 1 - (1 - 1 / USUAL_ROWS)**len(steps)
+        self._usual = self._usual + (np.minimum(steps, most).mean(axis=0) - self._usual) * share
+
+    def _back(self, away: Floats, step: Floats) -> int | None:
+        """Return at which of the rows after a step the values are back, None if at none."""
+        bound = step > self._allowed()
+        for k, row in enumerate(away):
+            if (_size(row)[bound] <= BACK_SHARE * step[bound]).all():
+                return k
+        return None
+
+
+def _size(step: Floats) -> Floats:
+    """Return the size of steps, (..., 6), of gyro and force, in STEPS: (..., 2); no force is 0."""
+    size = np.abs(step) / STEPS
+    return np.stack([size[..., :3].max(axis=-1), np.nan_to_num(size[..., 3:].max(axis=-1))], -1)
+
+
+def single(x: Floats) -> Bools:
+    """
+    Tell which rows are off alone: (n, 6) to (n,) bool, never the last row.
+
+    As ``screening.glitches.single`` has it, but by the rows before: those after are still to come.
+    """
+    off = np.zeros(len(x), bool)
+    if len(x) < ROWS_BESIDE + 3:
+        return off
+    far = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)       # of row k + 1
+    for k in range(ROWS_BESIDE + 1, len(far)):
+        at = far[k]
+        beside = far[k - ROWS_BESIDE - 1:k - 1].max(axis=0)
+        apart = np.abs(x[k + 2] - x[k])
+        off[k + 1] = ((at > np.maximum(SINGLES, SINGLE_TIMES * beside))
+                      & (apart < NEIGHBOURS_ALIKE * at)).any()
+    return off

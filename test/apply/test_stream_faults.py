@@ -1,0 +1,133 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Faulty streams into odometry: nothing unsaid, no NaN, no pose beyond five of its sigmas."""
+
+from faulty_streams import calibration, columns_of, drive_of, run, SIGMAS, stream, worst_of
+import numpy as np
+import pytest
+
+from odocal_ros.apply.arrivals import Arrivals
+from odocal_ros.apply.odometry import Odometry
+from odocal_ros.apply.vehicle import vehicle_of
+from odocal_ros.settings.apply_config import ApplyConfig
+from odocal_ros.settings.config import with_settings
+
+STREAMS = 6       # of any number: benchmarks/stream_faults.py
+SECOND = 10**9
+
+
+def published(drive, topics):
+    """Return the odometry after 75 s of a stream, its poses, and what it said."""
+    topics = {name: {k: v[:row_at(topic, 75.0)] for k, v in topic.items()}
+              for name, topic in topics.items()}
+    config = with_settings(ApplyConfig(), {'imu.grade': 'consumer', 'publish.rate': 5.0})
+    odometry = Odometry(vehicle_of(calibration(drive.truth, np.random.default_rng(5)), config),
+                        config)
+    poses, said = run(drive, odometry, topics)
+    return odometry, poses, said
+
+
+def row_at(topic, seconds):
+    return int(np.searchsorted(topic['arrival'], topic['arrival'][0] + int(seconds * SECOND)))
+
+
+def imu(name, value, rows=1):
+    """Return a fault: a row's x, or some rows', from t = 45 s on."""
+    def change(topics):
+        at = row_at(topics['imu'], 45.0)
+        topics['imu'][name][at:at + rows, 0] = value
+    return change
+
+
+def stamps(name, rows, put=None, add_s=0.0):
+    def change(topics):
+        at = row_at(topics[name], 45.0)
+        topics[name]['stamp'][at:at + rows] += int(add_s * SECOND)
+        if put is not None:
+            topics[name]['stamp'][at:at + rows] = put
+    return change
+
+
+def speeds(topics):
+    at = row_at(topics['odometer'], 45.0)
+    topics['odometer']['value'][at:at + 2] = 69.0
+
+
+FAULTS = {'force of 1e5': imu('f', 1e5), 'force of 1e150': imu('f', 1e150),
+          'force of 1e300': imu('f', 1e300), 'force of 200 for 3 s': imu('f', 200.0, 150),
+          'turns of 50 rad/s': imu('w', 50.0, 3), 'turns of 5 rad/s for 2 s': imu('w', 5.0, 100),
+          'odometer stamp of 2^63 - 1': stamps('odometer', 1, 2**63 - 1),
+          'first stamp of 2^63 - 1': lambda topics: topics['imu']['stamp'].put(0, 2**63 - 1),
+          'three rows 29 s ahead': stamps('odometer', 3, add_s=29.0),
+          'three imu rows 29 s ahead': stamps('imu', 3, add_s=29.0),
+          'odometer clock set by 3 s': stamps('odometer', 10**6, add_s=3.0),
+          'speeds of 69 m/s': speeds}
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_one_fault_is_said_and_within_the_covariance(fault):
+    drive = drive_of(4 if 'speed' in fault else 0)      # 50 Hz: speeds, counts
+    topics = columns_of(drive)
+    FAULTS[fault](topics)
+    odometry, poses, said = published(drive, topics)
+    assert said
+    assert len(poses) > 140
+    for path in {path for path, _ in poses}:
+        worst, what = worst_of(drive, [pose for p, pose in poses if p == path], topics, path)
+        assert worst <= SIGMAS, what
+    assert odometry.restarts == sum('begins anew' in text for text in said)
+
+
+def test_an_unharmed_stream_is_not_talked_about():
+    for number in range(3):          # counts, speeds, angles
+        drive = drive_of(number)
+        odometry, poses, said = published(drive, columns_of(drive))
+        assert (said, odometry.restarts) == ([], 0)
+        assert worst_of(drive, [pose for _, pose in poses], {})[0] < SIGMAS
+
+
+def test_random_faults():
+    wrong = [found for found in (stream(20261125, number) for number in range(6, 6 + STREAMS))
+             if not found[2] <= SIGMAS]
+    assert wrong == []
+
+
+def test_a_turn_that_no_vehicle_begins_is_doubted():
+    drive = drive_of(0)
+    topics = columns_of(drive)
+    at = row_at(topics['imu'], 45.0)
+    topics['imu']['w'][at:at + 50, 2] += 1.0
+    odometry, poses, said = published(drive, topics)
+    assert odometry.restarts == 0
+    assert any('as no vehicle turns' in text for text in said)
+    before, after = (np.sqrt(poses[k][1].pose_cov[5, 5]) for k in (150, -1))
+    assert before < 0.05
+    assert 0.3 < after < 2.0         # of 1 rad that it turned falsely
+
+
+def test_bags_played_fast_are_believed_and_clocks_that_are_set_are_not():
+    stamp = 10**18 + np.arange(0, 60 * SECOND, SECOND // 25)
+    arrivals = Arrivals()
+    assert arrivals.believed(stamp, 10**18 + (stamp - stamp[0]) // 20).all()
+    assert not arrivals.anew
+    for by in (3 * SECOND, -3 * SECOND):
+        odd = stamp.copy()
+        odd[500:] += by
+        arrivals = Arrivals()
+        believed = arrivals.believed(odd[:510], stamp[:510])
+        assert believed[:500].all()
+        assert not believed[500:509].any()
+        assert arrivals.anew
+        assert abs(arrivals.off_s) == pytest.approx(3.0, abs=0.4)
+    few = stamp.copy()
+    few[500:503] += 29 * SECOND
+    arrivals = Arrivals()
+    assert (~arrivals.believed(few, stamp)).nonzero()[0].tolist() == [500, 501, 502]
+    assert not arrivals.anew
