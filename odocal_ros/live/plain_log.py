@@ -11,7 +11,7 @@
 
 from typing import Any
 
-from odocal_ros.outside.names import one_line
+from odocal_ros.outside.names import brief_line
 
 
 class PlainLog:
@@ -23,19 +23,19 @@ class PlainLog:
     # rclpy tells callers apart by their lines, and wants one severity of each
     def debug(self, text: str) -> None:
         """Log for developers."""
-        self._logger.debug(one_line(text))
+        self._logger.debug(brief_line(text))
 
     def info(self, text: str) -> None:
         """Log what goes as it should."""
-        self._logger.info(one_line(text))
+        self._logger.info(brief_line(text))
 
     def warning(self, text: str) -> None:
         """Log what the operator may mend."""
-        self._logger.warning(one_line(text))
+        self._logger.warning(brief_line(text))
 
     def error(self, text: str) -> None:
         """Log what failed."""
-        self._logger.error(one_line(text))
+        self._logger.error(brief_line(text))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._logger, name)

@@ -27,7 +27,7 @@ from odocal_ros import __version__
 from odocal_ros.errors import BadConfig, OdocalError
 from odocal_ros.live.memory import hold_little
 from odocal_ros.live.plain_log import PlainLog
-from odocal_ros.outside.names import one_line, said_by
+from odocal_ros.outside.names import brief_line, said_by
 
 
 class SettledNode(Node):
@@ -123,5 +123,5 @@ def _init(args: list[str] | None) -> None:
 
 def complain(name: str, text: str) -> int:
     """Say on stderr why a command cannot go on; return its exit code."""
-    print(one_line(f'{name}: {text}'), file=sys.stderr)
+    print(brief_line(f'{name}: {text}'), file=sys.stderr)
     return 1

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Hears a calibrator's latched status and hint from another process."""
+"""Listens to a calibrator's latched status and hint; anybody may be their sender."""
 
 from collections.abc import Iterator
 
@@ -17,6 +17,9 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
+from odocal_ros.outside.names import brief_line
+
+MOST_VALUES = 500      # judgement: keys of a status that are looked at; a calibrator sends 100
 # definition: of what is latched, said and heard alike
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -38,10 +41,11 @@ class StatusListener:
         self._node.create_subscription(String, f'{name}/hint', self._hear_hint, LATCHED)
 
     def _hear(self, array: DiagnosticArray) -> None:
-        self._status = array
+        if array.status:
+            self._status = array
 
     def _hear_hint(self, message: String) -> None:
-        self._hint = message.data
+        self._hint = brief_line(message.data)
 
     def __enter__(self) -> 'StatusListener':
         return self
@@ -59,6 +63,7 @@ class StatusListener:
                 if self._status is not None and self._hint is not None:
                     status = self._status.status[0]
                     self._status = None
-                    yield (status.level, {kv.key: kv.value for kv in status.values}, self._hint)
+                    yield (status.level, {brief_line(kv.key): brief_line(kv.value)
+                                          for kv in status.values[:MOST_VALUES]}, self._hint)
         except ExternalShutdownException:
             return

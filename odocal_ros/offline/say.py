@@ -11,7 +11,7 @@
 
 import sys
 
-from odocal_ros.outside.names import for_terminal, one_line
+from odocal_ros.outside.names import brief_line, for_terminal
 
 
 def say(text: str, end: str = '\n') -> None:
@@ -21,4 +21,4 @@ def say(text: str, end: str = '\n') -> None:
 
 def warn(text: str) -> None:
     """Print one line on stderr."""
-    print(one_line(text), file=sys.stderr)
+    print(brief_line(text), file=sys.stderr)

@@ -20,7 +20,9 @@ import shlex
 # what may stand raw in a line: no control, no half of a surrogate pair, nothing that turns writing
 UNSEEN = re.compile('[\x00-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202f\u2060-\u206f'
                     '\ufeff\ufff9-\ufffb\ud800-\udfff]')
-VERDICT_STYLE = re.compile('(\x1b\\[(?:1;3[123]|0)m)')     # of our own on a terminal
+# of our own on a terminal: these words alone, not what others send
+VERDICT_STYLE = re.compile('(\x1b\\[1;3[123]m(?:ACCEPTED|CAUTION|REJECTED)\x1b\\[0m)')
+LONGEST_LINE = 2000       # judgement: characters of one line of a log, a panel or an error
 FRAME = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_./-]{0,199}')
 
 
@@ -29,9 +31,16 @@ def one_line(text: object) -> str:
     return _seen(str(text))
 
 
+def brief_line(text: object) -> str:
+    """Return text as ``one_line`` has it, cut at LONGEST_LINE: for a log, a panel, an error."""
+    # cut first: what is shown of a control character is up to ten times as long
+    line = _seen(str(text)[:LONGEST_LINE + 1])
+    return line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]} ...'
+
+
 def said_by(error: BaseException) -> str:
-    """Return the text of an error as one line."""
-    return one_line(' '.join(str(error).split()))
+    """Return the text of an error as one line, bounded."""
+    return brief_line(' '.join(str(error)[:10 * LONGEST_LINE].split()))
 
 
 def for_terminal(text: str) -> str:

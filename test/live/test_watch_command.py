@@ -96,3 +96,25 @@ def test_the_bars_are_shares_of_what_is_asked():
     assert shares(done)['yaw'] == (1.0, '0.25 deg, asked 0.5 deg')
     assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, asked 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
+
+
+def test_what_anybody_publishes_does_not_reach_the_terminal(domain):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from std_msgs.msg import String
+
+    from odocal_ros.live.status_listener import LATCHED, StatusListener
+    odd = 'waiting\x1b]52;c;eA==\x07\x1b]0;title\x07\u202e'
+    with StatusListener('/odd') as listener:
+        other = listener._node
+        status = other.create_publisher(DiagnosticArray, '/odd/status', LATCHED)
+        hint = other.create_publisher(String, '/odd/hint', LATCHED)
+        hint.publish(String(data=odd * 100_000))
+        found = iter(listener)
+        status.publish(DiagnosticArray())           # of no status: passed over
+        listener._executor.spin_once(timeout_sec=1.0)
+        status.publish(DiagnosticArray(status=[DiagnosticStatus(
+            values=[KeyValue(key='state', value=odd)] * 5000)]))
+        _, values, said = next(found)
+        assert len(said) < 3000
+        assert (said + values['state']).isprintable()
+        assert 'waiting' in said

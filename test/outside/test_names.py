@@ -163,3 +163,12 @@ def test_no_cell_of_a_spreadsheet_is_a_formula():
 def test_a_frame_that_nobody_names_leaves_all_as_it_is():
     made = calibration()
     assert framed(made, Config(), '') == (made, Config())
+
+
+def test_colours_of_others_are_shown_and_no_line_is_longer_than_a_screen():
+    colours = '\x1b[1;31mstd_msgs/msg/Int64\x1b[0m'
+    assert '\x1b' not in outside.for_terminal(colours)
+    for text in ('x' * 2_000_000, '\x1b' * 2_000_000, '\n' * 2_000_000):
+        assert len(outside.brief_line(text)) <= outside.LONGEST_LINE + 4
+        assert len(outside.said_by(ValueError(text))) <= outside.LONGEST_LINE + 4
+    assert outside.brief_line('a\x1b]52;c;eA==\x07b') == r'a\x1b]52;c;eA==\x07b'
