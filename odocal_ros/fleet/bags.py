@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import fnmatch
 from pathlib import Path, PurePosixPath
 import re
+import shutil
 import tempfile
 from typing import Any
 
@@ -199,6 +200,17 @@ def seen_as(url: str, settings: str) -> str:
         for name, about in files.items()))
 
 
+def _fits(url: str, fs: Any, path: str, folder: str) -> None:
+    """Raise BadBag where a copy would take more than half of what is free for it."""
+    files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
+    size = sum(int(about.get('size') or 0) for about in files.values())
+    free = shutil.disk_usage(folder).free
+    if size > free // 2:
+        raise BadBag(f'{url}: its copy takes {size / 1e9:.1f} GB of {free / 1e9:.1f} GB free in '
+                     f'{Path(folder).parent}; make room, or give workers another '
+                     '--local-directory')
+
+
 @contextmanager
 def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
     """Give a bag as a path of this machine: a copy in ``scratch`` that is removed, if need be."""
@@ -207,9 +219,13 @@ def at_hand(url: str, scratch: str | None) -> Iterator[Path]:
         yield Path(path)
         return
     with tempfile.TemporaryDirectory(prefix='odocal_', dir=scratch) as folder:
-        copy = Path(folder) / PurePosixPath(path).name
+        name = PurePosixPath(path).name
+        copy = Path(folder) / (name if name not in ('', '.', '..') else 'bag')
         try:
+            _fits(url, fs, path, folder)
             fs.get(path, str(copy), recursive=fs.isdir(path))
+        except BadBag:
+            raise
         except Exception as error:     # noqa: BLE001 as above
             raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
         yield copy

@@ -18,7 +18,7 @@ from typing import Any
 
 from odocal_ros.errors import BadUsage, OdocalError
 
-NEEDS = ('dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
+NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 INSTALL = "pip install 'odocal_ros[fleet]'"
 MEMORY = 2 * 2**30       # judgement: bytes for a task, unless said
 FEWEST = 50              # judgement: of them, least: workers may be on their way
@@ -47,13 +47,13 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
     tries : of a bag that ends its worker; of a cluster that is there, its own setting holds.
     """
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client, LocalCluster, Security
     if scheduler:
         for name in ('distributed', 'tornado.application'):      # we say it in a sentence
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             client = Client(scheduler, timeout='5s')
-        except (OSError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise BadUsage(f'--scheduler {scheduler}: nobody answers there ({error}); start one '
                            'with: dask scheduler') from None
         with client:
@@ -72,7 +72,9 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
                 ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
     with dask.config.set(ours), LocalCluster(
             n_workers=workers or _workers(memory), threads_per_worker=1, processes=True,
-            host='127.0.0.1', dashboard_address='127.0.0.1:0', memory_limit=0,
+            # who reaches a scheduler's port runs code: only who holds this key, of this run, does
+            security=Security.temporary(), host='127.0.0.1',
+            dashboard_address='127.0.0.1:0', memory_limit=0,
             silence_logs='CRITICAL') as cluster, Client(cluster) as client:
         yield client
 

@@ -32,7 +32,7 @@ from odocal_ros.fleet.second_stage import (
 from odocal_ros.fleet.tables import VEHICLES
 from odocal_ros.output.summary import DEG
 from odocal_ros.outside.names import for_table
-from odocal_ros.outside.whole import write_text
+from odocal_ros.outside.whole import locked, write_text
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.levels import TYRE_SPREAD
 
@@ -53,9 +53,11 @@ def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], outp
     from odocal_ros.fleet.page import fleet_page
     of = vehicle_jobs([job.bag for job in jobs], rows, asked(jobs))
     vehicles = vehicles_together(client, of, output, args.files)
-    write_text(output / TABLE, _csv(output / VEHICLES))
+    with locked(output):          # another fleet's command may write here too
+        write_text(output / TABLE, _csv(output / VEHICLES))
     _reports(client, vehicles, jobs, output, args.reports)
-    write_text(output / PAGE, fleet_page(vehicles, output))
+    with locked(output):
+        write_text(output / PAGE, fleet_page(vehicles, output))
     return vehicles
 
 

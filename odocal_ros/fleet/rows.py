@@ -19,14 +19,19 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 import hashlib
 import json
+import os
 from pathlib import Path
+import re
 from typing import Any
 
 from odocal_ros import __version__
-from odocal_ros.outside.whole import whole_file, write_text
+from odocal_ros.errors import BadData
+from odocal_ros.outside.names import said_by
+from odocal_ros.outside.whole import locked, whole_file, write_text
 from odocal_ros.settings.config import Config, flat, with_settings
 
 DONE, FAILED = 'done', 'failed'
+KEY, MAGIC = re.compile('[0-9a-f]{40}'), b'PAR1'
 # groups of settings that do not touch the legs of a bag
 NOT_OF_LEGS = ('accept', 'output', 'journal', 'publish', 'frames', 'diagnostic_updater')
 
@@ -92,15 +97,18 @@ class RowStore:
         import pyarrow.parquet as pq
         path = self.path(row.key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
+        with locked(path.parent), whole_file(path) as file:      # of another fleet's command
             sink = pa.BufferOutputStream()
             pq.write_table(pa.Table.from_pylist([asdict(row)], schema=row_schema()), sink,
                            compression='zstd')
             file.write(sink.getvalue().to_pybytes())
 
     def get(self, key: str) -> Row | None:
-        """Return the row of a key, None where there is none."""
-        return next(rows_of([self.path(key)]), None) if self.path(key).exists() else None
+        """Return the row of a key, None where there is none, or a file that is no row."""
+        try:
+            return next(rows_of([self.path(key)]), None)
+        except (BadData, FileNotFoundError):
+            return None
 
     def drop(self, key: str) -> None:
         """Take a row away."""
@@ -110,15 +118,17 @@ class RowStore:
         """Note which row is that of a bag at a place, of a size and date."""
         path = self._seen(seen)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, key)
+        with locked(path.parent):
+            write_text(path, key)
 
     def known(self, seen: str) -> str | None:
         """Return the key of the row that is there of a bag, None where there is none."""
         try:
             key = self._seen(seen).read_text()
-        except OSError:
+            whole = KEY.fullmatch(key) and _whole(self.path(key))
+        except (OSError, UnicodeDecodeError):
             return None
-        return key if self.path(key).exists() else None
+        return key if whole else None
 
     def _seen(self, seen: str) -> Path:
         return self.folder / 'seen' / seen[:2] / seen
@@ -131,11 +141,33 @@ def row_schema() -> Any:
     return pa.schema([(f.name, kinds.get(f.type, pa.float64())) for f in fields(Row)])
 
 
+def _whole(path: Path) -> bool:
+    """Return whether a file begins and ends as Parquet does: one that was cut does not."""
+    with open(path, 'rb') as file:
+        head = file.read(len(MAGIC))
+        file.seek(-len(MAGIC), os.SEEK_END)
+        return head == file.read() == MAGIC
+
+
 def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
-    """Yield the rows of files, one file after the other."""
+    """
+    Yield the rows of files, one file after the other.
+
+    Raises
+    ------
+    BadData
+        A file is no row of a fleet.
+
+    """
+    import pyarrow as pa
     import pyarrow.parquet as pq
     for path in paths:
         with open(path, 'rb') as file:
-            # its own threads end the process with an abort, if they still run as it ends
-            for entry in pq.ParquetFile(file).read(use_threads=False).to_pylist():
-                yield Row(**entry)
+            try:
+                # its own threads end the process with an abort, if they still run as it ends
+                table = pq.ParquetFile(file).read(use_threads=False)
+                rows = [Row(**entry) for entry in table.cast(row_schema()).to_pylist()]
+            except (pa.ArrowException, OSError, TypeError, ValueError) as error:
+                raise BadData(f'{path} is no row of a fleet ({said_by(error)}); remove it and '
+                              'give the command again') from None
+        yield from rows

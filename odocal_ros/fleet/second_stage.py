@@ -12,6 +12,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, UTC
+import hashlib
 import json
 from pathlib import Path
 import shutil
@@ -130,9 +131,14 @@ def _write_files(vehicle: Vehicle, folder: Path) -> None:
 
 
 def file_name(vehicle: str) -> str:
-    """Return a name for a vehicle's folder: no path, whatever it is called."""
+    """Return a name for a vehicle's folder: no path, none of another's, whatever it is called."""
     from urllib.parse import quote
-    return quote(vehicle, safe=' ').lstrip('.') or '_'
+    name = quote(vehicle, safe=' ')
+    name = name.replace('.', '%2E', 1) if name.startswith('.') else name or '_'
+    most = 120    # characters: a file system takes 255, and files in the making have longer names
+    if len(name) > most:
+        name = f'{name[:most]}~{hashlib.sha256(vehicle.encode()).hexdigest()[:16]}'
+    return name
 
 
 def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

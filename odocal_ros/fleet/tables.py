@@ -20,7 +20,7 @@ from odocal_ros.fleet.bags import FleetBag
 from odocal_ros.fleet.leg_text import legs_from
 from odocal_ros.fleet.rows import Row
 from odocal_ros.outside.names import one_line
-from odocal_ros.outside.whole import whole_file
+from odocal_ros.outside.whole import locked, whole_file
 
 LEGS, VEHICLES = 'legs.parquet', 'vehicles.parquet'
 VALUES = ('scale_factor', 'scale_ratio', 'yaw_mounting_angle', 'pitch_mounting_angle')
@@ -98,7 +98,7 @@ def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
     """Write tables one after the other as one file, whole or not at all."""
     import pyarrow as pa
     import pyarrow.parquet as pq
-    with whole_file(path) as file, pq.ParquetWriter(
+    with locked(path.parent), whole_file(path) as file, pq.ParquetWriter(
             pa.PythonFile(_Sink(file), mode='w'), schema, compression='zstd') as writer:
         for table in tables:
             if table.num_rows:

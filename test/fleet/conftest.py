@@ -17,6 +17,8 @@ import pytest
 import yaml
 
 pytest.importorskip('distributed')
+pytest.importorskip('cryptography')
+import dask
 
 from odocal_ros.fleet.bags import find_bags
 from odocal_ros.fleet.engine import engine
@@ -63,4 +65,10 @@ def fleet(tmp_path_factory):
 def client():
     """Two local workers; a bag that ends its worker is tried once."""
     with engine(None, 2, 2**31, 1) as client:
-        yield client
+        keys = client.security
+        # the command, given the address, takes them from where those of a cluster stand
+        with dask.config.set({'distributed.comm.require-encryption': True,
+                              'distributed.comm.tls.ca-file': keys.tls_ca_file,
+                              'distributed.comm.tls.client.cert': keys.tls_client_cert,
+                              'distributed.comm.tls.client.key': keys.tls_client_key}):
+            yield client

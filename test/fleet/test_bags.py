@@ -9,14 +9,18 @@
 
 """Which bags are meant: manifests, folders, globs, patterns, URLs."""
 
+import shutil
 import zipfile
 
 import pytest
 
 pytest.importorskip('fsspec')
 
-from odocal_ros.errors import BadBag, BadUsage
+from odocal_ros.errors import BadBag, BadData, BadUsage
+from odocal_ros.fleet import bags as bags_module
 from odocal_ros.fleet.bags import at_hand, find_bags, FleetBag, seen_as
+from odocal_ros.fleet.rows import key_of, Row, rows_of, RowStore
+from odocal_ros.fleet.second_stage import file_name
 
 
 def test_a_manifest_is_read_as_csv_and_as_parquet_alike(fleet, tmp_path):
@@ -76,3 +80,46 @@ def test_a_bag_by_url_is_copied_and_the_copy_removed(tmp_path):
     assert seen_as(url, 'settings') != before
     with pytest.raises(BadBag, match='gone'):
         seen_as(f'{tmp_path}/gone', '')
+
+
+def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
+    from fsspec.implementations.memory import MemoryFileSystem
+    memory = MemoryFileSystem()
+    memory.pipe('/odd/../x.mcap', b'12345')
+    scratch = tmp_path / 'scratch'
+    scratch.mkdir()
+    monkeypatch.setattr(bags_module, 'file_system', lambda url: (memory, '/odd/..'))
+    with at_hand('memory://odd/..', str(scratch)) as path:
+        assert path.parent.parent == scratch
+    monkeypatch.setattr(bags_module.shutil, 'disk_usage',
+                        lambda folder: shutil._ntuple_diskusage(9, 9, 9))
+    with pytest.raises(BadBag, match='make room'), at_hand('memory://odd/..', str(scratch)):
+        pass
+
+
+def test_folders_of_vehicles_are_their_own():
+    names = ['7', '.7', '..', '', '../x', 'x' * 300, 'x' * 299 + 'y', '\u00fc' * 200, 'a b']
+    folders = [file_name(name) for name in names]
+    assert len(set(folders)) == len(names)
+    for folder in folders:
+        assert 0 < len(folder) < 200
+        assert '/' not in folder
+        assert not folder.startswith('.')
+
+
+@pytest.mark.parametrize('spoil', [lambda data: data[:len(data) // 2], lambda data: b'',
+                                   lambda data: b'PAR1' + b'x' * 50 + b'PAR1'])
+def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
+    store, key = RowStore(tmp_path), key_of('a bag')
+    row = Row(key=key, bag='drive', vehicle='7')
+    store.put(row)
+    store.remember('ab' * 20, key)
+    assert store.known('ab' * 20) == key
+    assert store.get(key) == row
+    store.path(key).write_bytes(spoil(store.path(key).read_bytes()))
+    assert store.get(key) is None
+    with pytest.raises(BadData, match='no row of a fleet'):
+        list(rows_of([store.path(key)]))
+    for odd in (b'../../x', b'\xff\xfe', b''):
+        (tmp_path / 'seen' / 'ab' / ('ab' * 20)).write_bytes(odd)
+        assert store.known('ab' * 20) is None

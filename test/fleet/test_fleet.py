@@ -250,6 +250,18 @@ def test_a_process_that_has_read_rows_ends_well(output):
         assert subprocess.run([sys.executable, '-c', code, *files]).returncode == 0
 
 
+def test_only_who_holds_the_key_gives_local_workers_work(client):
+    import dask
+    from distributed import Client
+    address = client.scheduler.address
+    assert address.startswith('tls://')
+    nothing = dict.fromkeys(f'distributed.comm.tls.{name}' for name in (
+        'ca-file', 'client.cert', 'client.key'))
+    with dask.config.set(nothing | {'distributed.comm.require-encryption': False}), \
+            pytest.raises(OSError, match='reset|closed|Timed out'):
+        Client(address.replace('tls', 'tcp'), timeout='2s')
+
+
 def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
     manifest = pd.read_csv(fleet.manifest)[['vehicle', 'bag', 'model']].head(2)
     manifest['bag'] = [str(fleet.folder / bag) for bag in manifest.bag]
