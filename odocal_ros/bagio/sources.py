@@ -32,6 +32,8 @@ from odocal_ros.outside.yaml_tree import loader
 
 MAGIC = {b'\x89MCAP0\r\n': '.mcap', b'SQLite format 3\0': '.db3', b'#ROSBAG V': '.bag',
          b'\x28\xb5\x2f\xfd': '.zstd'}
+# judgement: bytes at a time: after each zstd frame, of 9 bytes at least, what is left is copied
+FRAMES_READ = 2**13
 ENDINGS = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
 
 
@@ -89,8 +91,9 @@ def _folder(path: Path) -> Source:
     files = [path / file for file in wanted if is_file(path / file)]
     lost = [file for file in wanted if not is_file(path / file)]
     if lost and files:
+        named = ', '.join(lost[:10]) + ' ...' * (len(lost) > 10)
         notes.append(f'{path}: {len(lost)} of {len(wanted)} files named in metadata.yaml are '
-                     f'missing ({", ".join(lost)}); the others are read')
+                     f'missing ({named}); the others are read')
     if not files:
         files = sorted((f for f in path.iterdir() if f.name.endswith(ENDINGS) and is_file(f)),
                        key=_by_number)
@@ -158,10 +161,12 @@ def _known(content: dict[str, dict[str, Any]]) -> Known:
     known = content['rosbag2_bagfile_information']
     files = known.get('files') or ()
     spans = ((Path(file['path']).name, _span(file)) for file in files)
-    formats = {str(topic['topic_metadata'].get('serialization_format', 'cdr'))
+    formats = {topic['topic_metadata'].get('serialization_format', 'cdr')
                for topic in known.get('topics_with_message_count') or ()}
-    return Known(
-        tuple(Path(name).name for name in known.get('relative_file_paths') or ()),
+    if not all(isinstance(form, str) for form in formats):
+        raise ValueError('a serialization format that is no text')
+    return Known(      # a file named twice is read once
+        tuple(dict.fromkeys(Path(name).name for name in known.get('relative_file_paths') or ())),
         _span(known), tuple((name, span) for name, span in spans if span),
         '' if 'cdr' in formats else ', '.join(sorted(formats)))
 
@@ -218,9 +223,12 @@ def _decompressed(path: Path, folder: Path, allowance: Allowance) -> Path:
     zstd = zstd_module()
     target = folder / path.name.removesuffix('.zstd')
     with path.open('rb') as packed, target.open('wb') as out:
+        frames = 1
         frame, data = zstd.ZstdDecompressor(), b''   # gives what there is of a file cut off
-        while data or not (frame.needs_input or frame.eof) or (data := packed.read(2**18)):
+        while data or not (frame.needs_input or frame.eof) or (data := packed.read(FRAMES_READ)):
             if frame.eof:
+                frames += 1
+                allowance.check_frames(frames, packed.tell())
                 frame = zstd.ZstdDecompressor()
             try:
                 piece = frame.decompress(data, 2**20)

@@ -23,7 +23,7 @@ from odocal_ros.bagio.channels import Batch, Channel, FORMATS, Message, possible
 from odocal_ros.bagio.file_bytes import FileBytes
 from odocal_ros.bagio.sqlite_leaves import Leaves
 from odocal_ros.errors import BadBag
-from odocal_ros.outside.limits import Damaged, factor, LATEST_NS
+from odocal_ros.outside.limits import Damaged, factor, LATEST_NS, MESSAGE
 
 READS = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ}
 TABLES = {'messages', 'topics', 'message_definitions'}
@@ -56,10 +56,11 @@ class SqliteFile(Recording):
             raise
 
     def _guard(self) -> None:
-        """Let sqlite do no more than read rows of tables, each no larger than the file."""
+        """Let sqlite do no more than read rows of tables, each no larger than file and limit."""
         db = self._db
         db.text_factory = lambda raw: raw.decode(errors='replace')
-        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._size, 100_000))
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH,
+                    min(max(self._size, 100_000), int(min(MESSAGE * factor(), 2**30))))
         # else sqlite refuses at once a file shorter than its header says
         db.execute('PRAGMA writable_schema=ON')
         db.execute('PRAGMA trusted_schema=OFF')

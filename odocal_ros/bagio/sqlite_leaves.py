@@ -20,6 +20,7 @@ import struct
 from typing import Any
 
 from odocal_ros.bagio.file_bytes import FileBytes
+from odocal_ros.outside.limits import factor, MESSAGE
 
 LEAF = 0x0D                       # format: kind of page of rows, sqlite.org/fileformat2
 # format: of rosbag2, id (NULL: it is the row number), topic_id, timestamp, data
@@ -96,7 +97,7 @@ class Leaves:
 
     def _payload(self, data: bytes, at: int, size: int) -> bytes:
         """Return a row's bytes, those on overflow pages too."""
-        if size > len(self._map):
+        if size > min(len(self._map), MESSAGE * factor()):
             raise ValueError('larger than the file')
         largest = self._usable - 35
         if size <= largest:

@@ -20,8 +20,12 @@ from odocal_ros.errors import BadBag
 
 RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
 DEFINITION = 2**16           # judgement: characters of a message definition
+MESSAGE = 2**26              # judgement: bytes of one message that is asked for
 ELEMENTS = 100_000           # judgement: values in the fixed arrays of one message
 SECONDS = 20                 # judgement: to understand a definition
+# judgement: bytes given to a decompressor at first: after each frame, of which there may be one in
+# 9 bytes, what is left of them is copied
+LEAST_PIECE = 2**10
 LATEST_NS = 2**62            # judgement: the year 2116: a later time of a message is none
 
 
@@ -73,6 +77,11 @@ class Allowance:
         self._used += count
         check(self._used, self.most, self._what)
 
+    def check_frames(self, frames: int, packed: int) -> None:
+        """Raise LimitReached where so many bytes hold more frames than anybody packs."""
+        few, bytes_a_frame = 1000, 1024
+        check(frames, few + packed / bytes_a_frame, self._what, 'frames')
+
     @property
     def left(self) -> int:
         """Return how many bytes may still come."""
@@ -90,12 +99,18 @@ class Allowance:
         if not packing:
             self.take(len(data))
             return data
-        parts, have = [], 0
-        while data and have <= most:
-            stream = opener(packing)()
-            parts.append(stream.decompress(data, most + 1 - have))
-            have += len(parts[-1])
-            data = stream.unused_data if stream.eof else b''
+        parts, have, at, frames = [], 0, 0, 0
+        packed = memoryview(data)
+        while at < len(packed) and have <= most:
+            frames += 1
+            self.check_frames(frames, at)
+            stream, piece = opener(packing)(), LEAST_PIECE
+            while at < len(packed) and have <= most and not stream.eof:
+                parts.append(stream.decompress(packed[at:at + piece], most + 1 - have))
+                have += len(parts[-1])
+                at += min(piece, len(packed) - at)
+                piece *= 2
+            at -= len(stream.unused_data or b'') if stream.eof else 0
         self.take(have)
         if size is not None and have > size:
             raise Damaged('a chunk is larger than it says')

@@ -13,6 +13,9 @@ from functools import cache
 from typing import Any
 
 from odocal_ros.errors import BadConfig
+from odocal_ros.outside.limits import check
+
+NODES = 30_000      # judgement: mappings, lists and values of a text: some seconds
 
 
 @cache
@@ -23,7 +26,7 @@ def loader(aliases: bool = False) -> Any:
     class Plain(yaml.SafeLoader):       # type: ignore[misc]  # PyYAML has no types here
         """Composes with a bound."""
 
-        depth = 0
+        depth = nodes = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             """Compose a node and what is in it."""
@@ -35,6 +38,8 @@ def loader(aliases: bool = False) -> Any:
             if self.depth >= deepest:
                 raise yaml.composer.ComposerError(
                     None, None, f'nested deeper than {deepest} levels', mark)
+            self.nodes += 1
+            check(self.nodes, NODES, 'the YAML text', 'values')
             self.depth += 1
             try:
                 node = super().compose_node(parent, index)
@@ -44,6 +49,9 @@ def loader(aliases: bool = False) -> Any:
                     isinstance(key, yaml.ScalarNode) for key, _ in node.value):
                 raise yaml.composer.ComposerError(None, None, 'a key that is no text', mark)
             return node
+
+        def flatten_mapping(self, node: Any) -> None:
+            """Take no merges (<<): a few of them in each other are millions of keys."""
     return Plain
 
 

@@ -13,6 +13,7 @@ import os
 import sqlite3
 import struct
 import sys
+import time
 import tracemalloc
 
 import pytest
@@ -225,3 +226,64 @@ def test_a_decompressor_is_looked_for_once_and_not_for_each_message(tmp_path, mo
     with open_bag(path) as bag:
         assert len(list(bag.messages('/imu/data'))) == 100
     assert len([name for name in asked if name.startswith('compression')]) <= 2
+
+
+@pytest.mark.parametrize('kind', ['chunk', 'file'])
+def test_empty_frames_cost_no_more_than_their_number(tmp_path, kind):
+    frames = zstd_module().compress(b'') * 100_000        # 0.9 MB
+    path = tmp_path / 'bag.mcap'
+    if kind == 'file':
+        path.write_bytes(frames)
+    else:
+        mcap(path, frames, 100)
+    before = time.process_time()
+    _, said = peak(path)
+    assert time.process_time() - before < 2.0
+    assert 'frames, the limit for it' in said
+
+
+def metadata(folder, change):
+    """Write a bag and change the tree of its metadata.yaml."""
+    path = ros_bags.write(folder / 'bag', ros_bags.drive(0.5), 'mcap')
+    file = path / 'metadata.yaml'
+    file.write_text(change(file.read_text()))
+    return path
+
+
+def test_links_in_each_other_are_not_written_out(tmp_path):
+    links = ['&l0 [x, x, x, x, x, x, x, x]']
+    links += [f'&l{k} [{", ".join([f"*l{k - 1}"] * 8)}]' for k in range(1, 8)]
+    odd = '{' + ', '.join(f'k{k}: {link}' for k, link in enumerate(links)) + '}'
+    path = metadata(tmp_path, lambda text: text.replace('serialization_format: cdr',
+                                                        f'serialization_format: {odd}', 1))
+    assert 'k7' in (path / 'metadata.yaml').read_text()
+    most, _ = peak(path)
+    assert most < MOST
+    merges = ['a0: &m0 {x: 1}'] + [
+        f'a{k}: &m{k} {{<<: [{", ".join([f"*m{k - 1}"] * 8)}]}}' for k in range(1, 9)]
+    path = metadata(tmp_path / 'merged', lambda text: '\n'.join([*merges, text]))
+    assert peak(path)[0] < MOST
+
+
+def test_a_text_of_very_many_keys_is_not_used(tmp_path):
+    path = metadata(tmp_path, lambda text: text + ''.join(f'k{n}: {n}\n' for n in range(38_000)))
+    with open_bag(path) as bag:
+        assert any('takes more than' in note and 'values' in note for note in bag.notes)
+
+
+def test_a_file_named_many_times_is_read_once(tmp_path):
+    def named(text):
+        line = next(x for x in text.split('\n') if x.strip().startswith('- bag'))
+        return text.replace(line, '\n'.join([line] * 50), 1)
+    path = metadata(tmp_path, named)
+    with open_bag(path) as bag:
+        assert len(bag.files) == 1
+
+
+def test_one_message_of_a_database_is_bounded(tmp_path):
+    path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5), 'sqlite3')
+    db = sqlite3.connect(path / 'bag.db3')
+    db.execute('UPDATE messages SET data = zeroblob(200000000) WHERE rowid = 3')
+    db.commit()
+    db.close()
+    assert peak(path)[0] < 2**27
