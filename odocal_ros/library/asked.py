@@ -10,10 +10,12 @@
 """What a caller asks for: settings in any of their forms, legs as text or seconds."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
+from odocal_ros.outside.names import brief_line, said_by
 from odocal_ros.settings.config import Config, with_settings
 
 if TYPE_CHECKING:
@@ -21,6 +23,38 @@ if TYPE_CHECKING:
 
 Settings = Config | Mapping[str, object] | str | Path | None
 Leg = str | tuple[float | None, float | None]
+
+
+def paths_of(asked: Any) -> list[Path]:
+    """
+    Return the paths of one bag or several.
+
+    Raises
+    ------
+    BadUsage
+        There is none, or one that is no path at all.
+
+    """
+    several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
+        else list(asked)
+    if not several:
+        raise BadUsage('no bag is given: want a path, or several')
+    for one in several:
+        try:
+            with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+                Path(one).stat()       # whether it is there is for who reads it to say
+        except (OSError, TypeError, ValueError) as error:
+            raise BadUsage(f'{brief_line(repr(one)[:100])} is no path of a bag: '
+                           f'{said_by(error)[:100]}') from None
+    return [Path(one) for one in several]
+
+
+def topics_of(asked: Any) -> dict[str, str]:
+    """Return slot -> topic, or raise BadUsage where what is asked is no mapping."""
+    if asked is not None and not isinstance(asked, Mapping):
+        raise BadUsage(f"topics: want a mapping of slot to topic, as in {{'imu': '/imu/data'}}, "
+                       f'not {type(asked).__name__}')
+    return dict(asked or {})
 
 
 def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> Config:
@@ -37,6 +71,11 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
     """
     if isinstance(asked, Config):
         return asked
+    if asked is not None and not isinstance(asked, (str, Path, Mapping)):
+        raise BadUsage('config: want a Config, a mapping of dotted names, or a parameter file, '
+                       f'not {type(asked).__name__}')
+    if '\0' in str(asked):
+        raise BadUsage('config: a path with a zero byte is none')
     if isinstance(asked, (str, Path)):
         from odocal_ros.settings.config_file import read_config_file
         asked = read_config_file(Path(asked))
@@ -59,6 +98,8 @@ def legs_of(asked: Iterable[Leg] | Leg | None) -> 'list[LegSpan | str]':
     from odocal_ros.library.legs import EACH_STOP, parse_leg
     if asked is None:
         return []
+    if not isinstance(asked, Iterable):
+        raise BadUsage(f"legs: {asked!r} is neither 'A:B', 'A/B', 'each-stop' nor (A, B)")
     one_alone = isinstance(asked, str) or isinstance(asked, tuple) and _is_pair(asked)
     wanted: Iterable[Any] = [asked] if one_alone else asked
     return [one if one == EACH_STOP else parse_leg(_text(one)) for one in wanted]

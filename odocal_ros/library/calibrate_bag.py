@@ -17,7 +17,7 @@ from typing import Any
 
 from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
-from odocal_ros.library.asked import config_of, Leg, legs_of, Settings
+from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings, topics_of
 from odocal_ros.library.calibration import Calibration
 from odocal_ros.library.hearer import Hearer, Notes
 from odocal_ros.library.read_bag import read_bag, readers_of, Recording
@@ -71,9 +71,9 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
     heard = Notes(hearer or Hearer())
-    asked = _Asked(dict(topics or {}), config, legs_of(legs), holdout)
+    asked = _Asked(topics_of(topics), config, legs_of(legs), holdout)
     imu = known_imu(config_of(config))
-    paths, again = once([Path(path)] if isinstance(path, (str, Path)) else list(map(Path, path)))
+    paths, again = once(paths_of(path))
     for twice in again:
         heard.note(f'{twice} is given twice: it is read once')
     if len(paths) > 1:

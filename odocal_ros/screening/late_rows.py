@@ -172,6 +172,8 @@ def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Float
     catching_up = 3.0    # times the speed beside: no wheel, so rows that catch up
     if t[b] - t[a] > even_travel or not beside or speed(a + 1, b) < catching_up * beside:
         return t[rows]
+    if travel[a] == travel[b]:      # there and back: it tells no time
+        return t[rows]
     # some rows of the burst are lost, so that its rhythm tells nothing
     by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])
     return np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))

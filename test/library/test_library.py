@@ -245,3 +245,14 @@ def test_a_comparison_is_what_the_command_prints(calibration, tmp_path, capsys):
 def test_an_option_that_is_none_is_told():
     with pytest.raises(OdocalError, match='durations'):
         simulate('town', durations=3.0)
+
+
+@pytest.mark.parametrize('odd', [
+    (b'\xff',), ('\0',), (3.5,), (None,), ([],), ('x' * 5000,), ('{bag}', 3), ('{bag}', None, 3),
+    ('{bag}', None, '\0'), ('{bag}', None, None, 3)])
+def test_arguments_that_make_no_sense_are_usage_errors(odd, tmp_path):
+    from odocal_ros.errors import BadUsage
+    from odocal_ros.library.calibrate_bag import calibrate_bag
+    args = [str(tmp_path) if one == '{bag}' else one for one in odd]
+    with pytest.raises(BadUsage):
+        calibrate_bag(*args)

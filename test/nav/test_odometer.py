@@ -259,3 +259,10 @@ def test_the_mean_of_two_rounded_wheels_errs_as_its_quantum_says():
     error = found.s - way * 1.0015
     # a variance from 20 000 hardly dependent draws: 1 %, five times over
     assert error.std() == pytest.approx(found.quantum / np.sqrt(12), rel=0.05)
+
+
+def test_steps_too_small_for_a_speed_are_no_resets():
+    from odocal_ros.nav.odometer import _resets
+    t = np.arange(100) * 1e9
+    step = np.full(99, 5e-324)
+    assert not _resets(t, step, False).any()
