@@ -17,6 +17,8 @@ import tempfile
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -29,6 +31,8 @@ from odocal_ros.live.memory import hold_little
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.outside.names import brief_line, said_by
 
+LOOK_FOR_NAMESAKE_S = 5.0      # judgement: s between looks for another node of the same name
+
 
 class SettledNode(Node):
     """A node that builds itself of its parameters, or says in one line which is wrong."""
@@ -38,6 +42,8 @@ class SettledNode(Node):
             super().__init__(node_name, **kwargs)
             try:
                 self._build()
+                self._alone = self.create_timer(LOOK_FOR_NAMESAKE_S, self._look_for_namesake,
+                                                clock=Clock(clock_type=ClockType.STEADY_TIME))
             except Exception:
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
@@ -46,6 +52,15 @@ class SettledNode(Node):
 
     def _build(self) -> None:
         raise NotImplementedError
+
+    def _look_for_namesake(self) -> None:
+        """Say once where another node has this one's name."""
+        own = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count(own) > 1:
+            self._alone.cancel()
+            self.get_logger().warning(
+                f'another node is called {self.get_fully_qualified_name()}: services, parameters '
+                'and topics of both mix; stop one, or rename it with -r __node:=NAME')
 
     def get_logger(self) -> PlainLog:
         """Return the node's log."""
