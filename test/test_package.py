@@ -116,7 +116,9 @@ def test_setup_requires_all_that_is_imported_but_ros():
     assert {name for name in TABLES if f"'{name}" in setup.partition("'tables': [")[2].partition(
         ']')[0]} == TABLES
     listed = setup.partition('FLEET = [')[2].partition(']')[0]
-    assert set(re.findall(r"'([a-z]+)", listed)) == FLEET <= imported() | TABLES
+    # Dask imports it, to make the keys of local workers
+    assert set(re.findall(r"'([a-z]+)", listed)) - {'cryptography'} == FLEET
+    assert imported() | TABLES >= FLEET
     for name, extra in EXTRA.items():
         assert f"'{KEYS[name][1]}" in setup.partition(f"'{extra}': [")[2].partition(']')[0]
 
