@@ -134,7 +134,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.LEG_NOT_STRAIGHT: 'More than a tenth of the way was driven in turns '
         '(`leg.max_yaw_rate`), where wheels run ways of their own.',
         Code.TRACK_MISMATCH: 'Even with the calibrated values the track is farther from the fixes '
-        'than noise, drift and 0.2 % of the distance explain. Something else is wrong.',
+        'than noise, drift and 0.2 % of the distance explain. Something else is wrong. Or the '
+        'direction of travel flips by half a turn from one piece of the drive to the next, and '
+        'the fixes stay back: the vehicle reversed, and the odometer counted upwards.',
         Code.CHECK_WORSE: 'Of pieces of 100 m, 500 m or 1 km, each begun anew at a fix, the track '
         'with the calibrated values ends farther from the fixes than the one without, beyond '
         'chance. Both have the same attitude, so the values are to blame: slip, bad fixes or a '

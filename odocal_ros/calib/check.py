@@ -13,12 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from odocal_ros.calib.drive import knots_of
 from odocal_ros.calib.marks import MarkFix, Path
 from odocal_ros.calib.result import TrackCheck
 from odocal_ros.calib.slow_errors import window_means
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.nav.angles import arctan2, wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import NORMAL_MEDIAN, OUTLIER_SIGMAS
 
@@ -142,27 +140,6 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
                    'too; mend what drops or spoils rows, or copy the recording again.'),)
 
 
-def pieces(track_2d: Floats, fixes_2d: Floats, t: Floats,
-           sigma: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """
-    Cut the drive into pieces long enough for a direction.
-
-    Returns
-    -------
-    middle : (k,) s.   track_direction, course : (k,) rad, from east, ccw.
-    stretch : (k,) how long the track is beside the fixes.
-
-    """
-    # a direction is then good to sqrt(2) / 20 rad
-    knots = np.array(knots_of(fixes_2d, max(10.0, 20 * sigma)), int)
-    if len(knots) < 2:
-        return (np.empty(0),) * 4
-    a, b = knots[:-1], knots[1:]
-    track, fix = track_2d[b] - track_2d[a], fixes_2d[b] - fixes_2d[a]
-    return ((t[a] + t[b]) / 2, arctan2(*track.T[::-1]), arctan2(*fix.T[::-1]),
-            np.hypot(*track.T) / np.hypot(*fix.T))
-
-
 def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
     """
     Tell which fixes are no outliers beside their neighbours, and how noisy they are.
@@ -181,24 +158,3 @@ def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:
         np.pad(level, ((2, 2), (0, 0)), 'edge'), 5, axis=0)
     off = np.hypot(*(level - np.median(windows, axis=-1)).T)
     return off <= OUTLIER_SIGMAS * sigma, sigma
-
-
-def against_travel(track_direction: Floats, course: Floats, stretch: Floats,
-                   signed: bool) -> tuple[Reason, ...]:
-    """
-    Return TRACK_MISMATCH where counts rise while the vehicle drives backwards.
-
-    As far as the fixes go back the counter goes on: fixes that only jump go as far as they like.
-    """
-    if len(course) < 3:
-        return ()
-    off = wrap(track_direction - course)
-    middle = np.angle(np.median(np.cos(off)) + 1j * np.median(np.sin(off)))
-    back = np.abs(wrap(off - middle)) > np.deg2rad(135)
-    back &= (stretch > ONE_MOTION_RATIO[0]) & (stretch < ONE_MOTION_RATIO[1])
-    if not back.any() or back.mean() > 0.5:
-        return ()
-    how = 'odometer.signed is false' if not signed else 'the counter does not count down'
-    return (Reason(Code.TRACK_MISMATCH, f'on {int(back.sum())} of {len(back)} pieces the '
-                   f'track runs against the fixes: the vehicle reversed and {how}',
-                   Code.REVERSING_UNSIGNED.remedy),)

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.calib.marks import fix_at, MARK_WINDOW, MarkFix, standing_at
+from odocal_ros.calib.reversal import level_track
 from odocal_ros.calib.wheels.wheel_slips import WheelSlips
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.leg import Leg
+from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import Alignment
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.earth import earth_rate_n
+from odocal_ros.nav.integral import integral_at
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.nav.strapdown import attitude
 from odocal_ros.pipeline.method_run import Path
@@ -72,6 +75,15 @@ class PreparedLeg(Placed):
             path = track.at(t) @ f
             return path + track.C_nb_at(t) @ self.lever_b if np.any(self.lever_b) else path
         return at
+
+    def level_path(self, t: Floats) -> Floats:
+        """Return travel along the gyro's heading on level ground, but for a rotation: (n, 2)."""
+        inputs, epochs = self.inputs, self.track.t
+        up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
+        turned = integral_at(epochs, inputs.t_imu, by_row(
+            lambda w_b: (w_b - self.alignment.gyro_bias) @ up_b, inputs.w_b))
+        path = level_track(self.track.s, turned)
+        return np.stack([np.interp(t, epochs, axis) for axis in path.T], -1)
 
     def mark(self, t: float, path: Path, name: str = '') -> MarkFix | None:
         """

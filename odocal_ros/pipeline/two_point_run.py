@@ -16,17 +16,17 @@ import numpy as np
 
 from odocal_ros.calib.budget import displacement, drift_sources, epochs_between
 from odocal_ros.calib.check import (
-    against_travel,
     bent,
     fix_noise_factor,
     mismatch,
-    pieces,
     steady,
     stray,
     track_check,
 )
+from odocal_ros.calib.drive import white_noise
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix
+from odocal_ros.calib.reversal import against_travel, pieces
 from odocal_ros.calib.slip import find_slips, rounding, slip_reason, SPIN_WINDOW
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import (
@@ -179,10 +179,10 @@ class TwoPointRun:
                      drift: float) -> None:
         """Compare the corrected track with the fixes: reversing, sanity."""
         ready, (t, p) = self.ready, fixes
-        track_2d = ((self.track.at(t) - self.track.at(chord.start.t)) @ f)[:, :2]
-        keep, sigma = steady(residual, ready.fix_sigma)
-        _, direction, course, stretch = pieces(track_2d[keep], p[keep, :2], t[keep], sigma)
-        found = against_travel(direction, course, stretch, self.config.odometer.signed)
+        keep, _ = steady(residual, ready.fix_sigma)     # as noisy as the track is wrong
+        sigma = max(ready.fix_sigma, white_noise(p[keep]))
+        found = against_travel(pieces(ready.level_path(t[keep]), p[keep, :2], t[keep], sigma),
+                               self.config.odometer.signed)
         self.found += found
         if not found:
             off = stray(ready.path(f), chord.start, fixes)

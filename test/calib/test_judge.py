@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 
 from odocal_ros.calib.check import (
-    against_travel,
     bent,
     fix_noise_factor,
     mismatch,
-    pieces,
     steady,
     track_check,
 )
@@ -218,18 +216,6 @@ class TestCheck:
         assert codes(reasons) == ([code] if code else [])
         assert all(text in f'{r.text} {r.remedy}' for r in reasons)
 
-    def test_reversing_with_rising_counts_is_seen(self):
-        course = np.array([0.1, 0.0, 0.1, 0.0, 3.1, 3.2, 0.1, 0.0])
-        as_far = np.full(8, 1.05)
-        reasons = against_travel(np.full(8, 0.05), course, as_far, signed=True)
-        assert codes(reasons) == [Code.TRACK_MISMATCH]
-        assert 'the vehicle reversed' in reasons[0].text
-        assert 'on 2 of 8 pieces' in reasons[0].text
-        assert against_travel(course + 0.3, course, as_far, signed=True) == ()
-        # fixes that jump back 60 m and on again while the vehicle goes on by 20
-        jump = np.where(np.abs(course) > 3, 0.33, as_far)
-        assert against_travel(np.full(8, 0.05), course, jump, signed=True) == ()
-
     def test_outliers_have_no_direction(self):
         rng = np.random.default_rng(4)
         residual = rng.standard_normal((500, 3)) + np.linspace(0, 300, 500)[:, None]
@@ -239,15 +225,6 @@ class TestCheck:
         # of 500 white errors of 1 m on a track that goes astray by 0.6 m a fix
         assert sigma == pytest.approx(1.05, abs=0.15)
         assert steady(residual, 9.0)[1] == 9.0
-
-    def test_pieces_are_long_enough_for_a_direction(self):
-        t = np.arange(0.0, 100.0)
-        p = np.stack([2.0 * t, np.zeros(100)], -1)
-        middle, track, course, stretch = pieces(p, p, t, sigma=1.0)
-        assert len(middle) == 9                    # of 20 sigmas, 20 m
-        np.testing.assert_array_equal(track, course)
-        np.testing.assert_array_equal(stretch, 1.0)
-        assert len(pieces(p * 0, p * 0, t, 1.0)[0]) == 0
 
 
 def test_a_vehicle_that_backs_up_turns_no_farther_than_its_gyro():

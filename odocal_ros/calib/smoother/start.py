@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.check import pieces, steady
+from odocal_ros.calib.check import steady
+from odocal_ros.calib.reversal import pieces
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.part import Total
@@ -167,11 +168,10 @@ class _Track:
             apart = np.stack([(laid - z).real, (laid - z).imag], -1)
             keep, noise = steady(apart, sigma)
             flat = np.stack([at.real, at.imag], -1) * self.K
-            middle, course_track, course, _ = pieces(
-                flat[keep], fix[keep, :2], t_fix[keep], noise)
+            found = pieces(flat[keep], fix[keep, :2], t_fix[keep], noise)
+            middle, off = found.t, -found.off
             if not len(middle):
                 break
-            off = course - course_track
             centre = float(np.angle(np.exp(1j * off).sum()))
             off = np.unwrap(centre + wrap(off - centre)) if len(off) > 1 else off
             self.chi, slope = _line(middle, off)
