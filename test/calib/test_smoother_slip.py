@@ -11,14 +11,18 @@
 
 from dataclasses import replace
 
+from drives import settings
 import numpy as np
 import pytest
-from smoother_legs import made
+from reversing_drives import made as by_hand
+from smoother_legs import leg_of, made
 
 from odocal_ros.calib.smoother import smooth
 from odocal_ros.calib.smoother.outcome import in_words
 from odocal_ros.nav.odometer import Travel
 from odocal_ros.reasons import Code
+from odocal_ros.sim import routes
+from odocal_ros.sim.profile import hold, ramp
 
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
 
@@ -72,6 +76,16 @@ def test_slip_at_starts_is_said(noise):
 def test_wheels_that_hold_are_not_blamed(options):
     _, config, leg = made(**SHORT, **options)
     assert not said(smooth(leg, config))
+
+
+def test_a_level_that_no_row_determines_is_not_reported():
+    """12 m/s in 40 s: no second speeds up by more than 0.5 m/s^2, where wheels may slip."""
+    drive = by_hand(lambda duration, rng: routes._route([
+        (hold(30) + ramp(40, 12, 1.0) + hold(60) + ramp(40, -12, 1.0) + hold(20), hold(190))]))
+    config = settings(drive, None)
+    method = smooth(leg_of(drive.leg(), config), config)
+    assert method.details['noise']['along_hard'] == pytest.approx(0.01)     # where the fit began
+    assert not said(method)
 
 
 def test_names_of_parameters_in_words():

@@ -91,7 +91,7 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     count = leg.travel.quantum * fit.state.scale
     # of a coarse speed only its steps are used: its way along shows no slip
     slips = () if leg.by_steps else find_slips(fit, near, count)
-    reasons += [] if leg.by_steps else slip_reasons(fit, slips, count)
+    reasons += [] if leg.by_steps else slip_reasons(fit, near, slips, count)
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.solved.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))

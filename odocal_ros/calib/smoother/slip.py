@@ -18,10 +18,14 @@ from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
 # off, once in 4200 by chance
 SLIP_VARIANCE = 1.5
+# rows that a level must be worth to be reported. Statistical: its root, with a sigma of
+# root / sqrt(2 rows), then lies REMARK_SIGMAS above zero
+LEVEL_ROWS = REMARK_SIGMAS**2 / 2
 
 
 @dataclass(frozen=True)
@@ -57,11 +61,19 @@ def find_slips(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> tuple[Sl
                         key=lambda s: -abs(s.metres)))
 
 
-def slip_reasons(fit: Fit, slips: tuple[Slip, ...], count: float = 0.0) -> list[Reason]:
-    """Say where the wheels slipped and how much, one by one or whenever the speed changes."""
+def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...],
+                 count: float = 0.0) -> list[Reason]:
+    """
+    Return WHEEL_SLIP with where the wheels slipped and how much, empty where they did not.
+
+    One by one, or whenever the speed changes: by a level, where the drive determines it.
+    """
     level = fit.levels.roots()
     # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
+    # one that no row determines stays where the fit began
+    known = {name for name, (_, rows) in fit.weighted[MotionRows].components(neighbours).items()
+             if rows > LEVEL_ROWS}
     said, most = [], 3      # runs said one by one
     if slips:
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
@@ -70,8 +82,9 @@ def slip_reasons(fit: Fit, slips: tuple[Slip, ...], count: float = 0.0) -> list[
         said.append('the wheel turned more (+) or less (-) than the vehicle moved: '
                     + ', '.join(one) + more)
     # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
-    if level['along_hard'] > max(0.006, 3 * level['along'], rounding):
+    if 'along_hard' in known and level['along_hard'] > max(0.006, 3 * level['along'], rounding):
+        beside = f', {1e3 * level["along"]:.1f} mm in even driving' if 'along' in known else ''
         said.append('it slips when the speed changes: about '
                     f'{1e3 * level["along_hard"]:.0f} mm in each second of speeding up or '
-                    f'braking, {1e3 * level["along"]:.1f} mm in even driving')
+                    f'braking{beside}')
     return [Reason(Code.WHEEL_SLIP, '; '.join(said))] if said else []
