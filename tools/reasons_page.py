@@ -71,7 +71,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         Code.DELAY_SEEN: 'Where the vehicle speeds up and slows down, the stamps of one sensor '
         'were found late or early against the others, by more than three sigmas and by enough to '
         'matter at the speed driven. Methods wheels and smoother estimate the delay and allow for '
-        'it; other software that joins these sensors does not.',
+        'it; other software that joins these sensors does not. Where no method estimates it, an '
+        'odometer is named that would look like a slipping wheel only because it is late, or '
+        'because its speed is low-pass filtered.',
         Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then came in a burst that '
         'made up for it: they were held up on the way, and their stamps, taken on arrival, are '
         'late. They were put where the rhythm of the sender has them, or where the travel before '

@@ -12,15 +12,19 @@ Wheel slip: where the odometer runs farther than the Imu's acceleration allows.
 
 Over a few seconds the way is the integral of speed, and the speed that of the specific force along
 the forward axis less gravity. With the speed pinned to the odometer's at both ends of the window,
-a steady accelerometer bias, a tilt and a late odometer drop out; what a wheel spun in between does
-not.
+a steady accelerometer bias and a tilt drop out; what a wheel spun in between does not. An odometer
+that is late, or whose speed is low-pass filtered, departs from the Imu at every change of
+acceleration: the lateness at which the two agree best is estimated first.
 """
+
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from odocal_ros.calib.result import Source
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.angles import arctan2
 from odocal_ros.nav.dead_reckoning import Track
@@ -32,12 +36,28 @@ from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 SPIN_WINDOW = 4.0    # s, longer than a spin, shorter than a hill: judgement
 SPIN_GRID = 0.2      # s between rows, a spin lasts longer: judgement
+SPAN = round(SPIN_WINDOW / SPIN_GRID)      # definition: rows of a window
 PIN_STEPS = 2        # rows each side that the speed at an end is taken over: judgement
 # rad in a window: in more of a turn the level's error is another axis'. Judgement
 SPIN_TURN = 0.1
 # odometer counts that rounding may make of a window: one over the 0.8 s of a pin is 5 over the
 # window, its own ends 1 more; the rest is margin: judgement
 PIN_COUNTS = 8.0
+# s by which the odometer may be late, looked at: judgement; a bus or a filter takes less
+LATE = 0.05 * np.arange(-10, 21)
+
+
+class Slips(NamedTuple):
+    """
+    Where the wheels spun or slid.
+
+    t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
+    late : s by which the odometer is late against the Imu, where it would look like slip, else 0.
+    """
+
+    t: Floats
+    size: Floats
+    late: float = 0.0
 
 
 def rounding(travel: Travel) -> float:
@@ -48,9 +68,9 @@ def rounding(travel: Travel) -> float:
 
 
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
-               quantum: float) -> tuple[Floats, Floats]:
+               quantum: float) -> Slips:
     """
-    Return when and how far the odometer ran ahead of the Imu.
+    Return when and how far the odometer ran ahead of the Imu, its lateness taken out.
 
     Parameters
     ----------
@@ -65,27 +85,54 @@ def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: fl
     quantum : float
         Size of an odometer count, scale units.
 
-    Returns
-    -------
-    t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
-
     """
     K = float(np.linalg.norm(f))
-    grid = np.arange(max(track.t[0], t_imu[0]), min(track.t[-1], t_imu[-1]), SPIN_GRID)
-    span = round(SPIN_WINDOW / SPIN_GRID)
-    if len(grid) < 2 * span:
-        return np.empty(0), np.empty(0)
+    grid = np.arange(max(track.t[0] - LATE[0], t_imu[0]), min(track.t[-1] - LATE[-1], t_imu[-1]),
+                     SPIN_GRID)
+    if len(grid) < 2 * SPAN:
+        return Slips(np.empty(0), np.empty(0))
     a = acceleration(grid, t_imu, f_b, track, f / K, latitude)
-    excess = excess_way(span, a, K * np.interp(grid, track.t, track.s))
     # in a turn the level error comes to bear on another axis: no window is judged there
     C = track.C_nb_at(grid)
     yaw = np.unwrap(arctan2(C[:, 1, 0], C[:, 0, 0]))[PIN_STEPS:-PIN_STEPS]
-    excess[np.ptp(sliding_window_view(yaw, span + 1), axis=1) > SPIN_TURN] = 0.0
-    # what the drive as a whole does (rough road, soft suspension) is no event
-    usual = np.median(np.abs(excess[excess != 0.0])) / NORMAL_MEDIAN if excess.any() else 0.0
-    least = 0.45        # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m
-    limit = max(least, PIN_COUNTS * quantum * K, 6 * usual)
-    return _events(grid[PIN_STEPS:-span - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
+    turns = np.ptp(sliding_window_view(yaw, SPAN + 1), axis=1) > SPIN_TURN
+    windows = _Windows(grid, a, turns, track, K, quantum)
+    # a mean of sizes: slips hardly move it
+    late = float(LATE[np.argmin([np.abs(windows.excess(late)).mean() for late in LATE])])
+    t, size = windows.events(late)
+    hidden = len(windows.events(0.0)[0]) > len(t)
+    return Slips(t, size, late if hidden else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """
+    The windows of a drive, from each of grid, (n,) s, on.
+
+    a : (n - 1,) m/s^2 along by the Imu.   turns : (m,) bool, windows that are not judged.
+    track, K, quantum : Track, its scale, size of a count in scale units.
+    """
+
+    grid: Floats
+    a: Floats
+    turns: Bools
+    track: Track
+    K: float
+    quantum: float
+
+    def excess(self, late: float) -> Floats:
+        """Return by how much the odometer exceeds the Imu in each window if so late, s: (m,) m."""
+        way = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
+        return np.where(self.turns, 0.0, excess_way(SPAN, self.a, way))
+
+    def events(self, late: float) -> tuple[Floats, Floats]:
+        """Return time, s, and size, m, of each slip if the odometer is so late, s."""
+        excess = self.excess(late)
+        # what the drive as a whole does (rough road, soft suspension) is no event
+        usual = np.median(np.abs(excess[excess != 0.0])) / NORMAL_MEDIAN if excess.any() else 0.0
+        least = 0.45    # m, 3 sigmas: a tilt that wanders makes 0.1 m/s^2 of a window, 0.15 m
+        limit = max(least, PIN_COUNTS * self.quantum * self.K, 6 * usual)
+        return _events(self.grid[PIN_STEPS:-SPAN - PIN_STEPS] + SPIN_WINDOW / 2, excess, limit)
 
 
 def acceleration(grid: Floats, t_imu: Floats, f_b: Floats, track: Track, forward: Floats,
@@ -135,10 +182,22 @@ def slip_source(track: Track, f: Floats, gradient: Floats, t: Floats, size: Floa
     return Source('wheel_slip', gradient @ along_n.sum(axis=0)[:, None])
 
 
-def slip_reason(t: Floats, size: Floats) -> tuple[Reason, ...]:
-    """Return WHEEL_SLIP with what was seen, empty where nothing was."""
-    if not len(t):
-        return ()
-    return (Reason(Code.WHEEL_SLIP, f'at {len(t)} place{"s" * (len(t) > 1)} the odometer and the '
-                   f'Imu part by {np.abs(size).sum():.2f} m in all, first by {size[0]:+.2f} m at '
-                   f't = {t[0]:.1f} s: the wheel spun or slid'),)
+def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
+    """
+    Return DELAY_SEEN and WHEEL_SLIP with what was seen, empty where nothing was.
+
+    slips : Slips.   time_offset : odometer.time_offset as set, s.
+    """
+    found: tuple[Reason, ...] = ()
+    t, size, late = slips
+    if late:
+        found += (Reason(
+            Code.DELAY_SEEN, f'the stamps of the odometer are about {abs(late):.2f} s '
+            f'{"late" if late > 0 else "early"} against the Imu, or its speed is low-pass '
+            f'filtered; odometer.time_offset = {time_offset - late:.2f} would take a delay out'),)
+    if len(t):
+        found += (Reason(
+            Code.WHEEL_SLIP, f'at {len(t)} place{"s" * (len(t) > 1)} the odometer and the '
+            f'Imu part by {np.abs(size).sum():.2f} m in all, first by {size[0]:+.2f} m at '
+            f't = {t[0]:.1f} s: the wheel spun or slid'),)
+    return found

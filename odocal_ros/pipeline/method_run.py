@@ -38,7 +38,8 @@ class MethodRun(NamedTuple):
 
     paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
     'odometer' to s late and sigma; None from a method that sees none.   slips : of one wheel, as
-    they stand in calibration.json.
+    they stand in calibration.json.   odometer : slip or lateness that its track shows beside the
+    Imu, said of the leg unless a better method has looked; None: it does not look.
     """
 
     result: MethodResult
@@ -46,3 +47,4 @@ class MethodRun(NamedTuple):
     found: tuple[Reason, ...] = ()
     delays: dict[str, tuple[float, float]] | None = None
     slips: tuple[dict[str, Any], ...] = ()
+    odometer: tuple[Reason, ...] | None = None

@@ -26,7 +26,7 @@ from odocal_ros.pipeline.no_force import upright
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.slow_slip import held
 from odocal_ros.pipeline.two_point_run import two_point
-from odocal_ros.reasons import Code, Reason
+from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.screen import Inputs
 
 
@@ -87,16 +87,24 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
 
 
 def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
-    """Return what methods found of the data, each said once, the delays by the best of them."""
+    """
+    Return what methods found of the data, each said once.
+
+    Delays are by the best method that sees them, what the odometer does beside the Imu by the best
+    that looked and is not rejected, else by the first.
+    """
     found: list[Reason] = []
     notes: list[Reason] = []
-    for name in METHODS:
-        if name in runs:
-            found += runs[name].found
-            delays, scale = runs[name].delays, runs[name].result.estimates['scale_factor'].value
-            if delays is not None and scale is not None:
-                notes = delay_notes(prepared, delays, scale)
-    return found + notes
+    odometer: tuple[Reason, ...] | None = None
+    for run in (runs[name] for name in METHODS if name in runs):
+        found += run.found
+        scale = run.result.estimates['scale_factor'].value
+        if run.delays is not None and scale is not None:
+            notes = delay_notes(prepared, run.delays, scale)
+        sound = odometer is None or run.result.verdict is not Verdict.REJECTED
+        if run.odometer is not None and sound:
+            odometer = run.odometer
+    return [*found, *(odometer or ()), *notes]
 
 
 def _doubted(run: MethodRun, prepared: PreparedLeg, slips: WheelSlips) -> MethodRun:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.smoother import smooth, smoother_leg
 from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.data.arrays import Floats
@@ -25,6 +26,7 @@ from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.slip_check import slip_check
 from odocal_ros.pipeline.tracks import as_configured
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -59,8 +61,11 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     track = dead_reckon(t, q_nb, replace(travel, t=travel.t - late['odometer']))
     lever_b, f = _lever(method.estimates, ready.config), method.details['f']
     before = ready.path(as_configured(ready, f, method.estimates), dead_reckon(t, q_nb, travel))
+    # of a speed in coarse steps the fit uses the steps alone: slip it sees by this track only
+    odometer = slip_reasons(slip_check(ready, track, f, (0.0, ready.t_fit)),
+                            ready.config.odometer.time_offset) if leg.by_steps else ()
     return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
-                     delays=seen)
+                     delays=seen, odometer=odometer)
 
 
 def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:

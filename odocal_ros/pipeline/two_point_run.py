@@ -27,7 +27,7 @@ from odocal_ros.calib.drive import white_noise
 from odocal_ros.calib.judge import judge
 from odocal_ros.calib.marks import MarkFix
 from odocal_ros.calib.reversal import against_travel, pieces
-from odocal_ros.calib.slip import find_slips, rounding, slip_reason, SPIN_WINDOW
+from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.slow_errors import marks_no_better
 from odocal_ros.calib.two_point import (
     Chord,
@@ -39,6 +39,7 @@ from odocal_ros.calib.two_point import (
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.pipeline.method_run import MethodRun, Passed, Paths
 from odocal_ros.pipeline.prepared import PreparedLeg
+from odocal_ros.pipeline.slip_check import slip_check
 from odocal_ros.pipeline.tracks import as_configured, near
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.facing import toward
@@ -63,6 +64,7 @@ class TwoPointRun:
         self.config, self.track = ready.config, ready.track
         self.reasons: list[Reason] = []     # of the method
         self.found: list[Reason] = []       # of the data
+        self.slip: tuple[Reason, ...] = ()
 
     def result(self) -> MethodRun:
         """Return the method's result and the path."""
@@ -87,21 +89,18 @@ class TwoPointRun:
             method.estimates, self.ready.nominal, self.config)))
         f = method.details['f']
         paths = Paths(*map(self.ready.path, (as_configured(self.ready, f, method.estimates), f)))
-        return MethodRun(method, paths, tuple(self.found))
+        return MethodRun(method, paths, tuple(self.found), odometer=self.slip)
 
     def _slips(self, chord: Chord, f: Floats) -> tuple[Floats, Floats]:
         """Return slips of the mean between the marks, s and m; name those not named already."""
         if not self.inputs.felt:
             return np.empty(0), np.empty(0)
-        t, size = find_slips(self.inputs.t_imu, self.inputs.f_b, self.track,
-                             toward(self.ready.facing, f), self.ready.origin.latitude,
-                             rounding(self.inputs.travel))
+        ends = chord.start.t, chord.end.t
+        slips = slip_check(self.ready, self.track, toward(self.ready.facing, f), ends)
+        self.slip = slip_reasons(slips, self.config.odometer.time_offset)
         one = self.ready.wheel_slips      # of one wheel: half of it goes into the mean
-        known = (np.abs(t[:, None] - one.t) < SPIN_WINDOW).any(axis=1)
-        held = (t >= chord.start.t) & (t <= chord.end.t) & ~known
-        self.found += slip_reason(t[held], size[held])
-        inside = (one.t >= chord.start.t) & (one.t <= chord.end.t)
-        return np.append(t[held], one.t[inside]), np.append(size[held], one.size[inside] / 2)
+        inside = (one.t >= ends[0]) & (one.t <= ends[1])
+        return np.append(slips.t, one.t[inside]), np.append(slips.size, one.size[inside] / 2)
 
     def _chord(self) -> Chord | None:
         """Return the chord between the marks, or None and say why."""

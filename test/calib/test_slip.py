@@ -26,12 +26,16 @@ from odocal_ros.sim.scenarios import SimOptions, simulate
 LOW = {'imu_rate': 50.0, 'odometer_rate': 20.0}
 
 
-def result(**options):
+def made(**options):
     drive = simulate(SimOptions(**LOW | options))
-    config = with_settings(Config(), {
+    return drive, with_settings(Config(), {
         'method': 'two_point',
         'odometer.nominal_scale': drive.options.nominal_scale,
         'imu.grade': drive.options.imu_grade})
+
+
+def result(**options):
+    drive, config = made(**options)
     return drive, calibrate(drive.leg(), config)
 
 
@@ -61,6 +65,38 @@ def test_no_slip_is_seen_where_there_is_none(options):
     assert not slips(result(**options)[1])
 
 
+def held_up(leg, seconds, how):
+    """Return a leg whose speeds come late, or low-passed with that time constant."""
+    sent = leg.odometer
+    if how == 'late':
+        return replace(leg, odometer=replace(sent, stamp_ns=sent.stamp_ns + round(seconds * 1e9)))
+    t, value = sent.stamp_ns * 1e-9, sent.value.copy()
+    for k in range(1, len(value)):
+        value[k] = value[k - 1] + (value[k] - value[k - 1]) * -np.expm1(
+            (t[k - 1] - t[k]) / seconds)
+    return replace(leg, odometer=replace(sent, value=value))
+
+
+@pytest.mark.parametrize('how', ['late', 'low pass'])
+def test_a_late_or_filtered_odometer_is_named_and_no_slip(how):
+    drive, config = made(scenario='town', odometer='speed', seed=3, duration=300.0)
+    leg = calibrate(held_up(drive.leg(), 0.4, how), config)
+    assert not slips(leg)
+    (text,) = (r.text for r in leg.reasons if r.code is Code.DELAY_SEEN)
+    # to the grid of 0.05 s, for a filter to the second order of its time
+    assert float(text.split('about ')[1].split(' s')[0]) == pytest.approx(0.4, abs=0.06)
+    assert 'odometer.time_offset = -0.' in text
+
+
+@pytest.mark.parametrize('how', ['late', 'low pass'])
+def test_spins_are_found_of_a_late_or_filtered_odometer(how):
+    drive, config = made(scenario='straight', odometer='speed', slip_events=30.0, slip_size=1.0,
+                         seed=2)
+    (sound,), (reason,) = (slips(calibrate(leg, config)) for leg in (
+        drive.leg(), held_up(drive.leg(), 0.4, how)))
+    assert reason.text.split(' place')[0] == sound.text.split(' place')[0]
+
+
 def test_a_source_of_slip_adds_spins_rather_than_averaging_them():
     _, leg = result(scenario='straight', slip_events=30.0, slip_size=1.0)
     slip = next(s for s in leg.methods['two_point'].sources if s.name == 'wheel_slip')
@@ -80,6 +116,7 @@ def test_a_bend_to_and_fro_is_no_slip(slip, bends):
     spun = slip * np.clip(t - 31.5, 0.0, 1.0)
     f_b = np.stack([0 * t, speed * rate, 0 * t + gravity(0.8, 0.0)], -1)
     track = Track(t, q_nb, speed * t + spun, np.zeros((len(t), 3, 3)))
-    when, size = find_slips(t, f_b, track, np.array([np.cos(off), np.sin(off), 0.0]), 0.8, 0.01)
-    assert len(when) == (slip > 0)
-    assert size.sum() == pytest.approx(slip, abs=0.2)
+    found = find_slips(t, f_b, track, np.array([np.cos(off), np.sin(off), 0.0]), 0.8, 0.01)
+    assert len(found.t) == (slip > 0)
+    assert found.size.sum() == pytest.approx(slip, abs=0.2)
+    assert found.late == 0.0

@@ -1,0 +1,149 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Slip alarms: how often WHEEL_SLIP is said of wheels that hold, and of wheels that spin by 0.5 m.
+
+    python benchmarks/slip_alarms.py [--drives 15] [--only RUN] [--duration 300] [--jobs 1]
+                                     [--file F]
+
+Vehicles are those of the zoo (docs/zoo.md) without any of its effects, kinds and grades by turns,
+towns where wheels slip or the odometer is in steps; ``zoo``: with all effects but slip, tyres and
+vibration. What is put into the odometer stands in RUNS: lateness, a first-order low pass, steps of
+whole km/h at 2 Hz, spins. Drive k of run e has seed 83_000_000 + 1_000_000 e + k, fixed before the
+first run. Rows go to the file line by line: an interrupted run goes on where it stopped.
+
+Printed by run: in how many drives WHEEL_SLIP is said, DELAY_SEEN, and the verdicts.
+"""
+
+import argparse
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import sys
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from alarms import CHEAP, shifted
+import numpy as np
+from resumed import read_rows
+from zoo import configured, GRADES, KINDS
+
+FIRST_SEED, SEEDS_A_RUN = 83_000_000, 1_000_000
+SPEED = {'odometer': 'speed', 'scale': 1.01}
+SPINS = {'slip_events': 60.0, 'slip_size': 0.5}
+NOT_OF_ZOO = {'slip', 'speed_law', 'warming', 'vibration', 'coarse_pulses', 'coarse_speed'}
+
+
+def late(leg, seconds):
+    """Return a leg whose odometer is stamped late."""
+    return replace(leg, odometer=shifted(leg.odometer, seconds))
+
+
+def low_passed(leg, seconds):
+    """Return a leg whose odometer, counts or speeds, is low-passed with that time constant."""
+    t, value = leg.odometer.stamp_ns * 1e-9, leg.odometer.value
+    out = value.astype(float)
+    share = -np.expm1(-np.diff(t) / seconds)
+    for k in range(1, len(out)):
+        out[k] = out[k - 1] + (out[k] - out[k - 1]) * share[k - 1]
+    out = np.floor(out) if value.dtype.kind == 'i' else out
+    return replace(leg, odometer=replace(leg.odometer, value=out.astype(value.dtype)))
+
+
+def whole_kmh(leg):
+    """Return a leg whose speeds are truncated to whole km/h and sent twice a second."""
+    rows = slice(None, None, max(1, round(0.5 / np.median(np.diff(
+        leg.odometer.stamp_ns * 1e-9)))))
+    sent = leg.odometer
+    return replace(leg, odometer=replace(
+        sent, stamp_ns=sent.stamp_ns[rows], received_ns=sent.received_ns[rows],
+        value=np.trunc(sent.value[rows] * 3.6) / 3.6))
+
+
+# run: (SimOptions, change of the leg, kinds by turns)
+RUNS = {
+    'plain': ({}, None, KINDS),
+    'zoo': ({}, None, KINDS),
+    'late 0.3 s': ({}, lambda leg: late(leg, 0.3), KINDS),
+    'low pass 0.4 s': ({}, lambda leg: low_passed(leg, 0.4), KINDS),
+    'km/h at 2 Hz': (SPEED, whole_kmh, ('town', 'motorway')),
+    'low pass, km/h at 2 Hz': (SPEED, lambda leg: whole_kmh(low_passed(leg, 0.4)), ('town',)),
+    'spins 0.5 m': (SPINS, None, ('town',)),
+    'spins 0.5 m, late 0.3 s': (SPINS, lambda leg: late(leg, 0.3), ('town',)),
+    'spins 0.5 m, low pass 0.4 s': (SPINS, lambda leg: low_passed(leg, 0.4), ('town',)),
+    'spins 3 m, km/h at 2 Hz': (SPEED | SPINS | {'slip_size': 3.0}, whole_kmh, ('town',)),
+}
+
+
+def run_drive(seed, duration):
+    """Draw, drive, calibrate; return a row."""
+    from odocal_ros.pipeline.calibrate import calibrate, combine
+    from odocal_ros.sim.draw import drawn, EFFECTS
+    from odocal_ros.sim.scenarios import simulate
+    e, k = divmod(seed - FIRST_SEED, SEEDS_A_RUN)
+    run = list(RUNS)[e]
+    options, change, kinds = RUNS[run]
+    effects = tuple(n for n in EFFECTS if n not in NOT_OF_ZOO) if run == 'zoo' else ()
+    kind, grade = kinds[k % len(kinds)], GRADES[k % len(GRADES)]
+    made, _ = drawn(seed, kind, grade, effects, **(CHEAP | {'duration': duration} | options))
+    drive = simulate(made)
+    config = configured(drive)
+    leg = drive.leg() if change is None else change(drive.leg())
+    calibration = combine([calibrate(leg, config)], config)
+    return {'seed': seed, 'run': run, 'kind': kind, 'grade': grade, 'asked': duration,
+            'verdict': calibration.verdict.value,
+            'codes': sorted({r.code.name for r in calibration.reasons}),
+            'slip': [r.text for r in calibration.reasons if r.code.name == 'WHEEL_SLIP']}
+
+
+def table(rows):
+    """Print how often slip is said, by run."""
+    print(f'{"":30}{"drives":>7}{"WHEEL_SLIP":>12}{"DELAY_SEEN":>12}  verdicts')
+    for run in RUNS:
+        own = [row for row in rows if row['run'] == run]
+        if own:
+            slip, delay = (sum(code in row['codes'] for row in own)
+                           for code in ('WHEEL_SLIP', 'DELAY_SEEN'))
+            print(f'{run:30}{len(own):7}{slip:12}{delay:12}  '
+                  f'{dict(Counter(row["verdict"] for row in own))}')
+
+
+def main():
+    """Run what the file does not hold yet, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=15, help='of each run')
+    parser.add_argument('--only', choices=RUNS, action='append', default=[], metavar='RUN')
+    parser.add_argument('--duration', type=float, default=300.0, help='s of a drive')
+    parser.add_argument('--jobs', type=int, default=1, help='processes')
+    parser.add_argument('--file', type=Path, default=Path('/tmp/slip_alarms.jsonl'))
+    args = parser.parse_args()
+    have = {seed: row for seed, row in read_rows(args.file).items()
+            if row['asked'] == args.duration}
+    # by turns, so that what is there after an interruption is of all runs
+    seeds = [FIRST_SEED + SEEDS_A_RUN * list(RUNS).index(run) + k for k in range(args.drives)
+             for run in args.only or RUNS]
+    missing = [seed for seed in seeds if seed not in have]
+    with ProcessPoolExecutor(args.jobs) as pool, args.file.open('a') as out:
+        done = pool.map(run_drive, missing, [args.duration] * len(missing))
+        for n, row in enumerate(done, 1):
+            out.write(json.dumps(row) + '\n')
+            out.flush()
+            have[row['seed']] = row
+            print(f'\r{n} of {len(missing)}', end='', file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    table([have[seed] for seed in seeds])
+
+
+if __name__ == '__main__':
+    main()
