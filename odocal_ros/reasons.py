@@ -63,6 +63,8 @@ class Code(Enum):
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
     SPEED_COARSE = NOTE, ('Take wheel pulses or a finer speed signal of the same bus, if there is '
                           'one; the smoother hears when the steps change and can do without.')
+    SPEED_FILTERED = CAUTION, ('Take wheel pulses or an unfiltered speed signal of the same bus; '
+                               'the smoother allows for a delay, not for a filter.')
     COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
                             'farther: a count weighs less the longer the way.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '

@@ -86,6 +86,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'they are half a step too low on the mean, rounded they are not, and the steps do not say '
         'which. The smoother uses the moments at which the speed passes from one step to the '
         'next, and finds which; the sigma of the other methods holds half a step.',
+        Code.SPEED_FILTERED: 'Over intervals of a second the odometer departs from the vehicle as '
+        'its acceleration changes, which a low-pass filter of the speed does and wheel slip does '
+        'not. Many speed signals of cars are filtered over 0.2 to 0.5 s. Slip is what is left.',
         Code.COUNTER_COARSE: 'There are few counts a metre, so that the way is known to a count '
         'at each moment. Over a long drive that is little, and the sigma holds it; what happens '
         'within a few metres, such as a short slip, does not show.',

@@ -88,6 +88,47 @@ def test_a_level_that_no_row_determines_is_not_reported():
     assert not said(method)
 
 
+def low_passed(leg, seconds):
+    """Return a leg whose counter follows the wheel with that time constant."""
+    t, s = leg.travel.t, leg.travel.s.copy()
+    for k in range(1, len(s)):
+        s[k] = s[k - 1] + (s[k] - s[k - 1]) * -np.expm1((t[k - 1] - t[k]) / seconds)
+    return replace(leg, travel=Travel(t, np.floor(s), leg.travel.quantum))
+
+
+def filtered(method):
+    return [r.text for r in method.reasons if r.code is Code.SPEED_FILTERED]
+
+
+@pytest.mark.parametrize('noise', ['white', 'rtk'])
+def test_a_low_pass_filter_is_named_and_no_slip(noise):
+    _, config, leg = made(**SHORT, fix_noise=noise)
+    method = smooth(low_passed(leg, 0.4), config)
+    (text,) = filtered(method)
+    # the fit's delay and noise take some of it
+    assert float(text.split('about ')[1].split(' s')[0]) == pytest.approx(0.4, abs=0.04)
+    assert not said(method)
+    assert not method.details['slips']
+
+
+def test_slip_of_a_filtered_odometer_is_said():
+    drive, config, leg = made(**SHORT)
+    slipped, pulses = slipping(leg, 100.0, 3.0, 0.2)
+    method = smooth(low_passed(slipped, 0.4), config)
+    assert filtered(method)
+    first = method.details['slips'][0]
+    assert first['metres'] == pytest.approx(pulses * drive.truth.scale, rel=0.3)
+    assert 98.0 <= first['t'] <= 103.0
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'odometer_delay': 0.3}, {'start_slip': 0.005}, {'start_slip': 0.005, 'fix_noise': 'rtk'},
+    {'scale': 0.3, 'nominal_scale': 0.3}, {'odometer': 'speed', 'speed_noise': 0.05}], ids=str)
+def test_what_is_not_filtered_is_not_said_to_be(options):
+    _, config, leg = made(**SHORT, **options)
+    assert not filtered(smooth(leg, config))
+
+
 def test_names_of_parameters_in_words():
     arm = [f'antenna_lever_arm_{axis}' for axis in 'xyz']
     assert in_words(arm) == 'the antenna lever arm'

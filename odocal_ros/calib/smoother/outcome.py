@@ -20,7 +20,9 @@ from odocal_ros.calib.judge import judge
 from odocal_ros.calib.mounting import FAR_YAW
 from odocal_ros.calib.result import Estimate, MethodResult, Source
 from odocal_ros.calib.smoother.border import border_of
+from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.filtered import filter_reasons, speed_filter
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.left_over import bias_sigmas, correlation, left_over, normalised
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -30,7 +32,14 @@ from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, MODEL_FLOOR, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed
-from odocal_ros.calib.smoother.slip import find_slips, slip_reasons, SLIP_VARIANCE
+from odocal_ros.calib.smoother.slip import (
+    along,
+    find_slips,
+    left_when_changing,
+    Slip,
+    slip_reasons,
+    SLIP_VARIANCE,
+)
 from odocal_ros.calib.smoother.state import (
     BG,
     CONSTANTS,
@@ -89,9 +98,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     near = fit.neighbours()
     widen, reasons = mismatch(problem, fit, config)
     count = leg.travel.quantum * fit.state.scale
-    # of a coarse speed only its steps are used: its way along shows no slip
-    slips = () if leg.by_steps else find_slips(fit, near, count)
-    reasons += [] if leg.by_steps else slip_reasons(fit, near, slips, count)
+    slips, along_reasons = _odometer(leg, fit, near, count)
+    reasons += along_reasons
     state, c = fit.state, fit.state.constants
     covariance = floored(fit.solved.covariance * widen**2)
     sigma = np.sqrt(np.diag(covariance))
@@ -123,6 +131,19 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                            'beside': beside(c, covariance, problem.grade),
                            'level_pitch_angle': level_pitch(fit, near, widen)},
                         border_of(fit, configured(leg)).widened(widen))
+
+
+def _odometer(leg: SmootherLeg, fit: Fit, near: Neighbours,
+              count: float) -> tuple[tuple[Slip, ...], list[Reason]]:
+    """Return the slips, and what is said of the odometer: a filter of its speed before slip."""
+    if leg.by_steps:    # of a coarse speed only its steps are used: its way along shows no slip
+        return (), []
+    turned = along(fit, near)
+    low_pass = speed_filter(fit, turned)
+    rest = turned if low_pass is None else low_pass.taken_from(turned)
+    slips = find_slips(fit, rest, count)
+    return slips, [*filter_reasons(low_pass), *slip_reasons(
+        fit, near, slips, count, left_when_changing(fit, turned, rest))]
 
 
 def floored(covariance: Floats) -> Floats:

@@ -16,6 +16,7 @@ import numpy as np
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.motion_rows import MotionRows
+from odocal_ros.calib.smoother.noise import ROAD
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
@@ -23,6 +24,7 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 # factor on the variance of an interval from which it is a slip. Statistical: it lies 3.7 sigmas
 # off, once in 4200 by chance
 SLIP_VARIANCE = 1.5
+ROAD_NAMES = tuple(ROAD)
 # rows that a level must be worth to be reported. Statistical: its root, with a sigma of
 # root / sqrt(2 rows), then lies REMARK_SIGMAS above zero
 LEVEL_ROWS = REMARK_SIGMAS**2 / 2
@@ -45,9 +47,20 @@ def along(fit: Fit, neighbours: Neighbours) -> Floats:
     return out
 
 
-def find_slips(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> tuple[Slip, ...]:
-    """Return the runs that lie far out along, by more than a count, m; largest first."""
-    turned, t = along(fit, neighbours), fit.state.t
+def left_when_changing(fit: Fit, turned: Floats, rest: Floats) -> float:
+    """Return the share of the rms of ``turned`` that ``rest`` is where speeds change, (K,) m."""
+    hard = fit.weighted[MotionRows].noise.road[:, ROAD_NAMES.index('along_hard')] > 0
+    power = float((turned[hard]**2).sum())
+    return float(np.sqrt((rest[hard]**2).sum() / power)) if power else 1.0
+
+
+def find_slips(fit: Fit, turned: Floats, count: float = 0.0) -> tuple[Slip, ...]:
+    """
+    Return the runs that lie far out along, by more than a count, m; largest first.
+
+    turned : (K,) m, as ``along`` has it, without what a filter of the speed does.
+    """
+    t = fit.state.t
     noise, worth = 4 * float(np.sqrt(fit.levels['along'])), 0.05    # sigmas of a second; m
     least = max(worth, noise, count)
     far = np.flatnonzero((fit.spread[:, 0] > SLIP_VARIANCE) | (np.abs(turned) > least))
@@ -61,14 +74,16 @@ def find_slips(fit: Fit, neighbours: Neighbours, count: float = 0.0) -> tuple[Sl
                         key=lambda s: -abs(s.metres)))
 
 
-def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...],
-                 count: float = 0.0) -> list[Reason]:
+def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...], count: float = 0.0,
+                 left: float = 1.0) -> list[Reason]:
     """
     Return WHEEL_SLIP with where the wheels slipped and how much, empty where they did not.
 
     One by one, or whenever the speed changes: by a level, where the drive determines it.
+    left : of the ways when the speed changes, without what a filter of the speed does.
     """
     level = fit.levels.roots()
+    level['along_hard'] *= left
     # two readings differ by that whatever the wheel does, over the 10 s that a spell of it lasts
     rounding = count * np.sqrt(2 / 12) / np.sqrt(10.0)
     # one that no row determines stays where the fit began
