@@ -8,7 +8,7 @@
 # the License.
 
 """
-Monte Carlo of the wheels' method, to see whether its stated sigmas hold.
+Monte Carlo of drives with two wheels, to see whether the stated sigmas hold.
 
     python benchmarks/wheels_monte_carlo.py [--drives 200] [--processes 1] [--cell TEXT] [--file F]
 
@@ -17,11 +17,12 @@ wheels (the Imu sends 50 Hz, the wheels 20, fixes 5), errors drawn anew from wha
 believe: gyro and accelerometer biases, walks and noise, the gyro's scale (by its grade), fixes,
 where the encoders' discs stand, latency of the fixes (50 ms), of the odometer (10 ms), the
 antenna's place (0.1 m), and the track width where one is given (2 %); routes of the town are drawn
-too. Printed for the scale of the mean, of each wheel, for the heading error (of alignment and
-mounting together) and the track width: mean error, RMS error, RMS of error / stated sigma, share
-within 1.96 sigmas. Goal at N = 2000: ratio 0.93 to 1.07, share 93.5 to 96.5 % (its own noise there
-is 1.6 % and 0.5 %, 1 sigma). Drive k of cell c has seed 40_000_000 + 100_000 c + k, fixed before
-the first run. Results go to the file line by line: an interrupted run goes on where it stopped.
+too. The whole pipeline runs, as for a recording. Printed for the scale of the mean, of each wheel,
+for the ratio of right to left, the yaw mounting angle and the track width: mean error, RMS error,
+median stated sigma, RMS of error / stated sigma, share within 1.96 sigmas. Goal at N = 2000: ratio
+0.93 to 1.07, share 93.5 to 96.5 % (its own noise there is 1.6 % and 0.5 %, 1 sigma). Drive k of
+cell c has seed 40_000_000 + 100_000 c + k, fixed before the first run. Results go to the file line
+by line: an interrupted run goes on where it stopped.
 """
 
 import argparse
@@ -34,8 +35,6 @@ import sys
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'calib'))
-
 import numpy as np
 from resumed import read_rows
 
@@ -63,9 +62,7 @@ GOAL_RATIO, GOAL_SHARE = (0.93, 1.07), (93.5, 96.5)
 
 def drive(number: int, k: int) -> dict:
     """Calibrate one drive; return errors and stated sigmas (scales: relative; rad; m)."""
-    from wheel_legs import true_heading_error, wheel_leg
-
-    from odocal_ros.calib.wheels.result import fit_wheels
+    from odocal_ros.pipeline.calibrate import calibrate
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.settings.grades import GRADES
     from odocal_ros.sim.noise import stream
@@ -80,14 +77,14 @@ def drive(number: int, k: int) -> dict:
         seed=seed, fix_delay=float(LATENCY * draw[0]), odometer_delay=float(
             LATE_ODOMETER * draw[1]), antenna_lever_arm=tuple(map(float, ARM * draw[2:5])),
         gyro_scale_error=float(grade.gyro_scale_error * draw[6]), **options))
-    settings = {'imu.grade': made.options.imu_grade,
+    settings = {'method': 'smoother', 'imu.grade': made.options.imu_grade,
                 'odometer.nominal_scale': float(made.options.nominal_scale)}
     if given:
         settings['odometer.track_width'] = float(made.options.track_width
                                                  * (1 + WIDTH * draw[5]))
-    leg = wheel_leg(made.leg(), with_settings(Config(), settings))
-    method = fit_wheels(leg, with_settings(Config(), settings))
-    truth = {'scale_factor': made.truth.scale, 'heading_error': true_heading_error(made, leg),
+    leg = calibrate(made.leg(), with_settings(Config(), settings))
+    method = leg.methods['smoother']
+    truth = {'scale_factor': made.truth.scale, 'yaw_mounting_angle': made.truth.yaw,
              'scale_factor_left': made.truth.wheel_scales[0],
              'scale_factor_right': made.truth.wheel_scales[1],
              'track_width': made.options.track_width}
@@ -98,6 +95,10 @@ def drive(number: int, k: int) -> dict:
             size = true if name.startswith('scale') else 1.0
             error = math.remainder(e.value - true, 2 * math.pi)
             row |= {name: error / size, f'{name}_sigma': e.sigma / size}
+    left, right = (row.get(f'scale_factor_{side}') for side in ('left', 'right'))
+    if left is not None:
+        row |= {'ratio': (right - left) / (1 + left),
+                'ratio_sigma': 2 * method.details['wheels']['left']['ratio_sigma']}
     return row
 
 
@@ -131,8 +132,8 @@ def main() -> None:
                 print(f'\r{name}: {min(done * BLOCK, len(missing))} of {len(missing)}',
                       end='', file=sys.stderr, flush=True)
             print(file=sys.stderr)
-    print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"RMS/sigma":>11}'
-          f'{"within 95 %":>13}')
+    print(f'{"cell":34}{"of":>6} {"":15}{"mean error":>11}{"RMS":>10}{"sigma":>10}'
+          f'{"RMS/sigma":>11}{"within 95 %":>13}')
     for number in wanted:
         first = FIRST_SEED + SEEDS_A_CELL * number
         print_cell(list(CELLS)[number],
@@ -144,18 +145,21 @@ def print_cell(name, rows) -> None:
     for label, key, unit in (('scale, ppm', 'scale_factor', 1e6),
                              ('left, ppm', 'scale_factor_left', 1e6),
                              ('right, ppm', 'scale_factor_right', 1e6),
-                             ('heading, mdeg', 'heading_error', 1e3 * math.degrees(1.0)),
+                             ('ratio, ppm', 'ratio', 1e6),
+                             ('yaw, mdeg', 'yaw_mounting_angle', 1e3 * math.degrees(1.0)),
                              ('width, mm', 'track_width', 1e3)):
         have = [r for r in rows if key in r]
         if not have:
             continue
         error = np.array([r[key] for r in have])
-        z = error / np.array([r[f'{key}_sigma'] for r in have])
+        sigma = np.array([r[f'{key}_sigma'] for r in have])
+        z = error / sigma
         ratio, share = math.sqrt((z**2).mean()), 100 * (np.abs(z) <= 1.96).mean()
         good = (GOAL_RATIO[0] <= ratio <= GOAL_RATIO[1]
                 and GOAL_SHARE[0] <= share <= GOAL_SHARE[1])
         print(f'{name:34}{len(have):6d} {label:15}{error.mean() * unit:+11.3f}'
-              f'{math.sqrt((error**2).mean()) * unit:10.3f}{ratio:11.3f}{share:13.2f}'
+              f'{math.sqrt((error**2).mean()) * unit:10.3f}{np.median(sigma) * unit:10.3f}'
+              f'{ratio:11.3f}{share:13.2f}'
               f'{"" if good else "  <-"}')
         name = ''
 

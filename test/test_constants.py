@@ -24,7 +24,7 @@ PACKAGE = Path(odocal_ros.__file__).parent
 ROOMS = ('data', 'nav', 'screening', 'settings', 'calib', 'pipeline', 'planning', 'foresee',
          'apply', 'live')
 # where a vector's unknowns lie: two vectors may hold the same quantity
-LAYOUTS = ('calib/smoother/state.py', 'calib/wheels/model.py', 'apply/errors.py')
+LAYOUTS = ('calib/smoother/state.py', 'apply/errors.py')
 
 
 # '# s, judgement: ...', '# statistical: ...', 'a sentence. Physical'; what is tuned says by what

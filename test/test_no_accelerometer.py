@@ -41,7 +41,7 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
     result = calibrate(leg, config)
     calibration = combine([result], config)
     scale = calibration.estimates['scale_factor']
-    assert scale.method == 'wheels'
+    assert scale.method == 'smoother'
     # 240 ppm of fixes of 1.5 m, 500 ppm of hills unseen
     assert abs(scale.value - made.truth.scale) < 3 * scale.sigma < 0.003 * made.truth.scale
     assert all(calibration.estimates[name].value is None for name in ANGLES)
@@ -50,7 +50,11 @@ def test_one_counter_gives_the_scale_within_its_sigma(how):
     assert 'need an accelerometer' in said[Code.NO_ACCELEROMETER]
     assert calibration.verdict is Verdict.CAUTION
     # nothing that only an accelerometer sees is made up
-    assert not {Code.WHEEL_SLIP, Code.REVERSING_UNSIGNED, Code.IMU_AXES} & set(said)
+    assert not {Code.WHEEL_SLIP, Code.REVERSING_UNSIGNED, Code.IMU_AXES,
+                Code.IMU_WORSE_THAN_GRADE, Code.MODEL_MISMATCH} & set(said)
+    method = result.methods['smoother']
+    assert 'level_pitch_angle' not in method.details
+    assert not any('housing' in name for name in method.details['beside'])
 
 
 def test_two_wheels_give_both_scales_and_the_track_width():
@@ -67,8 +71,22 @@ def test_two_wheels_give_both_scales_and_the_track_width():
 def test_hills_are_in_the_sigma():
     made = drive(**TOWN)
     config = settings(made, heading_sigma=None, method='auto')
-    sources = {s.name: s for s in calibrate(without_force(made), config).methods['wheels'].sources}
+    method = calibrate(without_force(made), config).methods['smoother']
+    sources = {s.name: s for s in method.sources}
     assert sources['hills'].effects[0, 0] == 5e-4
+
+
+@pytest.mark.parametrize('seed', [2, 4])
+def test_ten_minutes_by_a_gyro_alone_are_solved(seed):
+    """Information on tilt and height is small beside that of the counts: it is not lost."""
+    made = drive(scenario='town', seed=seed, two_wheels=True, duration=600.0)
+    config = settings(made, heading_sigma=None, method='smoother', imu__grade='consumer')
+    method = calibrate(without_force(made), config).methods['smoother']
+    assert Code.NOT_CONVERGED not in {r.code for r in method.reasons}
+    for name, true in zip(('scale_factor', 'scale_factor_left', 'scale_factor_right'),
+                          (made.truth.scale, *made.truth.wheel_scales), strict=True):
+        e = method.estimates[name]
+        assert abs(e.value - true) < 3 * e.sigma
 
 
 def test_a_heading_from_outside_gives_the_yaw_all_the_same():
@@ -77,6 +95,26 @@ def test_a_heading_from_outside_gives_the_yaw_all_the_same():
     found = combine([calibrate(without_force(made), config)], config).estimates
     yaw = found['yaw_mounting_angle']
     assert abs(yaw.value - made.truth.yaw) < 3 * yaw.sigma < 0.02
+
+
+def test_a_leg_without_force_tells_another_no_angle():
+    """Its angles are held as set: they are no observation, however small their sigmas."""
+    one = drive(**TOWN)
+    other = drive(**TOWN, seed=8, start_ns=one.options.start_ns + 10**13)
+    config = settings(one, heading_sigma=None, method='auto')
+    felt, unfelt = calibrate(one.leg(), config), calibrate(without_force(other), config)
+    alone = combine([felt], config).estimates
+    for legs in ([felt, unfelt], [unfelt, felt]):
+        both = combine(legs, config).estimates
+        for name in ANGLES:
+            assert abs(both[name].value - alone[name].value) < alone[name].sigma
+            assert both[name].sigma > 0.5 * alone[name].sigma
+    two = [calibrate(without_force(x), config) for x in (one, other)]
+    found = combine(two, config)
+    assert all(found.estimates[name].value is None for name in ANGLES)
+    scale = found.estimates['scale_factor']
+    assert abs(scale.value - one.truth.scale) < 3 * scale.sigma
+    assert not any('housing' in name for name in found.methods['smoother'].details['beside'])
 
 
 def test_an_imu_that_says_so_in_its_covariance_is_heard():

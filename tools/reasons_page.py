@@ -41,9 +41,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'zero. Without them there is no track.',
         Code.NO_ACCELEROMETER: 'Every acceleration of the Imu is zero, NaN, or said to be none '
         '(`linear_acceleration_covariance[0]` of -1), as of a yaw rate on a bus. The scale comes '
-        'from gyro, counter and fixes by the method wheels, of one counter too, with 0.05 % in '
-        'its sigma for hills that nothing sees; what moves the vehicle is not felt, so yaw and '
-        'pitch mounting angle, slips and reversing are not told.',
+        'from gyro, counter and fixes, with 0.05 % in its sigma for slopes, which are not '
+        'observed. Accelerations are not measured, so yaw and pitch mounting angle, slips and '
+        'reversing are not determined.',
         Code.NO_ODOMETER: 'No usable odometer message lies between the marks: a wrong topic, a '
         'type that is read differently, or a driver that is not running.',
         Code.NO_FIX: 'No position lies between the marks, or none near one of the two marks.',
@@ -70,7 +70,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'be joined at the wrong times.',
         Code.DELAY_SEEN: 'Where the vehicle speeds up and slows down, the stamps of one sensor '
         'were found late or early against the others, by more than three sigmas and by enough to '
-        'matter at the speed driven. Methods wheels and smoother estimate the delay and allow for '
+        'matter at the speed driven. The smoother estimates the delay and allows for '
         'it; other software that joins these sensors does not. Where no method estimates it, an '
         'odometer is named that would look like a slipping wheel only because it is late, or '
         'because its speed is low-pass filtered.',
@@ -180,7 +180,7 @@ MEANINGS: dict[str, dict[Code, str]] = {
     'Left and right wheel': {
         Code.ODOMETER_CHOSEN: 'A message holds several values (joints, or an array) and no '
         'setting says which are the wheels. Joints were chosen by their names; of two values '
-        'whose sides nothing tells the mean is taken, and method wheels is not run.',
+        'of unknown sides the mean is taken, and left and right are not estimated.',
         Code.WHEELS_NOT_SEPARABLE: 'What was driven does not tell the left wheel from the right; '
         'on a straight line only their mean is seen.',
         Code.TRACK_WIDTH_NOT_DETERMINED: 'The distance between the wheels shows in turns only, '

@@ -23,15 +23,12 @@ from odocal_ros.settings.levels import REMARK_SIGMAS
 NAMES = {'scale_factor': 'scale', 'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
 CAUSES = {
     'scale_factor': {
-        'two_point': 'slip or bad fixes at one of the marks',
-        'wheels': 'one wheel that slips or a wrong track width'},
+        'two_point': 'slip or bad fixes at one of the marks'},
     'yaw_mounting_angle': {
         'two_point': 'the heading it was given (alignment.heading_source) is wrong by about as '
-        'much', 'wheels': 'the heading it was given (alignment.heading_source) is wrong by about '
-        'as much'},
+        'much'},
     'pitch_mounting_angle': {
-        'two_point': 'heights at the marks, or an accelerometer bias',
-        'wheels': 'heights of the fixes, or an accelerometer bias'},
+        'two_point': 'heights at the marks, or an accelerometer bias'},
 }
 
 

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping
 from odocal_ros.calib.result import Estimate, LegResult, MethodResult
 from odocal_ros.reasons import Code, Reason, Verdict
 
-ORDER = ('smoother', 'wheels', 'two_point')
+ORDER = ('smoother', 'two_point')
 ALWAYS = 'two_point'     # the operator's own marks: computed and shown whatever is asked
-BY = {'patent': 'wheels'}       # asked for: the method that decides then
+BY = {'patent': 'smoother', 'wheels': 'smoother'}     # asked for: the method that decides then
 # what the smoother refuses end points do not know either: they have but the accelerometer's level
 REFUSED_FOR_ALL = 'smoother', 'pitch_mounting_angle'
 # what a reason speaks of: nothing to say where another method gives it

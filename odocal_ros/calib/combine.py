@@ -81,14 +81,17 @@ def newest(results: Sequence[MethodResult],
     """
     Return what belongs to a leg alone (gyro bias) from the last leg that knows it.
 
-    The heading error is each leg's own at its start: of several there is none.
+    Legs with one counter have no estimates of two wheels. The heading error, which older results
+    hold, is each leg's own at its start: of several there is none.
     """
-    names = [n for n in results[0].estimates if n not in estimates and n != 'scale_ratio']
-    none = {n: Estimate(None, None, results[0].estimates[n].unit) for n in names
-            if n == 'heading_error'}
-    return none | {n: next((r.estimates[n] for r in reversed(results)
-                     if r.estimates[n].value is not None), results[0].estimates[n])
-            for n in names if n not in none}
+    found: dict[str, Estimate] = {}
+    for name, e in (item for r in results for item in r.estimates.items()):
+        if name == 'heading_error':
+            e = Estimate(None, None, e.unit)
+        if name not in estimates and name != 'scale_ratio' and (
+                name not in found or e.value is not None):
+            found[name] = e
+    return found
 
 
 def _details(sources: Sequence[Source], parameters: Sequence[str],

@@ -80,7 +80,7 @@ def ability(config: Config, heard: Heard) -> Ability:
     if not heard.felt:
         told[-1] = False, 'the pitch, since the Imu sends no acceleration'
     if heard.two_wheels:
-        told += _of_two_wheels(config, methods)
+        told += _of_two_wheels(config)
     weak = '' if heard.rested_s >= config.leg.standstill else (
         'level and gyro bias come from the drive itself, since it starts without a standstill')
     return Ability(tuple(text for can, text in told if can),
@@ -101,8 +101,8 @@ def _yaw(config: Config, heard: Heard, methods: Sequence[str]) -> tuple[bool, st
     return True, f'the yaw (by {source}, {sigma:.2g} deg)'
 
 
-def _of_two_wheels(config: Config, methods: Sequence[str]) -> list[tuple[bool, str]]:
-    if 'wheels' not in methods:
+def _of_two_wheels(config: Config) -> list[tuple[bool, str]]:
+    if ALL_SAMPLES not in deciding(config.method):
         return [(False, f'left from right wheel, since method {config.method} takes their mean')]
     width = config.odometer.track_width
     return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)

@@ -12,6 +12,8 @@
 from dataclasses import dataclass, field, replace
 import math
 
+import numpy as np
+
 from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.reasons import Reason
 
@@ -20,6 +22,7 @@ FARTHEST_M = 2e4          # judgement: who must drive on for more needs somethin
 # judgement: standstill at an end that is foreseen and asked for; it levels well and tells the gyro
 # bias
 REST_FORESEEN_S = 10.0
+SOURCE_SHARE = 0.01    # judgement: of the variance; a source of less is not told
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
@@ -201,3 +204,12 @@ def _rounded_up(metres: float) -> int:
 def three_digits(value: float) -> str:
     """Return a number in three digits, never as a power of ten where it is large."""
     return f'{value:.0f}' if value >= 999.5 else f'{value:.3g}'
+
+
+def sources_of(method: MethodResult, parameter: str) -> tuple[tuple[str, float], ...]:
+    """Return the sources of a parameter's error that matter, the largest first."""
+    row = method.parameters.index(parameter)
+    sizes = {s.name: float(np.linalg.norm(s.effects[row])) for s in method.sources}
+    least = SOURCE_SHARE * sum(size**2 for size in sizes.values())
+    return tuple(sorted(((name, size) for name, size in sizes.items() if size**2 > least),
+                        key=lambda source: -source[1]))

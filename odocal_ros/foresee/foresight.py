@@ -32,6 +32,7 @@ from odocal_ros.foresee.forecast import (
     Forecast,
     Prospect,
     REST_FORESEEN_S,
+    sources_of,
 )
 from odocal_ros.foresee.leg_so_far import screened_in_cells
 from odocal_ros.foresee.smoother_forecast import (
@@ -42,10 +43,10 @@ from odocal_ros.foresee.smoother_forecast import (
     PITCH,
     SCALE,
     with_running,
+    without_force,
     YAW,
 )
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
-from odocal_ros.foresee.wheels_so_far import sources_of, with_wheels
 from odocal_ros.planning.drive import PlannedDrive, REST_SPEED
 from odocal_ros.planning.leg_profile import fix_figures, profile_of
 from odocal_ros.planning.predict import metres_to_go, predict, Prediction, Sigmas
@@ -111,12 +112,14 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
         forecast = nothing_foreseen(config)
     else:
         forecast = _by_ends(leg, fix_rate, config, wanted)
-        if smoother is not None and 'smoother' in deciding(config.method) and felt(leg.imu.f_i):
-            forecast = replace(forecast, scale=_open_yet(forecast.scale),
-                               yaw=_open_yet(forecast.yaw))
+        if smoother is not None and 'smoother' in deciding(config.method):
+            forecast = replace(forecast, scale=_open_yet(forecast.scale))
+            if felt(leg.imu.f_i):
+                forecast = replace(forecast, yaw=_open_yet(forecast.yaw))
+    if not felt(leg.imu.f_i):
+        forecast = without_force(forecast)
     if not wanted():
         raise Abandoned
-    forecast = with_wheels(forecast, leg, config)
     if running is not None:
         forecast = with_running(forecast, running, config)
     estimates, _ = choose(forecast.methods, config.method)

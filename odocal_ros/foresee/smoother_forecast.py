@@ -13,13 +13,21 @@ from collections.abc import Callable
 from dataclasses import replace
 import math
 
+import numpy as np
+
 from odocal_ros.calib.budget import PARAMETERS
 from odocal_ros.calib.choice import ABOUT, choose, deciding
+from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.data.leg import Leg
 from odocal_ros.errors import OdocalError
-from odocal_ros.foresee.forecast import FARTHEST_M, Forecast, Prospect
+from odocal_ros.foresee.forecast import (
+    FARTHEST_M,
+    Forecast,
+    Prospect,
+    sources_of,
+    WheelsForecast,
+)
 from odocal_ros.foresee.smoother_so_far import Running, SmootherSoFar
-from odocal_ros.foresee.wheels_so_far import sources_of
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config
 
@@ -68,6 +76,14 @@ def nothing_foreseen(config: Config) -> Forecast:
                     Prospect(None, config.verdict.max_yaw_sigma, None))
 
 
+def without_force(forecast: Forecast) -> Forecast:
+    """Return a forecast without what only an accelerometer determines."""
+    yaw = forecast.yaw
+    if yaw.sigma is None and not yaw.why:
+        yaw = replace(yaw, why='not determined without an accelerometer or an outside heading')
+    return replace(forecast, yaw=yaw, pitch=None)
+
+
 def with_running(forecast: Forecast, running: Running, config: Config) -> Forecast:
     """Return an forecast with a running estimate, where the result will be by it."""
     method = running.method
@@ -82,11 +98,25 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
     scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
     if by.get(SCALE) == 'smoother' or scale.sigma is None:
         scale = _scale(running, scale.asked)
-    if by.get(YAW) == 'smoother' or yaw.sigma is None:
+    told = np.isfinite(running.sigmas)      # no angle without an accelerometer
+    if told[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
         yaw = _yaw(running, yaw.asked)
-    if by.get(PITCH) == 'smoother' or pitch is None:
+    if told[2] and (by.get(PITCH) == 'smoother' or pitch is None):
         pitch = float(running.sigmas[2])
-    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch)
+    return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=_wheels(method))
+
+
+def _wheels(method: MethodResult) -> WheelsForecast | None:
+    """Return what the running estimate tells of two wheels, None of one counter."""
+    if 'track_width' not in method.estimates:
+        return None
+    left, right, width = (_relative(method.estimates[name]) for name in (
+        'scale_factor_left', 'scale_factor_right', 'track_width'))
+    return WheelsForecast(None if left is None or right is None else max(left, right), width)
+
+
+def _relative(e: Estimate) -> float | None:
+    return None if e.value is None or e.sigma is None else e.sigma / abs(e.value)
 
 
 def _scale(running: Running, asked: float) -> Prospect:

@@ -104,8 +104,6 @@ class SmootherSoFar:
         inputs = seen.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
             raise BadData('the smoother needs samples of the Imu and of the odometer')
-        if not inputs.felt:
-            raise BadData('the smoother needs an accelerometer')
         few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)

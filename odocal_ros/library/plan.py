@@ -21,7 +21,7 @@ from odocal_ros.library import planned_drives
 from odocal_ros.library.asked import config_of, Settings
 from odocal_ros.library.what_helps import Change, changes, SCALE, YAW
 from odocal_ros.planning.drive import PlannedDrive
-from odocal_ros.planning.methods import NOT_PREDICTED, Plan, plan_methods
+from odocal_ros.planning.methods import Plan, plan_methods
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.reasons import Reason, Verdict
 
@@ -81,7 +81,6 @@ class Planned:
                 'reasons': [r.as_dict() for r in plan.reasons_of(name)],
                 'budget': method.details.get('budget', {})}
                 for name, method in plan.methods.items()},
-            'methods_not_predicted': list(NOT_PREDICTED),
             'changes': [{'text': c.text, 'scale_factor': c.scale, 'yaw_mounting_angle': c.yaw}
                         for c in self.helps]}
 

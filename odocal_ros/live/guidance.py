@@ -94,7 +94,7 @@ def manoeuvres(now: SessionView) -> list[str]:
     wants, least = [], now.session.config.leg.min_speed
     if now.max_speed < least:
         wants.append(f'{DRIVE}faster than {least:.3g} m/s ({KMH * least:.0f} km/h)')
-    if now.two_wheels and 'wheels' in deciding(now.session.config.method):
+    if now.two_wheels and 'smoother' in deciding(now.session.config.method):
         wants += _of_two_wheels(now)
     return wants + (now.forecast.lacks if now.forecast else [])
 

@@ -61,7 +61,6 @@ def driven(fix_noise: str, seed: int) -> 'PlanarLeg':
     from odocal_ros.patent.embodiment import FOUND, RADIUS
     from odocal_ros.pipeline.patent_run import planar_of
     from odocal_ros.pipeline.prepare import prepare
-    from odocal_ros.pipeline.wheels_run import wheel_leg
     from odocal_ros.screening.screen import screen
     from odocal_ros.settings.config import Config, with_settings
     from odocal_ros.sim.scenarios import SimOptions, simulate
@@ -78,6 +77,6 @@ def driven(fix_noise: str, seed: int) -> 'PlanarLeg':
     inputs, _ = screen(leg, config)
     prepared, _ = prepare(leg, inputs, config)
     assert prepared is not None     # a drive made for it
-    wheels = wheel_leg(prepared)
-    assert wheels is not None
-    return planar_of(prepared, wheels, 0.0)
+    planar = planar_of(prepared, 0.0)
+    assert planar is not None
+    return planar

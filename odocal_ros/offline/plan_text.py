@@ -17,7 +17,7 @@ from odocal_ros.library.plan import PARAMETERS, PITCH, Planned
 from odocal_ros.library.what_helps import Change, ranked, SCALE, YAW
 from odocal_ros.output.budget_table import budget_lines
 from odocal_ros.output.figures import length, share, time_span
-from odocal_ros.planning.methods import NOT_PREDICTED, Plan
+from odocal_ros.planning.methods import Plan
 from odocal_ros.planning.predict import Sigmas
 from odocal_ros.planning.smoother import SWAY_RATE
 
@@ -55,8 +55,7 @@ def _methods(before: Plan) -> list[str]:
     for name, method in before.methods.items():
         shown = [_shown(p, method.estimates[p].sigma) for p in PARAMETERS]
         lines.append(f'  {name:<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}')
-    return [*lines, f'  ({" and ".join(NOT_PREDICTED)}: not predicted; the result: '
-            f'{_result(before)})']
+    return [*lines, f'  (the result: {_result(before)})']
 
 
 def _result(before: Plan) -> str:

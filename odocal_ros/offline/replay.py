@@ -60,7 +60,7 @@ def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
     add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
-        help='method whose figures are the result')
+        help='method whose figures are the result; wheels: another name for smoother')
     add('--accept', action='append', default=[], metavar='NAME=LOW:HIGH',
         help='pass or fail: value plus and minus 2 sigma within limits, as '
         'yaw_mounting_angle_deg=-0.5:0.5; repeatable; prints a line of JSON a vehicle')

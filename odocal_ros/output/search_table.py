@@ -16,8 +16,8 @@ def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
     """Return a table of each leg's search, empty where there was none."""
     lines = []
     for k, leg in enumerate(legs, 1):
-        wheels = leg.methods.get('wheels')
-        found = wheels and wheels.details.get('search')
+        found = next((m.details['search'] for m in leg.methods.values()
+                      if m.details.get('search')), None)
         if not found:
             continue
         best, after = found['best_row'], found['after']

@@ -20,7 +20,6 @@ from odocal_ros.screening.placed import Placed
 from odocal_ros.screening.screen import Inputs
 
 NAME = 'speed_truncation'
-ADDED_UP = ('two_point', 'wheels')      # methods whose travel is the sum of the speeds
 
 
 def half_step(inputs: Inputs) -> float:
@@ -41,7 +40,7 @@ def half_step(inputs: Inputs) -> float:
 def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     """Return the result of a method that adds up speeds, what truncation takes in its sigmas."""
     size = half_step(prepared.inputs)
-    if method.name not in ADDED_UP or not size:
+    if method.name != 'two_point' or not size:
         return method
     return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, size), shared=True)
 

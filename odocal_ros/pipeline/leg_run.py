@@ -32,7 +32,7 @@ from odocal_ros.screening.fix_screen import origin_amid
 from odocal_ros.screening.screen import Inputs
 
 # judgement: of the time that methods take, and of the tracks after them
-METHOD_EFFORT = {'two_point': 1, 'wheels': 8, 'smoother': 20}
+METHOD_EFFORT = {'two_point': 1, 'smoother': 20}
 TRACKS = 2
 
 
@@ -96,12 +96,8 @@ def _once(found: Sequence[Reason]) -> list[Reason]:
 
 def _methods_of(prepared: PreparedLeg) -> list[str]:
     """Return the methods to run: those asked for, of auto those that the leg can carry."""
-    asked, inputs = prepared.config.method, prepared.inputs
-    wanted = deciding(asked, shown=True)
-    # without an accelerometer it serves one counter too
-    one_counter = inputs.travel_right is None and inputs.felt and asked == 'auto'
-    return [name for name in METHODS if name in wanted
-            and not (name == 'wheels' and one_counter)]
+    wanted = deciding(prepared.config.method, shown=True)
+    return [name for name in METHODS if name in wanted]
 
 
 def _effort(names: Iterable[str]) -> int:

@@ -10,7 +10,7 @@
 """What a method gives on one leg."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.data.arrays import Floats
@@ -37,14 +37,13 @@ class MethodRun(NamedTuple):
     A method's result and what it found beside it.
 
     paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
-    'odometer' to s late and sigma; None from a method that sees none.   slips : of one wheel, as
-    they stand in calibration.json.   odometer : slip or lateness that its track shows beside the
-    Imu, said of the leg unless a better method has looked; None: it does not look.
+    'odometer' to s late and sigma; None from a method that sees none.   odometer : slip or
+    lateness that its track shows beside the Imu, said of the leg unless a better method has
+    looked; None: it does not look.
     """
 
     result: MethodResult
     paths: Paths | None = None
     found: tuple[Reason, ...] = ()
     delays: dict[str, tuple[float, float]] | None = None
-    slips: tuple[dict[str, Any], ...] = ()
     odometer: tuple[Reason, ...] | None = None

@@ -16,7 +16,6 @@ from functools import partial
 from odocal_ros.calib.failed import failed, raised_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.two_point import unsolved
-from odocal_ros.calib.wheels.wheel_slips import WheelSlips, with_unseen
 from odocal_ros.data.mapped import let_go
 from odocal_ros.errors import OdocalError
 from odocal_ros.pipeline.coarse_odometer import held_steps
@@ -30,35 +29,23 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.screening.screen import Inputs
 
 
-def _wheels(prepared: PreparedLeg, passed: Passed) -> MethodRun:
-    from odocal_ros.pipeline.wheels_run import wheels
-    return wheels(prepared, passed)
-
-
 def _smoother(prepared: PreparedLeg, passed: Passed) -> MethodRun:
     from odocal_ros.pipeline.smoother_run import smoother
     return smoother(prepared, passed)
 
 
-def _no_wheels(inputs: Inputs, why: Reason) -> MethodResult:
-    from odocal_ros.calib.wheels.result import refused
-    return refused(inputs, why)
-
-
 def _no_smoother(inputs: Inputs, why: Reason) -> MethodResult:
     from odocal_ros.calib.smoother.outcome import refused
-    return refused((why,), inputs.scale_unit)
+    return refused((why,), inputs.scale_unit, inputs.travel_right is not None)
 
 
 # as they are shown; two_point, the operator's own marks, is always computed
 METHODS: dict[str, Callable[[PreparedLeg, Passed], MethodRun]] = {
-    'two_point': two_point, 'wheels': _wheels, 'smoother': _smoother}
+    'two_point': two_point, 'smoother': _smoother}
 # what each gives where it refuses: (inputs, reason) to MethodResult
 UNKNOWN: dict[str, Callable[[Inputs, Reason], MethodResult]] = {
            'two_point': lambda inputs, why: unsolved((why,), inputs.scale_unit),
-           'wheels': _no_wheels, 'smoother': _no_smoother}
-# methods that begin with the alignment: what it had to say is said of them
-ALIGNED = ('two_point', 'wheels')
+           'smoother': _no_smoother}
 
 
 def run_methods(names: Iterable[str], prepared: PreparedLeg,
@@ -71,7 +58,7 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
 
     Returns
     -------
-    What each found and, in its sigmas, what the others found of the wheels.
+    What each found.
 
     """
     runs = {}
@@ -79,10 +66,7 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
         passed = begun(name)
         let_go()
         runs[name] = _guarded(name, prepared, partial(METHODS[name], prepared, passed))
-    slips = prepared.wheel_slips
-    for run in runs.values():
-        slips = with_unseen(slips, run.slips)
-    return {name: _guarded(name, prepared, partial(_doubted, run, prepared, slips))
+    return {name: _guarded(name, prepared, partial(_doubted, run, prepared))
             for name, run in runs.items()}
 
 
@@ -107,11 +91,10 @@ def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     return [*found, *(odometer or ()), *notes]
 
 
-def _doubted(run: MethodRun, prepared: PreparedLeg, slips: WheelSlips) -> MethodRun:
+def _doubted(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
     """Return a method's run with the errors that its own model does not hold."""
-    result = upright(held_steps(held(run.result, prepared, slips), prepared), prepared)
-    about = prepared.about_alignment if result.name in ALIGNED else ()
-    about += prepared.of_ends if result.name == 'two_point' else ()
+    result = upright(held_steps(held(run.result, prepared), prepared), prepared)
+    about = (*prepared.about_alignment, *prepared.of_ends) if result.name == 'two_point' else ()
     return run._replace(result=replace(result, reasons=(*about, *result.reasons)))
 
 

@@ -7,28 +7,45 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The search of patent CN104359492A on one leg, beside method wheels: by positions alone."""
+"""The search of patent CN104359492A on one leg, beside the smoother: by positions alone."""
 
-from odocal_ros.calib.wheels.leg import WheelLeg
+import numpy as np
+
 from odocal_ros.patent.planar import planar_leg, PlanarLeg
 from odocal_ros.patent.ranges import ranges_of
 from odocal_ros.patent.search import search, SearchResult
 from odocal_ros.pipeline.prepared import PreparedLeg
 
 
-def planar_of(ready: PreparedLeg, leg: WheelLeg, pitch: float) -> PlanarLeg:
+def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """
     Return a leg as the patent sees it: two tracks in the plane, and fixes.
 
-    ready : PreparedLeg.   leg : WheelLeg of it.   pitch : rad, of the Imu on the vehicle.
+    ready : PreparedLeg.   pitch : rad, of the Imu on the vehicle.   None without two wheels, or
+    without a fix at the start.
     """
-    start = ready.nominal or ready.rough
-    return planar_leg(leg.left, leg.right, leg.t_fix, leg.fixes_n, leg.covariance_n,
-                      (leg.start.t, leg.start.position_n), (start, start), pitch, leg.lever_b)
+    inputs = ready.inputs
+    left, right = inputs.travel_left, inputs.travel_right
+    if left is None or right is None:
+        return None
+    begin, end = (pick([float(x.t[at]) for x in (ready.track, left, right)])
+                  for pick, at in ((max, 0), (min, -1)))
+    begin, end = max(0.0, begin), min(ready.t_fit, end)
+    start = ready.mark(begin, ready.path(np.array([ready.rough, 0.0, 0.0])), 'start')
+    if start is None or end <= begin:
+        return None
+    between = (inputs.t_fix >= begin) & (inputs.t_fix <= end)
+    scale = ready.nominal or ready.rough
+    return planar_leg(ready.reckon(left), ready.reckon(right), inputs.t_fix[between],
+                      ready.fixes_n[between], inputs.covariance_n[between],
+                      (start.t, start.position_n), (scale, scale), pitch, ready.lever_b)
 
 
-def search_of(ready: PreparedLeg, leg: WheelLeg, pitch: float) -> SearchResult | None:
+def search_of(ready: PreparedLeg, pitch: float) -> SearchResult | None:
     """Return what the search finds, None with too few fixes; arguments as of planar_of."""
+    leg = planar_of(ready, pitch)
+    if leg is None:
+        return None
     a, wheels = ready.alignment, ready.config.wheels
     course = None if a.heading_separable else a.heading_sigma     # holds the mounting angle too
-    return search(planar_of(ready, leg, pitch), ranges_of(wheels, course), wheels.robust)
+    return search(leg, ranges_of(wheels, course), wheels.robust)

@@ -16,22 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.result import Estimate
+from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.calib.slip import slip_reasons
 from odocal_ros.calib.smoother import smooth, smoother_leg
-from odocal_ros.calib.smoother.outcome import refused
 from odocal_ros.data.arrays import Floats
 from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.dead_reckoning import dead_reckon, Track
 from odocal_ros.nav.rotations import quat_at, quat_conjugate, quat_from_matrix, quat_multiply
 from odocal_ros.pipeline.method_run import MethodRun, Passed, Path, Paths
+from odocal_ros.pipeline.patent_run import search_of
 from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.pipeline.slip_check import slip_check
 from odocal_ros.pipeline.tracks import as_configured
-from odocal_ros.reasons import Code, Reason
+from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
-
-NOT_FELT = Reason(Code.NO_METHOD, 'the smoother needs an accelerometer')
 
 
 def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
@@ -43,14 +41,17 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     The Paths are by the smoother's own attitude, the calibrated one with all values found, delays
     and lever arms too; t is as the fixes stamp it.
     """
-    if not ready.inputs.felt:
-        return MethodRun(refused((NOT_FELT,), ready.inputs.scale_unit))
     leg = smoother_leg(ready.inputs, ready.config, ready.origin, ready.fixes_n, ready.spans,
                        ready.rough, ready.t_fit)
+    t_slip, metres = ready.wheel_slips.doubts()
+    leg = replace(leg, doubt_t=np.append(leg.doubt_t, t_slip),
+                  doubt_sigma=np.append(leg.doubt_sigma, metres / ready.rough))
     passes = count(1)
     method = smooth(leg, ready.config, lambda *seen: passed(next(passes), seen[-1]))
     if method.estimates['scale_factor'].value is None:
         return MethodRun(method)
+    if ready.config.method == 'patent':
+        method = _with_search(method, ready)
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
     seen = {name: (e.value, e.sigma) for name, e in delays.items()
             if e.value is not None and e.sigma is not None}
@@ -66,6 +67,17 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
                             ready.config.odometer.time_offset) if leg.by_steps else ()
     return MethodRun(method, Paths(before, _late_path(track, f, lever_b, late['gnss'])),
                      delays=seen, odometer=odometer)
+
+
+def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
+    """Return the result with the patent's search beside it, where the leg allows one."""
+    found = search_of(ready, method.estimates['pitch_mounting_angle'].value or 0.0)
+    if found is None:
+        return method
+    # what positions alone cannot tell, the gyro may have: of that the smoother speaks itself
+    said = (r for r in found.reasons if r.code is not Code.WHEELS_NOT_SEPARABLE)
+    return replace(method, reasons=(*method.reasons, *said),
+                   details=method.details | {'search': found.as_dict()})
 
 
 def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:

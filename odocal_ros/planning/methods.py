@@ -18,8 +18,6 @@ from odocal_ros.planning.predict import predict, Prediction, Sigmas
 from odocal_ros.planning.smoother import predict_smoother
 from odocal_ros.reasons import Reason, Verdict, verdict_of
 
-NOT_PREDICTED = ('wheels',)
-
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -95,8 +93,7 @@ def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = No
     Parameters
     ----------
     drive, sigmas : PlannedDrive, Sigmas
-        As for ``predict``. Where the method asked for is not predicted (wheels), the two-point
-        method stands in for it.
+        As for ``predict``.
     spacing : float, optional
         As for ``predict_smoother``.
 
@@ -111,6 +108,6 @@ def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = No
     methods = {'two_point': two_point.method}
     if 'smoother' in deciding(asked):
         methods = {'smoother': predict_smoother(drive, sigmas, spacing)} | methods
-    may_give = tuple(name for name in deciding(asked) if name in methods) or ('two_point',)
+    may_give = deciding(asked)
     estimates, _ = choose({name: methods[name] for name in may_give}, may_give)
     return Plan(two_point, methods, estimates, may_give)

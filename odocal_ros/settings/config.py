@@ -259,9 +259,9 @@ class Config:
 
     method: str = setting('auto', choices=(
         'auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'), about=(
-        'Method whose figures are the result; auto: each value of the first of smoother, wheels '
-        '(with two counters) and two_point that has it; all: the same, wheels tried always; '
-        'patent: wheels, with the search of CN104359492A beside it.'))
+        'Method whose figures are the result; auto, all: each value of the first of smoother and '
+        'two_point that has it; patent: smoother, with the search of CN104359492A beside it where '
+        'there are two wheels; wheels: another name for smoother.'))
     vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: it stands in '
                            'results and titles the report, and a result of another one is not '
                            'restored.')

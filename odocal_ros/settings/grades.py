@@ -111,7 +111,8 @@ def grade_as_seen(imu: ImuConfig, variance: Mapping[str, float]) -> Grade:
         return grades[stated]
     return min(reversed(grades[:stated + 1]), key=lambda grade: sum(
         abs(math.log(max(sigma, 1e-12) / math.sqrt(variance[name])))
-        for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))))
+        for name, sigma in (('gyro', grade.gyro_noise), ('accel', grade.accel_noise))
+        if name in variance))
 
 
 def grade_of(imu: ImuConfig) -> Grade:

@@ -60,16 +60,16 @@ def test_a_pitch_that_the_smoother_cannot_tell_is_not_given_by_end_points():
 
 
 def test_a_rejected_method_gives_nothing_while_another_is_sound():
-    methods = several(method('wheels', 2.1, reasons=[REFUSED]), method('two_point'))
+    methods = several(method('smoother', 2.1, reasons=[REFUSED]), method('two_point'))
     assert choose(methods, 'auto')[0]['scale_factor'].value == 2.0
 
 
 def test_where_all_are_rejected_the_values_computed_stay():
-    methods = several(method('wheels', 2.1, reasons=[REFUSED]),
+    methods = several(method('smoother', 2.1, reasons=[REFUSED]),
                       method('two_point', None, None, [REFUSED]))
     estimates, giving = choose(methods, 'auto')
     assert estimates['scale_factor'].value == 2.1
-    assert giving == ('wheels',)
+    assert giving == ('smoother',)
 
 
 def test_a_method_asked_for_is_the_only_one():
@@ -81,9 +81,9 @@ def test_a_method_asked_for_is_the_only_one():
 
 
 @pytest.mark.parametrize(('asked', 'run'), [
-    ('two_point', ('two_point',)), ('wheels', ('wheels', 'two_point')),
-    ('auto', ('smoother', 'wheels', 'two_point')),
-    ('all', ('smoother', 'wheels', 'two_point'))])
+    ('two_point', ('two_point',)), ('wheels', ('smoother', 'two_point')),
+    ('patent', ('smoother', 'two_point')), ('auto', ('smoother', 'two_point')),
+    ('all', ('smoother', 'two_point'))])
 def test_the_operators_own_marks_are_always_computed(asked, run):
     assert deciding(asked, shown=True) == run
 
@@ -107,7 +107,7 @@ def test_a_rejected_method_is_named_where_one_behind_it_gives():
     assert passed_over(several(loop, fell), 'auto') == []
     assert passed_over(several(method('two_point'), fell), 'two_point') == []
     # that there is no second wheel is no fault of the drive
-    none = method('wheels', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
+    none = method('smoother', None, None, [Reason(Code.NO_METHOD, 'one wheel')])
     assert passed_over(several(none, method('two_point')), 'all') == []
 
 

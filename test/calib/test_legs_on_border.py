@@ -352,10 +352,11 @@ def test_a_leg_widened_for_its_model_counts_less(legs):
     assert unsure.estimates[SCALE].sigma == pytest.approx(2 * sure.estimates[SCALE].sigma, rel=0.1)
 
 
-def test_a_slip_that_the_smoother_does_not_hold_is_in_its_border_too(legs):
+def test_a_wheel_that_changes_on_the_way_is_in_the_border_too(legs):
     _, config, results = legs
-    run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config)
-    loose = held(results[0], run, replace(NO_SLIPS, change=8e-4))
+    run = SimpleNamespace(distance=1000.0, nominal=0.0, config=config,
+                          wheel_slips=replace(NO_SLIPS, change=8e-4))
+    loose = held(results[0], run)
     scale = loose.estimates[SCALE]
     assert scale.sigma / scale.value > 2e-4
     C = joint([loose.border], []).covariance

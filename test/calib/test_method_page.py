@@ -19,7 +19,7 @@ import odocal_ros
 
 TAGS = re.findall(r'\\tag\{([STW])(\d+)\}', (ROOT / 'docs/method.md').read_text(encoding='utf-8'))
 TAGS = {letter: [int(n) for a, n in TAGS if a == letter] for letter in 'STW'}
-MOST = {'S': 30, 'T': 15, 'W': 15}      # there are more of them: smoother, two-point, wheels
+MOST = {'S': 30, 'T': 15, 'W': 7}      # there are more of them: smoother, two-point, two wheels
 
 
 def _cited(text, letter):

@@ -313,7 +313,7 @@ def test_a_gyro_that_does_not_turn_is_no_ground_for_factors():
     """The track goes straight on where the fixes turn: its best scale would be a third off."""
     made = drive(**TOWN, seed=3)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w * [1, 1, 0]))
-    result = calibrate(leg, settings(made, method='wheels'))
+    result = calibrate(leg, settings(made, method='smoother'))
     assert result.methods == {}
     said = next(r for r in result.reasons if r.code is Code.IMU_UNITS)
     assert 'next to nothing' in said.text
@@ -325,15 +325,14 @@ def test_a_gyro_of_noise_ends_in_reasons_too():
     made = drive(**TOWN, seed=3, imu_grade='industrial')
     noise = np.random.default_rng(0).normal(0.0, 0.3, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
-    assert calibrate(leg, settings(made, method='wheels')).methods['wheels'].reasons
+    assert calibrate(leg, settings(made, method='smoother')).methods['smoother'].reasons
 
 
-def test_a_track_width_that_ends_at_nothing_is_none():
-    """A gyro so noisy that the turns tell no width: 0.1 m is a limit of the search, no result."""
+def test_a_gyro_of_less_noise_widens_the_track_width():
     made = drive(**TOWN, seed=3, imu_grade='consumer')
     noise = np.random.default_rng(0).normal(0.0, 0.1, made.imu.w_i.shape)
     leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w + noise))
-    method = calibrate(leg, settings(made, method='wheels')).methods['wheels']
-    assert method.estimates['track_width'].value is None
-    why = {r.code: r.text for r in method.reasons}[Code.TRACK_WIDTH_NOT_DETERMINED]
-    assert 'as if less than 0.1 m lay between them' in why
+    noisy, clean = (calibrate(x, settings(made, method='smoother')).methods['smoother']
+                    .estimates['track_width'] for x in (leg, made.leg()))
+    assert abs(noisy.value - made.options.track_width) < 4 * noisy.sigma
+    assert noisy.sigma > 3 * clean.sigma

@@ -26,7 +26,6 @@ from odocal_ros.foresee.foresight import Abandoned, DriveSoFar, forecast_of
 from odocal_ros.foresee.leg_so_far import faults_in_cells
 from odocal_ros.foresee.smoother_so_far import SmootherSoFar
 from odocal_ros.foresee.thinned_leg import MOST_CELLS, ThinnedLeg
-from odocal_ros.foresee.wheels_so_far import with_wheels
 from odocal_ros.live import running_estimate as watch
 from odocal_ros.live.guidance import hint
 from odocal_ros.live.running_estimate import LOOK_PERIOD_NS, RunningEstimate
@@ -395,53 +394,51 @@ def two():
                                seed=4, imu_grade='tactical'))
 
 
-UNSURE = Prospect(0.2, 1e-3, 1e5)
 
 
-def wheels_at(two, t_stop, scale=UNSURE, **settings):
-    """Return forecast without and with the wheels, after so many seconds of the drive."""
-    whole = two.leg()
+def looked_at(made, t_stop, **settings):
+    """Return what is foreseen after so many seconds of a drive."""
+    whole = made.leg()
     thinned = ThinnedLeg(whole.form)
     for slot in ('imu', 'odometer', 'odometer_right', 'fix'):
         rows = getattr(whole, slot)
         thinned.feed(slot, take(rows, rows.stamp_ns <= whole.start_ns + t_stop * SECOND))
-    config = with_settings(Config(), {'odometer.left': 'left', 'odometer.right': 'right',
-                                      'imu.grade': 'tactical'} | settings)
-    before = Forecast(scale, Prospect(None, 0.0087, None, (), 'not told'))
-    return before, with_wheels(before, thinned.leg(whole.start_ns), config)
+    config = with_settings(Config(), {'imu.grade': made.options.imu_grade} | settings)
+    return forecast_of(thinned.leg(whole.start_ns), thinned.fix_rate(), config,
+                       smoother=SmootherSoFar())
 
 
-def test_two_wheels_are_foreseen_as_they_come_out(two):
+@pytest.mark.parametrize('method', ['smoother', 'auto', 'wheels'])
+def test_two_wheels_are_foreseen_as_they_come_out(two, method):
     whole = two.leg()
-    method = calibrate(whole, with_settings(Config(), {
-        'method': 'wheels', 'imu.grade': 'tactical'})).methods['wheels']
-    _, forecast = wheels_at(two, (whole.stop_ns - whole.start_ns) / SECOND)
-    left, right, scale = (method.estimates[f'scale_factor{x}'] for x in ('_left', '_right', ''))
+    found = calibrate(whole, with_settings(Config(), {
+        'method': method, 'imu.grade': 'tactical'})).methods['smoother'].estimates
+    forecast = looked_at(two, (whole.stop_ns - whole.start_ns) / SECOND, method=method)
+    left, right, width = (found[name] for name in (
+        'scale_factor_left', 'scale_factor_right', 'track_width'))
     # the thinned has a tenth of the rows: their noise is judged anew
     assert forecast.wheels.left_right == pytest.approx(
         max(e.sigma / e.value for e in (left, right)), rel=0.25)
-    assert forecast.scale.sigma == pytest.approx(scale.sigma / scale.value, rel=0.25)
-    assert forecast.scale.metres == 0.0
-    assert forecast.scale.sources
-    assert forecast.wheels.track_width < 0.05
-    assert forecast.yaw.why == 'not told'
+    assert forecast.wheels.track_width == pytest.approx(width.sigma / width.value, rel=0.5)
+    assert forecast.estimates['scale_factor_left'].value == pytest.approx(
+        left.value, abs=left.sigma)
 
 
-def test_the_metres_still_to_go_are_enough_and_no_more_than_the_end_points_need(two):
-    _, forecast = wheels_at(two, 25.0)
-    metres = forecast.scale.metres
-    assert 0.0 < metres < UNSURE.metres
-    few = replace(UNSURE, metres=metres / 2)
-    assert wheels_at(two, 25.0, few)[1].scale.metres == few.metres
-    speed = 10.0        # m/s, of the town
-    assert wheels_at(two, 25.0 + metres / speed)[1].scale.metres == 0.0
+def test_a_method_of_one_travel_and_a_single_counter_foresee_no_wheels(two, drive):
+    assert looked_at(two, 100.0, method='two_point').wheels is None
+    assert looked_at(drive, 100.0, method='smoother').wheels is None
 
 
-def test_a_method_of_one_travel_and_a_single_counter_leave_the_forecast_alone(two, drive, config):
-    before, forecast = wheels_at(two, 60.0, method='two_point')
-    assert forecast is before
-    thinned, start_ns = sketched(drive, 60.0)
-    assert with_wheels(before, thinned.leg(start_ns), config) is before
+@pytest.mark.parametrize('method', ['smoother', 'auto'])
+def test_without_an_accelerometer_the_scale_is_foreseen_and_no_angle(two, method):
+    still = replace(two, imu=replace(two.imu, f_i=np.zeros_like(two.imu.f_i)))
+    forecast = looked_at(still, 200.0, method=method)
+    assert 0.0 < forecast.scale.sigma < 0.01
+    assert forecast.wheels.left_right < 0.01
+    assert (forecast.yaw.sigma, forecast.pitch) == (None, None)
+    assert forecast.yaw.why
+    assert not any(forecast.estimates[name].value for name in (
+        'yaw_mounting_angle', 'pitch_mounting_angle'))
 
 
 def test_swapped_wheels_are_said_while_it_is_driven(two):

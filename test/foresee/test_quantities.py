@@ -232,14 +232,14 @@ def test_seconds_to_stand():
      'takes their mean'),
 ])
 def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, heard, said):
-    monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'wheels'))
+    monkeypatch.setattr(ability_module, 'METHODS', ('two_point',))
     known = Heard(**({'variances': NONE, 'rested_s': 30.0} | heard))
     text = ability(with_settings(CONFIG, settings), known).words()
     assert text.startswith(said) if said.endswith(', ') else text == said
 
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
-    monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'wheels', 'smoother'))
+    monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'smoother'))
     can = ability(with_settings(CONFIG, {'method': 'smoother'}), Heard(NONE, 30.0)).can
     assert 'the yaw (by stops, starts and turns)' in can
     only = with_settings(CONFIG, {'method': 'two_point'})

@@ -362,13 +362,13 @@ def test_the_keys_hold_values_and_sigmas(looks):
     found = of_sigmas(looks[-1])
     found = replace(found, estimates={
         'scale_factor': Estimate(0.02, 1e-5, 'm/pulse', 'smoother'),
-        'yaw_mounting_angle': Estimate(0.01, 1e-3, 'rad', 'wheels'),
+        'yaw_mounting_angle': Estimate(0.01, 1e-3, 'rad', 'two_point'),
         'pitch_mounting_angle': Estimate(None, None, 'rad', 'smoother')})
     keys = as_keys(found, 7.5)
     assert [keys[f'estimate_{name}'] for name in (
         'scale_factor', 'scale_factor_sigma', 'yaw_mounting_angle_rad',
         'yaw_mounting_angle_sigma_rad', 'method', 'age_s')] == [
-            0.02, 1e-5, 0.01, 1e-3, 'smoother, wheels', 7.5]
+            0.02, 1e-5, 0.01, 1e-3, 'smoother, two_point', 7.5]
     assert math.isnan(keys['estimate_pitch_mounting_angle_rad'])
     assert math.isnan(keys['estimate_pitch_mounting_angle_sigma_rad'])
 

@@ -172,7 +172,7 @@ def command(rng, bag, wide, options) -> list[str]:
     few = [] if rng.random() < 0.005 else ['--set', 'output.formats=[params]']
     if rng.random() < 0.9:
         return ['replay', str(bag), '--method', 'two_point', *wide, *few, *options]
-    return ['replay', str(bag), '--method', rng.choice(['auto', 'smoother', 'wheels']), *few,
+    return ['replay', str(bag), '--method', rng.choice(['auto', 'smoother', 'patent']), *few,
             *options]
 
 

@@ -69,7 +69,7 @@ def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, caps
     assert told['command'].split()[-4:] == options
     assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json']) < 2
     said = capsys.readouterr().out
-    assert 'wheels' in json.loads(said)['methods']
+    assert 'scale_factor_left' in json.loads(said)['methods']['smoother']['estimates']
     assert 'WHEELS_SWAPPED' not in said
 
 

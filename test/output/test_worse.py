@@ -85,3 +85,15 @@ def test_what_cannot_be_read_is_no_loss(why, good, tmp_path):
     assert stored_in(tmp_path / 'old') is stored_in(tmp_path / 'gone') is None
     assert replacing(None, tmp_path / 'new') == ''
     assert replacing(stored_in(tmp_path / 'new'), tmp_path / 'gone') == ''
+
+
+def test_a_result_of_the_method_wheels_is_read_and_replaced(why, good):
+    """Older versions have such a method and estimate; it holds the result's own factors."""
+    wheels = {'scale_factor_left': Estimate(0.0499, 1e-6, 'm/pulse', 'wheels'),
+              'heading_error': Estimate(0.01, 1e-3, 'rad', 'wheels')}
+    base = good.methods['two_point']
+    old = replace(good, estimates=good.estimates | wheels, methods=good.methods | {
+        'wheels': replace(base, name='wheels', estimates=base.estimates | wheels)})
+    left = replace(wheels['scale_factor_left'], method='smoother')
+    assert why(old, later(good, scale_factor_left=left)) == ''
+    assert 'no scale factor left' in why(old, later(good))

@@ -37,17 +37,16 @@ def said(made, method, **changes):
     return what, float(size) * (1 if way == 'late' else -1), float(sigma), name, float(offset)
 
 
-@pytest.mark.parametrize('method', ['wheels', 'smoother'])
 @pytest.mark.parametrize('late', [0.12, -0.12])
-def test_late_and_early_fixes_are_said(method, late):
+def test_late_and_early_fixes_are_said(late):
     made = drive(**ROUTE, fix_delay=late)
-    what, size, sigma, name, offset = said(made, method)
+    what, size, sigma, name, offset = said(made, 'smoother')
     assert (what, name) == ('fixes', 'gnss')
     # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / prior)^2 of itself
     pull = abs(late) * (sigma / 0.05)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001
     assert offset == pytest.approx(-size, abs=0.001)
-    assert said(made, method, gnss__time_offset=offset) is None
+    assert said(made, 'smoother', gnss__time_offset=offset) is None
 
 
 def test_a_late_odometer_is_said():
@@ -64,9 +63,8 @@ def test_what_is_set_already_is_counted_in():
     assert said(made, 'smoother', gnss__time_offset=offset) is None
 
 
-@pytest.mark.parametrize('method', ['wheels', 'smoother'])
-def test_of_no_delay_nothing_is_said(method):
-    assert said(drive(**ROUTE), method) is None
+def test_of_no_delay_nothing_is_said():
+    assert said(drive(**ROUTE), 'smoother') is None
 
 
 @pytest.mark.parametrize(('late', 'sigma', 'fix_sigma', 'is_said'), [

@@ -14,6 +14,7 @@ import numpy as np
 from odocal_ros.calib.border import Border
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.priors import PriorRows
+from odocal_ros.calib.smoother.problem import NO_ERROR
 from odocal_ros.calib.smoother.state import CONSTANTS
 from odocal_ros.data.arrays import Floats
 
@@ -23,13 +24,15 @@ def border_of(fit: Fit, configured: Floats) -> Border:
     Return the border of a fit, at its last linearisation.
 
     The Schur complement of the constants less their priors, which the elimination leaves as they
-    are.
+    are. Of a constant that the leg holds where it is, it tells nothing to another leg.
 
     configured : (M,) values of the settings that constants are corrections to.
     """
     at, priors = fit.weighted.state.constants, fit.weighted[PriorRows].priors
     weight = 1 / priors.constants**2
+    free = priors.constants > NO_ERROR
     return Border(
-        CONSTANTS, at + configured, fit.solved.reduced - np.diag(weight),
-        fit.solved.g_reduced + weight * (at - priors.centre), priors.centre + configured,
+        CONSTANTS, at + configured,
+        (fit.solved.reduced - np.diag(weight)) * np.outer(free, free),
+        (fit.solved.g_reduced + weight * (at - priors.centre)) * free, priors.centre + configured,
         fit.first.constants, priors.constants)

@@ -28,7 +28,7 @@ from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, Wa
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
-from odocal_ros.calib.smoother.problem import Problem, SPACING
+from odocal_ros.calib.smoother.problem import NO_ERROR, Problem, SPACING
 from odocal_ros.calib.smoother.smoother import best_fit
 from odocal_ros.calib.smoother.state import LN_K, PITCH, State, YAW
 from odocal_ros.calib.smoother.warm_start import carried, rows_of
@@ -147,6 +147,8 @@ def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> S
     covariance = floored(best.solved.covariance * method.details['widened']**2)
     sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
     sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
+    # an angle that is as set is none that the drive knows
+    sigmas[best.first.constants[[LN_K, YAW, PITCH]] <= NO_ERROR] = np.inf
     found = dict(method.estimates)
     for name, sigma in zip(PARAMETERS, sigmas, strict=True):
         e = found[name]

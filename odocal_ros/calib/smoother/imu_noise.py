@@ -9,6 +9,8 @@
 
 """White noise and walks of an Imu: as its grade, its standstills and its samples have them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from odocal_ros.calib.smoother.imu_rows import ImuRows
@@ -16,7 +18,12 @@ from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import by_step, chunks
-from odocal_ros.settings.grades import Grade
+from odocal_ros.screening.force import TILT_SIGMA
+from odocal_ros.settings.grades import G, Grade
+
+# m/s^2/sqrt(Hz) at least, and m/s^2/sqrt(s): what moves the vehicle, 1.5 m/s^2 for some seconds at
+# a time, and slopes of a few per cent over a minute. Judgement
+UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
@@ -24,6 +31,12 @@ def sensor_noise(grade: Grade) -> dict[str, float]:
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
     return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
+
+
+def unfelt(grade: Grade) -> Grade:
+    """Return the grade of an Imu without an accelerometer: its forces are gravity, made up."""
+    return replace(grade, accel_noise=UNFELT_NOISE, accel_bias=TILT_SIGMA * G,
+                   accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 
 
 def at_rest(imu: ImuRows, leg: SmootherLeg, still: Bools) -> dict[str, float]:
@@ -46,8 +59,9 @@ def at_rest(imu: ImuRows, leg: SmootherLeg, still: Bools) -> dict[str, float]:
         freedom += len(run) - 2
     if freedom < 15:        # of three axes each: a variance by fewer is good to 20 % at best
         return {}
-    return {name: max(float(total / freedom), LEAST.imu[name]**2)
-            for name, total in zip(('gyro', 'accel'), sums, strict=True)}
+    found = {name: max(float(total / freedom), LEAST.imu[name]**2)
+             for name, total in zip(('gyro', 'accel'), sums, strict=True)}
+    return found if leg.felt else {'gyro': found['gyro']}
 
 
 def shaken(imu: ImuRows) -> dict[str, float]:

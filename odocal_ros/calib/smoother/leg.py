@@ -60,6 +60,8 @@ class SmootherLeg:
     doubt_sigma: Floats = _none()        # scale units
     velocity: Velocity = Velocity()
     heading: Heading = Heading()
+    wheels: tuple[Travel, ...] = ()     # each by itself, the left one of two first
+    felt: bool = True                   # False: no accelerometer, f_b is gravity, made up
 
     @property
     def by_steps(self) -> bool:
@@ -95,6 +97,8 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
 
     """
     t_stop = inputs.t_stop if t_stop is None else t_stop
+    if not inputs.felt:         # the ground is taken as level, so heights have no say
+        fixes_n = fixes_n * np.array([1.0, 1.0, np.nan])
     before = [s for s in spans if s[0] <= 0.5 and s[1] >= -BEFORE_MARK]
     t_begin = min(0.0, float(before[-1][0])) if before else 0.0
     return SmootherLeg(
@@ -107,4 +111,6 @@ def smoother_leg(inputs: Inputs, config: Config, origin: Origin, fixes_n: Floats
         antenna_arm=np.array(config.gnss.lever_arm, float),
         doubt_t=inputs.doubt_t, doubt_sigma=inputs.doubt_sigma,
         velocity=outside_velocity(inputs, config, origin),
-        heading=outside_heading(inputs, config, origin))
+        heading=outside_heading(inputs, config, origin), felt=inputs.felt,
+        wheels=() if inputs.travel_left is None or inputs.travel_right is None else (
+            inputs.travel_left, inputs.travel_right))

@@ -38,13 +38,16 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     stated, own = (sensor_noise(grade) for grade in (grade_of(config.imu), problem.grade))
     gyro_sold, accel_sold = turn_on_bias(config.imu)
     level = fit.levels.roots()
-    shaken = max(level[name] / own[name] for name in ('gyro', 'accel'))
-    worse = [f'{what} {level[name] / stated[name]:.1f} times' for name, what in (
-        ('gyro', 'gyro noise'), ('accel', 'accelerometer noise'))
-        if level[name] > WORSE_THAN_GRADE * stated[name]]
-    worse += [f'{what} {np.max(np.abs(now[0]) / sigma):.1f} times' for now, sigma, sold, what in (
-        (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold, 'gyro bias'),
-        (fit.state.accel_bias, problem.priors.accel_bias, accel_sold, 'accelerometer bias'))
+    # of an accelerometer that is not there nothing is said
+    sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
+    shaken = max(level[name] / own[name] for name in sensors)
+    worse = [f'{what} noise {level[name] / stated[name]:.1f} times'
+             for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
+    worse += [f'{what} bias {np.max(np.abs(now[0]) / sigma):.1f} times' for (
+        now, sigma, sold), what in zip((
+            (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold),
+            (fit.state.accel_bias, problem.priors.accel_bias, accel_sold)),
+            sensors.values(), strict=False)
         if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '

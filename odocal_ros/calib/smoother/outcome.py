@@ -52,6 +52,8 @@ from odocal_ros.calib.smoother.state import (
     PITCH,
     YAW,
 )
+from odocal_ros.calib.smoother.wheel_result import unknown_wheels, wheel_details, wheel_estimates
+from odocal_ros.calib.smoother.wheels import wheels_beside
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
@@ -68,11 +70,10 @@ SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
 
-def refused(reasons: Iterable[Reason], scale_unit: str,
-            details: dict[str, Any] | None = None) -> MethodResult:
+def refused(reasons: Iterable[Reason], scale_unit: str, two_wheels: bool) -> MethodResult:
     """Return the result of a leg that the method refuses: every value unknown."""
-    return MethodResult('smoother', tuple(reasons), _unknown(scale_unit), PARAMETERS, (),
-                        details or {})
+    found = _unknown(scale_unit) | (unknown_wheels(scale_unit) if two_wheels else {})
+    return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
 
 
 def no_imu(fit: Fit) -> list[Reason]:
@@ -109,6 +110,12 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
     found, undetermined = determined(c + configured(leg), sigma, after, leg.scale_unit,
                                      leg.nominal_scale, config, widen)
     reasons += undetermined
+    up_b = state.C_bv[:, 2]
+    drift = float(np.sqrt(up_b @ near[0][BG, BG] @ up_b) * widen)
+    wheels = wheels_beside(problem, fit, covariance, drift, config.odometer.track_width)
+    if leg.wheels:
+        of_wheels, why = wheel_estimates(wheels, found['scale_factor'], config)
+        found, reasons = found | of_wheels, reasons + why
     bias_sigma = np.sqrt(np.diagonal(near[0])[BG]) * widen
     for i, axis in enumerate('xyz'):
         name = f'gyro_bias_{axis}'
@@ -125,11 +132,12 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
                Source('model', np.diag(MODEL_FLOOR))]
     return MethodResult('smoother', tuple(reasons), found, PARAMETERS, tuple(sources),
                         _details(leg, problem, fit, sources, ratio, widen, sigma)
-                        | left_over(leg, problem, fit)
+                        | left_over(leg, problem, fit) | wheel_details(wheels)
                         | {'key_bias_sigmas': bias_sigmas(near, widen),
                            'slips': [vars(s) for s in slips],
-                           'beside': beside(c, covariance, problem.grade),
-                           'level_pitch_angle': level_pitch(fit, near, widen)},
+                           'beside': beside(c, covariance, problem.grade if leg.felt else None)}
+                        | ({'level_pitch_angle': level_pitch(fit, near, widen)} if leg.felt
+                           else {}),
                         border_of(fit, configured(leg)).widened(widen))
 
 
@@ -183,7 +191,8 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
     limit = max(np.deg2rad(0.5), config.verdict.max_yaw_sigma)
     for name, i, angle in (('yaw_mounting_angle', YAW, yaw),
                            ('pitch_mounting_angle', PITCH, pitch)):
-        if doubt * sigma[i] <= limit:
+        # a mounting angle that is as set is none that the drive knows
+        if doubt * sigma[i] <= limit and ratio[i] < INFORMED_SHARE:
             found[name] = Estimate(angle, float(sigma[i]), 'rad')
     for i in OPTIONAL:
         if ratio[i] < INFORMED_SHARE:

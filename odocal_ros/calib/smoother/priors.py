@@ -45,6 +45,8 @@ SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
 # Judgement, far wider than any data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
     'position': (P, 1e4), 'velocity': (V, 100.0), 'attitude': (PHI, np.array([1.0, 1.0, 10.0]))}
+# m: on ground taken as level no height is observed; 1e4 m would be lost in rounding. Definition
+UP, LEVEL_START = slice(P.stop - 1, P.stop), 1.0
 # priors of the vehicle, so the same in every leg
 SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'odometer_delay': constants_from('odometer_delay'),
@@ -70,6 +72,7 @@ class PriorRows(Part):
         self.state, self.base = here.state, here.priors
         absent = {'heading'} - {*problem.outside}
         absent |= {'speed_truncation'} if problem.leg.travel.coarse is None else set()
+        self.level = not problem.leg.felt
         self.shared = {name: where for name, where in SHARED.items() if name not in absent}
 
     @classmethod
@@ -114,6 +117,8 @@ class PriorRows(Part):
         """Add the rows to normal equations; the start is held but loosely, where it is."""
         for columns, sigma in START_SIGMAS.values():
             hold(out, 0, columns, sigma**2, 0.0)
+        if self.level:
+            hold(out, 0, UP, LEVEL_START**2, 0.0)
         for columns, value, sigma in self._biases():
             hold(out, 0, columns, sigma**2, value)
         w = 1 / self.priors.constants**2

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.smoother.axle import rates_at, WARM_TIME
 from odocal_ros.calib.smoother.equations import PARTS, Weighted
 from odocal_ros.calib.smoother.fixes import whitener
-from odocal_ros.calib.smoother.imu_noise import at_rest, shaken
+from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
@@ -42,9 +42,11 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     ODO_DELAY,
+    PITCH,
     Priors,
     SPEED_OFFSET,
     State,
+    YAW,
 )
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.coarse_speed import CoarseSpeed
@@ -95,6 +97,7 @@ class Problem:
         still = standing(leg, t)
         use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
         grade = grade_as_seen(config.imu, at_rest(imu, leg, still))
+        grade = grade if leg.felt else unfelt(grade)
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                    used(leg, t), turned(leg, imu), config.gnss.correlation_time,
@@ -253,7 +256,17 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     accel_bias = np.maximum([grade.accel_bias, grade.accel_bias, up], 1e-6)
     centre = np.zeros(M)
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
+    if not leg.felt:        # nothing tells the mounting from the attitude: it is as set
+        sigma[ACCEL] = sigma[PITCH] = NO_ERROR
+        if not len(leg.heading.t):
+            centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR
     return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)
+
+
+def nominal_yaw(config: Config) -> float:
+    """Return the yaw mounting angle as set, 0 where it is not, rad."""
+    yaw = config.imu.nominal_yaw
+    return 0.0 if np.isnan(yaw) else yaw
 
 
 def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:

@@ -47,20 +47,22 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
 
 
-def beside(value: Floats, covariance: Floats, grade: Grade) -> dict[str, Any]:
+def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
     """
     Return what stands beside the estimates: figures by their names in calibration.json.
 
-    value, covariance : (M,), (M, M) of the constants.   grade : Grade that the Imu is taken for.
+    value, covariance : (M,), (M, M) of the constants.   grade : that the Imu is taken for, None
+    without an accelerometer.
     """
     sigma = np.sqrt(np.diag(covariance))
     # scale_by_speed: the slope at FAST
     out: dict[str, Any] = {name: {'slope': float(value[i]), 'sigma': float(sigma[i]), 'unit': unit}
                  for name, i, unit in (('scale_by_speed', BY_SPEED, '1/(m/s)'),
                                        ('scale_by_time', BY_TIME, '1/s'))}
-    for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
-        out[f'{name}_mounting_angle_housing_sigma'] = _figure(
-            _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
+    if grade is not None:
+        for name, angle, axis in (('yaw', YAW, AXIS_XY), ('pitch', PITCH, AXIS_ZX)):
+            out[f'{name}_mounting_angle_housing_sigma'] = _figure(
+                _of_housing(value[axis], sigma[axis], sigma[angle], grade.misalignment), 'rad')
     next_drive = 1e-3       # physical: by so much tyres differ from drive to drive, warm or cold
     out['scale_ratio_next_drive_sigma'] = _figure(np.hypot(sigma[LN_K], next_drive), '1')
     return out

@@ -26,7 +26,8 @@ from odocal_ros.calib.smoother.outcome import determined, floored, in_words, OPT
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.priors import SHARED, SIZE
 from odocal_ros.calib.smoother.remarks import beside, MODEL_FLOOR
-from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, LN_K
+from odocal_ros.calib.smoother.state import CONSTANTS, IMPERFECT, LN_K, PITCH
+from odocal_ros.calib.smoother.wheel_result import joined, wheel_details, wheel_estimates
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
@@ -78,16 +79,23 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     nominal = next((e['scale_factor'].value / e['scale_ratio'].value for e in
                     (leg.estimates for leg in legs) if e['scale_ratio'].value), 0.0)
     estimates, why = determined(found.value[at], sigma, ratio, scale.unit, nominal, config)
+    wheels = joined(legs)
+    if wheels:
+        of_wheels, more = wheel_estimates(wheels, estimates['scale_factor'], config)
+        estimates, why = estimates | of_wheels, why + more
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
         why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
                           f'{in_words(unsaid)}; what the settings say of it is kept'))
     sources = _sources(found.used[at] * found.factor, C)
+    # by any leg with an accelerometer
+    grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
     said = [_changed(change, np.asarray(times_ns)[order], names) for change in changes]
     return MethodResult('smoother', (*said, *_disputed(found, names), *why), estimates, PARAMETERS,
                         sources, _details(found, found.value[at], C, sources, len(legs))
-                        | {'beside': beside(found.value[at], C, grade_of(config.imu))},
+                        | {'beside': beside(found.value[at], C, grade)}
+                        | wheel_details(wheels),
                         found.carried)
 
 

@@ -20,7 +20,7 @@ from odocal_ros.calib.smoother.estimate import Fit, fit, Trace
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outcome import no_imu, outcome, refused
-from odocal_ros.calib.smoother.problem import Problem, with_imperfect
+from odocal_ros.calib.smoother.problem import nominal_yaw, Problem, with_imperfect
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.start import first_state, Start
@@ -52,17 +52,17 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     MethodResult named ``smoother``; what the leg cannot determine is None with its reason.
 
     """
-    few = too_little_of(leg)
+    few, two_wheels = too_little_of(leg), len(leg.wheels) > 1
     if few:
-        return refused([few], leg.scale_unit)
+        return refused([few], leg.scale_unit, two_wheels)
     problem = Problem.of(leg, config)
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
         return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}; '
-                               'samples are missing or wild there')], leg.scale_unit)
+                               'samples are missing or wild there')], leg.scale_unit, two_wheels)
     if implausible := no_imu(best):
-        return refused(implausible, leg.scale_unit)
+        return refused(implausible, leg.scale_unit, two_wheels)
     return outcome(leg, problem, best, config)
 
 
@@ -78,12 +78,13 @@ def best_fit(problem: Problem, config: Config, trace: Trace | None = None) -> Fi
 
 
 def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
-    start = first_state(problem.leg, problem.imu, problem.priors)
-    if start.yaw_sigma <= TWO_HEADINGS:
+    nominal = nominal_yaw(config)
+    start = first_state(problem.leg, problem.imu, problem.priors,
+                        None if problem.leg.felt else nominal)
+    if not problem.leg.felt or start.yaw_sigma <= TWO_HEADINGS:
         return fit(problem, start.state, _first_levels(problem, start),
                    config.leg.compute_limit, trace=trace)
-    yaw = config.imu.nominal_yaw
-    other = first_state(problem.leg, problem.imu, problem.priors, 0.0 if np.isnan(yaw) else yaw)
+    other = first_state(problem.leg, problem.imu, problem.priors, nominal)
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
                  for one in (start, other)), key=lambda f: f.likelihood).outline()
     last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,

@@ -9,8 +9,7 @@
 
 """Slips of the wheels as they are found and said."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -49,6 +48,19 @@ class WheelSlips:
         return (self.begin + self.end) / 2
 
 
+    def doubts(self) -> tuple[Floats, Floats]:
+        """
+        Return where the mean of both wheels is in doubt, and by how much: (d,) s, (d,) m.
+
+        A slip of one wheel is half as large in the mean, drawn out over the seconds it lasts.
+        """
+        seconds = np.maximum(np.ceil(self.end - self.begin), 1.0).astype(int)
+        t = [begin + (end - begin) * (np.arange(n) + 0.5) / n
+             for begin, end, n in zip(self.begin, self.end, seconds, strict=True)]
+        sigma = np.repeat(np.abs(self.size) / 2 / np.sqrt(seconds), seconds)
+        return np.concatenate([*t, []]), sigma
+
+
 NO_SLIPS = WheelSlips()
 
 
@@ -73,14 +85,3 @@ def slip_reason(slips: WheelSlips) -> tuple[Reason]:
                    f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
                    + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
                       if n > 1 else '')),)
-
-
-def with_unseen(known: WheelSlips, seen: Iterable[Mapping[str, Any]]) -> WheelSlips:
-    """Return WheelSlips with those of calibration.json after them, in order of time."""
-    begin = np.append(known.begin, [s['t'] for s in seen])
-    order = np.argsort(begin, kind='stable')
-    end = np.append(known.end, [s['t'] + s['duration'] for s in seen])
-    wheel = [{'left': -1, 'right': 1}.get(s['wheel'], 0) for s in seen]
-    return replace(known, begin=begin[order], end=end[order],
-                   size=np.append(known.size, [s['metres'] for s in seen])[order],
-                   wheel=np.append(known.wheel, wheel)[order].astype(np.int64))

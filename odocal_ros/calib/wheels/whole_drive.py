@@ -17,7 +17,7 @@ that changes on the way.
 
 import numpy as np
 
-from odocal_ros.calib.wheels.track_width import TRACK_WIDTH
+from odocal_ros.calib.track_width import TRACK_WIDTH
 from odocal_ros.data.arrays import Floats
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.wheel_pair import Pair, robust_fit

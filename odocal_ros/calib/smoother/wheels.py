@@ -1,0 +1,179 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Each wheel beside the mean of all: its factor, and where it rolls, docs/method.md (W1) to (W4).
+
+The scale factor of the fit is that of the mean reading. What a wheel reads beyond the mean is the
+turn of the vehicle times the wheel's distance from the middle, and the difference of the tyres:
+
+    K (s_i - s) = (a_i - 1) K s - a_i y_i psi,        K_i = K / a_i
+
+s_i and s the readings of wheel i and of the mean, psi the turn, y_i the wheel's place, positive to
+the left. The attitudes of the fit give the turn; any number of wheels is one line each. The places
+are those of the leg's turns: an outer tyre, which is pressed more, rolls on a smaller radius, and
+that is in them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.leg import SmootherLeg
+from odocal_ros.calib.smoother.motion import rotvec
+from odocal_ros.calib.smoother.motion_rows import MotionRows
+from odocal_ros.calib.smoother.noise import hard_and_turning
+from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.state import GYRO, GYRO_AXIS, GYRO_SIGNAL, LN_K, ODO_DELAY
+from odocal_ros.calib.smoother.wheel_noise import fit_line, Increments, Line
+from odocal_ros.calib.track_width import TRACK_WIDTH
+from odocal_ros.data.arrays import Floats, Ints
+
+OWN_DELAY = 0.02        # s, 1 sigma of a wheel's stamps against the others'. Judgement
+FIRST_WALK = 2e-3**2    # m^2/s, definition: where the levels set out
+DOUBTED = 1e10          # definition: share of a walk that makes an increment say nothing
+GAP = 0.3               # s, judgement: a line between readings is then off by a centimetre or two
+FEWEST = 20             # increments, judgement: levels by fewer are good to 30 % at best
+
+
+@dataclass(frozen=True, eq=False)
+class Wheel:
+    """
+    A wheel beside the mean.
+
+    ratio : K_i / K.   ratio_sigma : relative.   y : m to the left of the middle of all wheels.
+    y_sigma : m.   walk : m/sqrt(s), by which it parts from the mean: even, hard, in turns.
+    """
+
+    ratio: float
+    ratio_sigma: float
+    y: float
+    y_sigma: float
+    walk: tuple[float, ...]
+
+
+def wheels_beside(problem: Problem, fit: Fit, covariance: Floats, drift: float,
+                  width: float) -> tuple[Wheel, ...]:
+    """
+    Return each wheel of a leg beside their mean, () where there are no two or too little motion.
+
+    Parameters
+    ----------
+    problem, fit : Problem, Fit
+        The leg and its fit.
+    covariance : (M, M) array
+        Of the constants.
+    drift : float
+        Sigma of the gyro's bias about up, rad/s: of how the attitudes of the fit drift.
+    width : float
+        Track width as set, m, 0: unknown.
+
+    """
+    wheels, state = problem.leg.wheels, fit.state
+    if len(wheels) < 2:
+        return ()
+    t = state.t + state.constants[ODO_DELAY]
+    inside = np.flatnonzero((t >= max(w.t[0] for w in wheels))
+                            & (t <= min(w.t[-1] for w in wheels)))
+    if len(inside) < FEWEST:
+        return ()
+    s = np.stack([w.at(t[inside]) for w in wheels]) * state.scale
+    at = _nodes(s, state.scale * max(w.quantum for w in wheels))
+    if len(at) < FEWEST:
+        return ()
+    common = _Common(problem, fit, inside[at], s[:, at])
+    delay = float(np.sqrt(covariance[ODO_DELAY, ODO_DELAY]))
+    own = [LN_K, *range(GYRO.start, GYRO.stop)]
+    lines = [common.line(i, delay, drift, width) for i in range(len(wheels))]
+    return tuple(_wheel(line, common.moved(line), covariance[np.ix_(own, own)]) for line in lines)
+
+
+def _nodes(s: Floats, quantum: float) -> Ints:
+    """Return where readings (w, k) are compared: where one has moved by a count at least."""
+    nodes = [0]
+    for k in range(1, s.shape[1]):
+        # m: standing, a reading is one
+        if np.abs(s[:, k] - s[:, nodes[-1]]).max() > max(quantum, 1e-3):
+            nodes.append(k)
+    return np.array(nodes)
+
+
+def _unknown(leg: SmootherLeg) -> Iterator[tuple[float, float]]:
+    """Yield where increments say nothing: slips that are known, what gaps of a wheel hide, s."""
+    for t in leg.doubt_t:
+        yield t - 1.0, t + 1.0
+    for wheel in leg.wheels:
+        steps = np.diff(wheel.t)
+        for k in np.flatnonzero(steps > max(GAP, 3 * float(np.median(steps)))):
+            yield wheel.t[k], wheel.t[k + 1]
+
+
+class _Common:
+    """What the lines of all wheels have in common; s : (w, k) readings at the nodes, m."""
+
+    def __init__(self, problem: Problem, fit: Fit, at: Ints, s: Floats) -> None:
+        state, motion = fit.state, fit.weighted[MotionRows].motion
+        self.leg, self.s = problem.leg, s
+        self.way = np.diff(s.mean(axis=0))
+        up = state.C_bv[:, 2]
+        turn = rotvec(np.swapaxes(state.C_nb[:-1], 1, 2) @ state.C_nb[1:]) @ up
+        self.turn = np.diff(np.append(0.0, np.cumsum(turn))[at])
+        signals = np.concatenate([motion.sums.mean_rate, motion.sums.mean_force], axis=1)
+        errors = signals[:, GYRO_SIGNAL] * up[list(GYRO_AXIS)] * motion.T
+        ends = np.concatenate([np.zeros((1, errors.shape[1])), np.cumsum(errors, axis=0)])
+        self.turn_errors = np.diff(ends[at], axis=0)     # by units of the gyro's errors
+        rate = (problem.rate_b - state.gyro_bias) @ up
+        speed = np.einsum('ki,ki->k', state.v_n, state.C_nb @ state.forward)
+        self.faster, self.turning = np.diff(speed[at]), np.diff(rate[at])
+        hard, turns = hard_and_turning(motion)
+        kind = np.where(turns, 2, np.where(hard, 1, 0))
+        self.kind = kind[np.clip(at[1:] - 1, 0, len(kind) - 1)]
+        self.T, self.t = np.diff(state.t[at]), state.t[at]
+        # a second of driving each, less where wheels hardly turn, whatever they stood before
+        rolled = np.abs(np.diff(s)).max(axis=0)
+        self.share = np.clip(rolled, 0.02 * np.minimum(self.T, 1.0), self.T)
+        delay = state.constants[ODO_DELAY]
+        for begin, end in _unknown(problem.leg):
+            self.share[(self.t[1:] > begin - delay) & (self.t[:-1] < end - delay)] = DOUBTED
+        self.scale = state.scale
+
+    def line(self, i: int, delay: float, drift: float, width: float) -> Line:
+        """Return the line of a wheel: a - 1, a y, own delay, common delay, drift of the turn."""
+        wheels = self.leg.wheels
+        n = len(wheels)
+        # of two the left one comes first
+        y0 = (width or TRACK_WIDTH.of_a_car) / 2 * (1 if i == 0 else -1) if n == 2 else 0.0
+        X = np.stack([self.way, -self.turn, self.faster, y0 * self.turning, y0 * self.T], -1)
+        taped = TRACK_WIDTH.taped_share * width / 2 if n == 2 else 0.0
+        prior = np.array([1.0, taped or TRACK_WIDTH.any_sigma, OWN_DELAY,
+                          max(delay, 1e-4), max(drift, 1e-9)])
+        centre = np.array([0.0, y0 if taped else 0.0, 0.0, 0.0, 0.0])
+        weight = np.full(n, -1 / n)
+        weight[i] += 1.0
+        rounding = sum((w * q.quantum * self.scale)**2 / 12 for w, q in zip(
+            weight, wheels, strict=True))
+        return fit_line(Increments(
+            np.diff(self.s[i] - self.s.mean(axis=0)), X, prior, centre,
+            max(float(rounding), 1e-4**2), self.share, self.kind, np.full(3, FIRST_WALK)))
+
+    def moved(self, line: Line) -> Floats:
+        """Return the derivatives of a - 1 and a y by ln K and the gyro's errors: (2, 1 + g)."""
+        by_gyro = -line.gain[:2] @ self.turn_errors * line.x[1]
+        return np.column_stack([[0.0, line.x[1]], by_gyro])
+
+
+def _wheel(line: Line, moved: Floats, of_fit: Floats) -> Wheel:
+    a, y = 1 + line.x[0], line.x[1] / (1 + line.x[0])
+    covariance = line.covariance[:2, :2] + moved @ of_fit @ moved.T
+    gradient = np.array([-y, 1.0]) / a
+    return Wheel(float(1 / a), float(np.sqrt(covariance[0, 0]) / a), float(y),
+                 float(np.sqrt(gradient @ covariance @ gradient)),
+                 tuple(np.sqrt(line.levels).tolist()))
