@@ -79,13 +79,13 @@ class ImuConfig:
     gyro_noise: float = setting(NAN, 'rad/s/sqrt(Hz)', 0.0, 1.0, about='White gyro noise; NaN: '
                                 "the grade's.")
     gyro_bias: float = setting(NAN, 'rad/s', 0.0, 1.0, about='Turn-on gyro bias, 1 sigma; NaN: '
-                               "the grade's.")
+                               'as Imus of the grade are sold.')
     gyro_bias_walk: float = setting(NAN, 'rad/s/sqrt(s)', 0.0, 1.0, about='Random walk of the '
                                     "gyro bias; NaN: the grade's.")
     accel_noise: float = setting(NAN, 'm/s^2/sqrt(Hz)', 0.0, 10.0, about='White accelerometer '
                                  "noise; NaN: the grade's.")
     accel_bias: float = setting(NAN, 'm/s^2', 0.0, 10.0, about='Turn-on accelerometer bias, 1 '
-                                "sigma; NaN: the grade's.")
+                                'sigma; NaN: as Imus of the grade are sold.')
     accel_bias_walk: float = setting(NAN, 'm/s^2/sqrt(s)', 0.0, 10.0, about='Random walk of the '
                                      "accelerometer bias; NaN: the grade's.")
     gyro_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the gyro scale, '

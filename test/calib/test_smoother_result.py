@@ -30,6 +30,7 @@ from odocal_ros.calib.smoother.start import first_state
 from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO_SCALE, IMPERFECT, M, YAW
 from odocal_ros.reasons import Code, Verdict
 from odocal_ros.settings.config import with_settings
+from odocal_ros.settings.grades import GRADES, turn_on_bias
 
 smoother = import_module('odocal_ros.calib.smoother.smoother')
 SHORT = {'duration': 200.0, 'imu_grade': 'industrial'}
@@ -254,3 +255,15 @@ def test_a_turn_on_bias_as_imus_are_sold_with_is_no_worse_grade(times, said):
     worse = [r.text for r in method.reasons if r.code is Code.IMU_WORSE_THAN_GRADE]
     assert bool(worse) == said, worse
     assert np.abs(off(drive, method)).max() < 3.3
+
+
+def test_turn_on_biases_have_the_priors_of_imus_as_sold():
+    """Else what a bias does would pass for an axis that points off: docs/decisions/0016."""
+    _, config, leg = made(**SHORT)
+    gyro, accel = turn_on_bias(config.imu)
+    priors = Problem.of(leg, config).priors
+    assert priors.gyro_bias == pytest.approx(gyro)
+    assert priors.accel_bias[:2] == pytest.approx(accel)
+    assert accel > GRADES['industrial'].accel_bias
+    known = with_settings(config, {'imu.accel_bias': 0.04})
+    assert Problem.of(leg, known).priors.accel_bias[:2] == pytest.approx(0.04)

@@ -349,7 +349,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; 710 m more bring it to the asked 1000 ppm; yaw ' in told
+    assert ' m/pulse +- 2000 ppm so far; 700 m more bring it to the asked 1000 ppm; yaw ' in told
     assert told.endswith('; stop and start 12 times, or turn as often, for the yaw')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; as it was 40 s ago; ' in told

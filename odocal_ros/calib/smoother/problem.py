@@ -51,7 +51,7 @@ from odocal_ros.calib.smoother.state import (
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.settings.config import Config
-from odocal_ros.settings.grades import G, Grade, grade_as_seen
+from odocal_ros.settings.grades import G, Grade, grade_as_seen, turn_on_bias
 
 # how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
 # forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
@@ -251,16 +251,19 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     sigma[GNSS_DELAY] = max(config.gnss.time_sigma, 1e-5)
     sigma[HEADING] = leg.heading.sigma
     sigma[IMPERFECT] = np.maximum(imperfect_sigmas(grade), NO_ERROR)
+    # as Imus are sold, whatever the grade says of one that was calibrated: else a bias would pass
+    # for an axis that points off, and the yaw of a tilted Imu with it
+    gyro_bias, accel = map(max, turn_on_bias(config.imu), (grade.gyro_bias, grade.accel_bias))
     # what gravity makes of the scale is a bias too
-    up = np.hypot(grade.accel_bias, grade.accel_scale_error * G)
-    accel_bias = np.maximum([grade.accel_bias, grade.accel_bias, up], 1e-6)
+    up = np.hypot(accel, grade.accel_scale_error * G)
+    accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(M)
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
     if not leg.felt:        # nothing tells the mounting from the attitude: it is as set
         sigma[ACCEL] = sigma[PITCH] = NO_ERROR
         if not len(leg.heading.t):
             centre[YAW], sigma[YAW] = nominal_yaw(config), NO_ERROR
-    return Priors(np.full(3, max(grade.gyro_bias, 1e-9)), accel_bias, sigma, centre)
+    return Priors(np.full(3, max(gyro_bias, 1e-9)), accel_bias, sigma, centre)
 
 
 def nominal_yaw(config: Config) -> float:
