@@ -44,10 +44,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from resumed import read_rows
 from zoo_table import print_tables
 
-from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS
+from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, RARE
 
 CLEAN = 'clean'
-RUNS = ('all', *EFFECTS, CLEAN)
+RUNS = ('all', *EFFECTS, CLEAN, *RARE)     # in the order of their seeds
 FIRST_SEED, SEEDS_A_RUN = 70_000_000, 1_000_000
 BLOCK = 3       # drives a process does before it reports
 

@@ -63,6 +63,8 @@ class Code(Enum):
     COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
     SPEED_COARSE = NOTE, ('Take wheel pulses or a finer speed signal of the same bus, if there is '
                           'one; the smoother hears when the steps change and can do without.')
+    SPEED_ON_CHANGE = NOTE, ('Take wheel pulses or a speed that is sent at a fixed rate, if the '
+                             'vehicle has one.')
     SPEED_FILTERED = CAUTION, ('Take wheel pulses or an unfiltered speed signal of the same bus; '
                                'the smoother allows for a delay, not for a filter.')
     COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
@@ -114,6 +116,9 @@ class Code(Enum):
                           'the speeds that matter, and combine legs.')
     FIXES_SMOOTHED = NOTE, ("Switch off the receiver's smoothing (position filter, static hold) "
                             'if you can: accelerations then tell more.')
+    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use the fixes of the receiver alone: choose the topic '
+                                      'before fusion, or switch off its odometer (dead reckoning '
+                                      'mode), and drive again.')
     # the estimate
     YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
                                   'alignment.heading with its sigma, a dual-antenna heading '

@@ -86,6 +86,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'they are half a step too low on the mean, rounded they are not, and the steps do not say '
         'which. The smoother uses the moments at which the speed passes from one step to the '
         'next, and finds which; the sigma of the other methods holds half a step.',
+        Code.SPEED_ON_CHANGE: 'The speed repeats one value until it has changed by a step: it '
+        'lags while the vehicle speeds up or brakes. At least 30 % of the moving rows repeat the '
+        'one before, and the least change is more than 0.6 of the tenth percentile of all.',
         Code.SPEED_FILTERED: 'Over intervals of a second the odometer departs from the vehicle as '
         'its acceleration changes, which a low-pass filter of the speed does and wheel slip does '
         'not. Many speed signals of cars are filtered over 0.2 to 0.5 s. Slip is what is left.',
@@ -152,7 +155,11 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'in this leg. What is given is its mean over the way driven; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',
         Code.FIXES_SMOOTHED: 'Positions follow accelerations as a filter does, later and rounder '
-        'than a delay alone would have them.',
+        'than a delay alone would have them, or overshoot as a filter of position and velocity '
+        'does.',
+        Code.FIXES_FOLLOW_ODOMETER: 'Over seconds the fixes travel by another scale than over '
+        'minutes, as those of a receiver do that is fused with a wheel speed of its own. Limits: '
+        '5 of its sigmas and 0.05 %.',
     },
     'The estimate': {
         Code.YAW_NOT_SEPARABLE: 'End points see the sum of initial heading and yaw mounting '

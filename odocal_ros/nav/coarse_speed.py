@@ -16,7 +16,7 @@ one, the speed passes the edge between both cells. Where it changes by more, eac
 cell. Zero is no cell: below it is whatever the sender holds for rest.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,6 +24,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.gaps import MISSING_INTERVALS
 
+LEAST_CROSSING = 0.02      # judgement: of a cell, sigma of a crossing: what speeds do beside
 LEAST_CELLS = 3.0          # judgement: cells that the values must span
 # judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 GRID_COHERENCE = 0.9
@@ -53,12 +54,18 @@ class CoarseSpeed:
 
     step : scale units per s.   t, value : (n,) s and scale units per s, the rows that are data.
     interpolated : rows between these were sent, which say nothing more.
+    truncates : whether all values may be too small by up to half a step.
     """
 
     step: float
     t: Floats
     value: Floats
     interpolated: bool = False
+    truncates: bool = True
+
+    def times(self, sign: Floats) -> 'CoarseSpeed':
+        """Return the speed times signs (n,)."""
+        return replace(self, value=self.value * sign)
 
     @cached_property
     def most(self) -> float:
@@ -112,8 +119,7 @@ class CoarseSpeed:
         # one of its rows by turns: where the speed turns about, the middle one is the fastest
         row = first + (length * (np.arange(len(first)) * golden % 1.0)).astype(int)
         when, value = np.r_[middle[single], t[row]], np.r_[edge[single], v[row]]
-        least_crossing = 0.02    # of a cell, sigma of a crossing: what speeds do beside
-        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), least_crossing * q)
+        sigma = np.hypot(np.r_[sigma, np.full(len(row), q)] / np.sqrt(12), LEAST_CROSSING * q)
         order = np.argsort(when, kind='stable')
         return SpeedInstants(when[order], value[order], np.sign(value[order]), sigma[order])
 

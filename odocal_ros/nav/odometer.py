@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from odocal_ros.data.arrays import Bools, Floats, Values
 from odocal_ros.data.samples import OdometerForm
 from odocal_ros.nav.coarse_speed import coarse_speed, CoarseSpeed
+from odocal_ros.nav.held_speed import held_speed, HeldSpeed
 from odocal_ros.reasons import Code, Reason
 
 # judgement: a step this many times the 95th percentile of the moving rate is no motion
@@ -50,7 +51,7 @@ class Travel:
             return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
                             -1.0, 1.0)
         step = np.diff(self.s, prepend=self.s[:1]) * way(self.t)
-        coarse = self.coarse and replace(self.coarse, value=self.coarse.value * way(self.coarse.t))
+        coarse = self.coarse and self.coarse.times(way(self.coarse.t))
         return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 
@@ -81,8 +82,11 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     reasons: tuple[Reason, ...] = ()
     coarse = None
     if form.quantity == 'rate':
-        step = (value[:-1] + value[1:]) / 2 * np.diff(t)
-        coarse = coarse_speed(t, (-value if reversed_counts else value).astype(float, copy=False))
+        speed = value.astype(float, copy=False)
+        coarse = _coarse(t, -speed if reversed_counts else speed)
+        if isinstance(coarse, HeldSpeed):
+            speed = -coarse.value if reversed_counts else coarse.value
+        step = (speed[:-1] + speed[1:]) / 2 * np.diff(t)
     elif form.quantity == 'increment':
         step = value[1:].astype(float)
     else:
@@ -90,6 +94,12 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
     s = np.concatenate([[0.0], np.cumsum(step)]) if len(value) else np.empty(0)
     quantum = 1.0 if whole and form.quantity != 'rate' else 0.0
     return Travel(t, -s if reversed_counts else s, quantum, coarse), reasons
+
+
+def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:
+    """Return what a speed's steps are; of a fine grid that is held, that it is held."""
+    coarse, held = coarse_speed(t, value), held_speed(t, value)
+    return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
 
 def mean_travel(left: Travel, right: Travel) -> Travel:

@@ -8,71 +8,148 @@
 # the License.
 
 """
-What a receiver that smooths makes of a way: the mean of its past, weighted exp(-age / tau) / tau.
+What a receiver's filter makes of its fixes, by one unknown ``square``, s^2.
 
-A stamp's delay is the mean age; what is computed here is the rest of it, by the square of tau: the
-smoothed place at t + tau less the place at t. Of small tau that is a tau^2 / 2, a series that does
-not end soon: of 0.6 s in town its next terms are decimetres.
+Above zero: the mean of the past, weighted exp(-age / tau) / tau, square = tau^2. A stamp's delay
+is the mean age; what is computed here is the rest, the smoothed place at t + tau less the place
+at t. Below zero: a filter of position and velocity, square = -2 tau^2, which follows a steady
+velocity without delay and overshoots where it changes: e'' + sqrt(2) e' / tau + e / tau^2 = -p''.
+Of small tau both are p'' square / 2, a series that does not end soon: of 0.6 s in town its next
+terms are decimetres.
 """
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 
-# s^2, judgement: below, as much in proportion (and of an estimate below zero)
+# s^2, judgement: nearer to zero, as much in proportion
 LEAST_LAG2 = 1e-4
 
 
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
               ) -> tuple[Floats, Floats]:
     """
-    Return by how far smoothed places lie off the true ones, and the derivative by ``square``.
+    Return by how far filtered places lie off the true ones, and the derivative by ``square``.
 
     t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
-    at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, of tau.
+    at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, as above.
     """
-    def late(square: float) -> Floats:
-        return _late(t, place, velocity, at, np.sqrt(square))
+    def off(square: float) -> Floats:
+        if square > 0:
+            return _late(t, place, velocity, at, np.sqrt(square))
+        return _tracked(t, place, velocity, at, np.sqrt(-square / 2))
 
-    if square <= LEAST_LAG2:
-        rate = late(LEAST_LAG2) / LEAST_LAG2
+    if abs(square) <= LEAST_LAG2:
+        least = -LEAST_LAG2 if square < 0 else LEAST_LAG2
+        rate = off(least) / least
         return rate * square, rate
-    here = late(square)
+    here = off(square)
     lag2_step = 1e-4    # relative, of the difference that gives a derivative
-    return here, (late(square * (1 + lag2_step)) - here) / (square * lag2_step)
+    return here, (off(square * (1 + lag2_step)) - here) / (square * lag2_step)
+
+
+def _bends(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return (n - 1, 1) lengths of the intervals, (n - 1, 3) p'' / 2 at their begin, p''' / 6."""
+    T = np.diff(t)[:, None]
+    mean = np.diff(place, axis=0) / T
+    return (T, (3 * mean - 2 * velocity[:-1] - velocity[1:]) / T,
+            (velocity[:-1] + velocity[1:] - 2 * mean) / T**2)
+
+
+def odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share: float,
+                   log_time: float) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the errors of a receiver by its own odometer, and derivatives by share and log_time.
+
+    It is ``share`` times the motion until ``at``, weighted exp(-age / time): satellites take the
+    places of its odometer back within that time.
+
+    t, place, velocity, at : as for ``smoothing``.   share : relative error of its odometer.
+    log_time : logarithm of s.
+    """
+    track, time, step = _Track(t, place, velocity), np.exp(log_time), 1e-3    # of the logarithm
+    motion = track.at(at) - track.smoothed(at, time)
+    longer = track.at(at) - track.smoothed(at, time * np.exp(step))
+    return share * motion, motion, share * (longer - motion) / step
 
 
 def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
+    """Return the smoothed places at ``at + tau`` less those at ``at``, (k, 3)."""
+    track = _Track(t, place, velocity)
+    return track.smoothed(at + tau, tau) - track.at(at)
+
+
+class _Track:
+    """Cubics between places and velocities, steady beyond both ends, and means of their past."""
+
+    def __init__(self, t: Floats, place: Floats, velocity: Floats) -> None:
+        beyond = 10.0       # s that the way goes on at its last velocity
+        self.t = np.append(t, t[-1] + beyond)
+        self.place = np.concatenate([place, place[-1:] + beyond * velocity[-1:]])
+        self.velocity = np.concatenate([velocity, velocity[-1:]])
+        self.T, self.bend, self.twist = _bends(self.t, self.place, self.velocity)
+
+    def _cubic(self, at: Floats) -> tuple[Ints, Floats, Floats]:
+        """Return intervals (k,), times in them (k, 1) and places (k, 3)."""
+        k = np.clip(np.searchsorted(self.t, at, side='right') - 1, 0, len(self.T) - 1)
+        s = (at - self.t[k])[:, None]
+        return k, s, self.place[k] + s * (
+            self.velocity[k] + s * (self.bend[k] + s * self.twist[k]))
+
+    def at(self, at: Floats) -> Floats:
+        """Return the places at ``at``, (k, 3)."""
+        return self._cubic(at)[2]
+
+    def smoothed(self, at: Floats, tau: float) -> Floats:
+        """
+        Return the mean of the past of ``at``, weighted exp(-age / tau), (k, 3).
+
+        On a cubic it is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is left of before
+        dies away.
+        """
+        T, bend, twist = self.T, self.bend, self.twist
+        # where two cubics meet, their answers differ by jumps of p'' and p'''
+        first = tau**2 * (2 * bend - 6 * tau * twist)
+        last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
+        left = np.concatenate([-first[:1], last[:-1] - first[1:]])
+        for m, decay in enumerate(np.exp(-T[:-1] / tau), 1):
+            left[m] += decay * left[m - 1]
+        k, s, p = self._cubic(at)
+        rate = self.velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
+        after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
+        out: Floats = after + left[k] * np.exp(-np.maximum(s, 0.0) / tau)
+        return out
+
+
+def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
     """
-    Return the smoothed places at ``at + tau`` less those at ``at``, (k, 3).
+    Return the error at ``at`` of a filter of position and velocity, (k, 3).
 
-    On a cubic the filter's answer is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is
-    left of before dies away.
+    On a cubic it is tau^2 (-p'' + sqrt(2) tau p'''), and what is left of before swings out.
     """
-    track_beyond = 10.0    # s that the way goes on at its last velocity
-    t = np.append(t, t[-1] + track_beyond)
-    place = np.concatenate([place, place[-1:] + track_beyond * velocity[-1:]])
-    velocity = np.concatenate([velocity, velocity[-1:]])
-    T = np.diff(t)[:, None]
-    mean = np.diff(place, axis=0) / T
-    bend = (3 * mean - 2 * velocity[:-1] - velocity[1:]) / T             # p'' / 2 at its begin
-    twist = (velocity[:-1] + velocity[1:] - 2 * mean) / T**2             # p''' / 6
-    # where two cubics meet, their answers differ by jumps of p'' and p'''
-    first = tau**2 * (2 * bend - 6 * tau * twist)
-    last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
-    left = np.concatenate([-first[:1], last[:-1] - first[1:]])
-    for m, decay in enumerate(np.exp(-T[:-1] / tau), 1):
-        left[m] += decay * left[m - 1]
+    T, bend, twist = _bends(t, place, velocity)
 
-    def cubics(at: Floats) -> tuple[Ints, Floats]:
-        k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
-        return k, (at - t[k])[:, None]
+    def forced(k: Ints | slice, s: Floats) -> Floats:
+        jerk = 6 * twist[k]
+        return tau**2 * np.stack([np.sqrt(2) * tau * jerk - 2 * bend[k] - jerk * s, -jerk], 1)
 
-    k, s = cubics(at)
-    before = place[k] + s * (velocity[k] + s * (bend[k] + s * twist[k]))
-    k, s = cubics(at + tau)
-    p = place[k] + s * (velocity[k] + s * (bend[k] + s * twist[k]))
-    rate = velocity[k] + s * (2 * bend[k] + 3 * s * twist[k])
-    after = p - tau * rate + tau**2 * (2 * bend[k] + 6 * (s - tau) * twist[k])
-    off: Floats = after + left[k] * np.exp(-np.maximum(s, 0.0) / tau) - before
+    swing = _swing(np.append(0.0, T[:-1, 0]), tau)
+    first, last = forced(slice(None), np.zeros_like(T)), forced(slice(None), T)
+    left = -first
+    left[1:] += last[:-1]       # error and its derivative go on where two cubics meet
+    for m in range(1, len(T)):
+        left[m] += swing[m] @ left[m - 1]
+    k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
+    s = (at - t[k])[:, None]
+    off: Floats = forced(k, s)[:, 0] + np.einsum(
+        'ki,kij->kj', _swing(np.maximum(s[:, 0], 0.0), tau)[:, 0], left[k])
     return off
+
+
+def _swing(s: Floats, tau: float) -> Floats:
+    """Return what is left after s of an error and its derivative: (k, 2, 2)."""
+    w = np.sqrt(0.5) / tau      # rate of decay and frequency, of a damping of sqrt(1/2)
+    decay, sine, cosine = np.exp(-w * s), np.sin(w * s), np.cos(w * s)
+    out: Floats = decay[:, None, None] * np.stack([
+        np.stack([cosine + sine, sine / w], -1), np.stack([-2 * w * sine, cosine - sine], -1)], 1)
+    return out

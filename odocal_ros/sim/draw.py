@@ -27,7 +27,8 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS
+EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS     # all of them, in a drawn vehicle
+RARE = draw_road.RARE
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
 
 
@@ -58,8 +59,8 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
                        f'{", ".join(GRADES)}')
     names = list(EFFECTS) if effects is None else list(effects)
     for name in names:
-        if name not in EFFECTS:
-            raise BadUsage(f'--effect {name}: want one of {", ".join(EFFECTS)}')
+        if name not in EFFECTS | RARE:
+            raise BadUsage(f'--effect {name}: want one of {", ".join(EFFECTS | RARE)}')
     if set(ODOMETER_EFFECTS) <= set(effects or ()):
         raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer')
     own = given.pop('real', {})
@@ -73,7 +74,7 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
     real: dict[str, Any] = {}
     there = []
     for name in names:
-        changes, figures = EFFECTS[name](stream(seed, f'vehicle {name}'), vehicle)
+        changes, figures = (EFFECTS | RARE)[name](stream(seed, f'vehicle {name}'), vehicle)
         if changes or figures:      # a draw may come out as none
             there.append(name)
         options |= changes

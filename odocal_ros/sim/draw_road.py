@@ -130,6 +130,26 @@ def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     return {'outages': tuple(sorted(spans))}, {'drops': 0.01}
 
 
+def fused_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Fuse an odometer that is not calibrated into the fixes, as car head units do."""
+    return {}, {'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
+                'receiver_odometer_time': lognormal(rng, 20.0, 0.5)}
+
+
+def tracked_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Filter position and velocity as receivers set for vehicles do."""
+    return {}, {'receiver_tracking': float(rng.uniform(0.3, 1.0))}
+
+
+def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
+    """Send a speed on until it has changed by a step, as buses do to save messages."""
+    ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
+    return ({'odometer': 'speed', 'scale': ratio, 'nominal_scale': 1.0},
+            {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))})
+
+
 EFFECTS = {f.__name__: f for f in (
     coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
+# drawn where they are asked for by name: of receivers and buses that some vehicles have
+RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed)}

@@ -26,9 +26,10 @@ NONE3, NONE9 = (0.0,) * 3, (0.0,) * 9    # definition
 WORDS = {'speed_rounding': ('floor', 'round'), 'told_grade': tuple(GRADES)}
 SIGNED = ('gyro_matrix', 'accel_matrix', 'g_sensitivity', 'gyro_bias', 'accel_bias', 'gyro_slope',
           'accel_slope', 'warm_rise', 'rectification', 'speed_law', 'warming', 'imu_arm_error',
-          'odometer_arm_error', 'antenna_arm_error', 'sideslip', 'squat', 'body_roll')
+          'odometer_arm_error', 'antenna_arm_error', 'receiver_odometer', 'sideslip',
+          'squat', 'body_roll')
 POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_factor',
-            'imu_batch')
+            'receiver_odometer_time', 'imu_batch')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,7 @@ class Real:
     speed_step: float = 0.0          # step of the speed sent, in its unit; 0: fine
     speed_rounding: str = 'floor'    # floor or round
     dead_band: float = 0.0           # speeds below are sent as 0
+    speed_hold: float = 0.0          # a speed is sent until it has changed by that
     odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
     speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
     warming: float = 0.0             # relative growth of the tyres, warm against cold
@@ -78,6 +80,9 @@ class Real:
     antenna_arm_error: Vector = NONE3
 
     receiver_lag: float = 0.0        # s, time constant of a first-order filter on positions
+    receiver_tracking: float = 0.0   # s, of a filter of position and velocity
+    receiver_odometer: float = 0.0   # relative error of an odometer that is fused into the fixes
+    receiver_odometer_time: float = 20.0    # s in which satellites take its places back
     # (sigma m of east and north, up twice; correlation s) each
     slow_errors: tuple[tuple[float, float], ...] = ()
     bursts: float = 0.0              # multipath bursts per hour

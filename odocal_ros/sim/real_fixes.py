@@ -22,8 +22,11 @@ from odocal_ros.sim.options import SimOptions
 EDGES = np.concatenate([np.arange(0.0, 8.0, 0.25), np.arange(8.0, 20.0, 1.0),
                         np.arange(20.0, 41.0, 4.0)])
 NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (0.5 + np.array([-1, 1]) / 12**0.5)).ravel()
-WEIGHTS = np.exp(-NODES) * np.repeat(np.diff(EDGES) / 2, 2)
-WEIGHTS /= WEIGHTS.sum()
+AVERAGING = np.exp(-NODES) * np.repeat(np.diff(EDGES) / 2, 2)
+AVERAGING /= AVERAGING.sum()
+# definition: of a second-order filter of position and velocity, damped by sqrt(1/2)
+TRACKING = np.exp(-NODES / 2**0.5) * np.cos(NODES / 2**0.5) * np.repeat(np.diff(EDGES) / 2, 2)
+TRACKING /= TRACKING.sum()
 UP = 2.0             # judgement: errors of the height over those of east and north
 SPREAD = 0.9         # judgement: of the logarithm of a burst's size and length
 ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
@@ -31,14 +34,37 @@ ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
     """Return latitude, longitude (rad), height (m) that a receiver without noise tells at t."""
-    lag = options.real.receiver_lag
-    if not lag:
-        return _antenna(motion, t, options)
-    # the mean of the past with weights exp(-age / lag) / lag; before the first sample the vehicle
-    # stood
-    return tuple(sum(w * x for w, x in zip(WEIGHTS, row, strict=True)) for row in zip(
-        *(_antenna(motion, np.maximum(t - lag * node, 0.0), options) for node in NODES),
+    real, true = options.real, _antenna(motion, t, options)
+    out = true
+    for weights, time in ((AVERAGING, real.receiver_lag), (TRACKING, real.receiver_tracking)):
+        if time:
+            out = _filtered(motion, t, options, weights, time)
+    if real.receiver_odometer:
+        mean = _filtered(motion, t, options, AVERAGING, real.receiver_odometer_time)
+        share = real.receiver_odometer
+        latitude, longitude, height = (x + share * (now - past) for x, now, past in zip(
+            out, true, mean, strict=True))
+        return latitude, longitude, height
+    return out
+
+
+def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
+              time: float) -> tuple[Floats, Floats, Floats]:
+    """Return places weighted by their age; before the first sample the vehicle stood."""
+    return tuple(sum(w * x for w, x in zip(weights, row, strict=True)) for row in zip(
+        *(_antenna(motion, np.maximum(t - time * node, 0.0), options) for node in NODES),
         strict=True))
+
+
+def fused(t: Floats, errors: Floats, options: SimOptions) -> Floats:
+    """Return (n, 3) errors of satellites as a receiver with an odometer of its own has them."""
+    if not options.real.receiver_odometer:
+        return errors
+    left = np.exp(-np.diff(t) / options.real.receiver_odometer_time)
+    out = errors.copy()
+    for k, a in enumerate(left, 1):
+        out[k] = a * out[k - 1] + (1 - a) * errors[k]
+    return out
 
 
 def _antenna(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:

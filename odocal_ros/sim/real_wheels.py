@@ -64,9 +64,20 @@ def leg_factor(state: State, real: Real) -> float:
 
 
 def coarse(speed: Floats, real: Real) -> Floats:
-    """Return speeds as a bus sends them: in steps, 0 below the dead band."""
+    """Return speeds as a bus sends them: in steps, 0 below the dead band, or held."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step
         steps = np.floor(steps) if real.speed_rounding == 'floor' else np.floor(steps + 0.5)
         speed = np.sign(speed) * steps * real.speed_step
-    return np.where(np.abs(speed) < real.dead_band, 0.0, speed) if real.dead_band else speed
+    if real.dead_band:
+        speed = np.where(np.abs(speed) < real.dead_band, 0.0, speed)
+    return held(speed, real.speed_hold) if real.speed_hold else speed
+
+
+def held(speed: Floats, step: float) -> Floats:
+    """Return speeds each of which is sent until one is 0 or a step away."""
+    out = speed.tolist()
+    for k, now in enumerate(out[1:], 1):
+        if now and abs(now - out[k - 1]) < step:
+            out[k] = out[k - 1]
+    return np.array(out)

@@ -218,7 +218,7 @@ def fixes(motion: Motion, options: SimOptions) -> FixSamples:
     ns, t = stamps(motion.duration, options.fix_rate, PHASE['fix'])
     real = options.real
     latitude, longitude, height = real_fixes.places(motion, t, options)
-    error = fix_errors(t, options) + real_fixes.errors(t, options)
+    error = real_fixes.fused(t, fix_errors(t, options) + real_fixes.errors(t, options), options)
     meridian, normal = radii(latitude)
     latitude = latitude + error[:, 1] / (meridian + height)
     longitude = longitude + error[:, 0] / ((normal + height) * np.cos(latitude))

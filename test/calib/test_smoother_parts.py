@@ -28,6 +28,8 @@ from odocal_ros.calib.smoother.state import (
     CONSTANTS,
     constants_from,
     E,
+    FIX_LAG2,
+    FIX_TIME,
     GNSS_DELAY,
     GYRO,
     IMPERFECT,
@@ -70,8 +72,9 @@ def shaken():
     step[:, PHI.start:BG.stop] *= 0.1
     c = 1e-3 * rng.standard_normal(M)
     # of the size that there is: derivatives leave out how these change what the others do
-    c[SPEED_OFFSET] = 0.0
-    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.03, 0.003, *[0.0] * 6, 1e3]
+    c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
+    c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.03, 0.003, *[0.0] * 6, 1e3]
+    c[FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
     return problem, state.moved(step, c)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-from odocal_ros.nav.receiver_filter import LEAST_LAG2, smoothing
+from odocal_ros.nav.receiver_filter import LEAST_LAG2, odometer_error, smoothing
 
 
 def swaying(t):
@@ -35,6 +35,42 @@ def test_a_sine_comes_out_as_a_first_order_filter_has_it(tau):
     above, below = (smoothing(t, *swaying(t), at, tau**2 + x)[0] for x in (h, -h))
     # the product's own difference is one-sided, 1e-4 of tau^2 long
     assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
+
+
+@pytest.mark.parametrize('tau', [0.005, 0.3, 1.0, 2.5])
+def test_a_sine_comes_out_as_a_filter_of_position_and_velocity_has_it(tau):
+    t, at, square = np.arange(0.0, 60.0, 0.2), np.linspace(35.0, 50.0, 40), -2 * tau**2
+    off, rate = smoothing(t, *swaying(t), at, square)
+    w = np.array([0.5, 0.7])
+    s = 1j * w * tau
+    sines = np.exp(1j * np.multiply.outer(at, w)) * -s**2 / (s**2 + np.sqrt(2) * s + 1)
+    want = [20.0, 3.0] * sines.imag
+    # as above; of what the begin left, exp(-35 / (2.5 sqrt(2)))
+    assert_allclose(off, want, rtol=0, atol=3e-3 * np.abs(want).max())
+    h = 1e-3 * max(-square, LEAST_LAG2)
+    above, below = (smoothing(t, *swaying(t), at, square + x)[0] for x in (h, -h))
+    assert_allclose(rate, (above - below) / (2 * h), rtol=0, atol=1e-3 * np.abs(rate).max())
+
+
+def test_both_filters_leave_the_same_where_they_are_fast():
+    t, at = np.arange(0.0, 60.0, 0.2), np.linspace(25.0, 50.0, 40)
+    rates = [smoothing(t, *swaying(t), at, x)[1] for x in (1e-9, -1e-9)]
+    # half the acceleration; 1e-2 s of the time constant, over 1.4 s of the faster sine
+    assert_allclose(*rates, rtol=0, atol=2e-2 * np.abs(rates[0]).max())
+
+
+def test_of_an_odometer_in_the_receiver_the_slow_part_is_taken_back():
+    t, at, share, time = np.arange(0.0, 200.0, 0.2), np.linspace(150.0, 190.0, 40), 0.02, 8.0
+    error, by_share, by_log_time = odometer_error(t, *swaying(t), at, share, np.log(time))
+    s = 1j * np.array([0.5, 0.7]) * time
+    sines = np.exp(1j * np.multiply.outer(at, [0.5, 0.7])) * s / (1 + s)
+    want = share * (np.array([20.0, 3.0]) * sines.imag)
+    assert_allclose(error, want, rtol=0, atol=1e-3 * np.abs(want).max())
+    assert_allclose(by_share, error / share, rtol=1e-12)
+    above, below = (odometer_error(t, *swaying(t), at, share, np.log(time) + x)[0]
+                    for x in (1e-3, -1e-3))
+    assert_allclose(by_log_time, (above - below) / 2e-3, rtol=0,
+                    atol=2e-3 * np.abs(by_log_time).max())
 
 
 def test_past_its_ends_a_way_goes_straight_on():

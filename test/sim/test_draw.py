@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS
+from odocal_ros.sim.draw import drawn, EFFECTS, GRADES, KINDS, ODOMETER_EFFECTS, RARE
 from odocal_ros.sim.real import Real
 from odocal_ros.sim.scenarios import simulate
 from odocal_ros.sim.truth import settings
@@ -45,6 +45,14 @@ def test_an_effect_alone_changes_something_and_is_that_of_the_whole(name):
         real, plain = asdict(one.real), asdict(Real())
         changed = {k: v for k, v in real.items() if v != plain[k]}
         assert changed.items() <= asdict(whole.real).items()
+
+
+@pytest.mark.parametrize('name', RARE)
+def test_a_rare_effect_is_drawn_where_it_is_named_only(name):
+    one, there = drawn(7, 'town', 'industrial', (name,))
+    assert there == (name,)
+    assert one != drawn(7, 'town', 'industrial', ())[0]
+    assert name not in drawn(7, 'town', 'industrial')[1]
 
 
 @pytest.mark.parametrize('kind', KINDS)

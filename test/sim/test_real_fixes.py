@@ -43,6 +43,33 @@ def test_a_receiver_that_filters_lags_by_its_closed_form():
     assert north(slow, [0.3])[0] == pytest.approx(0, abs=1e-8)
 
 
+def test_a_receiver_of_position_and_velocity_overshoots_by_its_closed_form():
+    tau = 0.8
+    tracked, exact = (replace(PAPER, real=Real(receiver_tracking=x)) for x in (tau, 0.0))
+    # a steady speed is followed without lag; an even acceleration with tau^2 of it
+    for t, want in ((450.0, 0.0), (330.0, 0.5 * tau**2)):
+        behind = (north(exact, [t]) - north(tracked, [t]))[0]
+        assert behind == pytest.approx(want, abs=2e-3)
+
+
+def test_an_odometer_in_the_receiver_adds_its_share_of_the_last_motion():
+    fused, exact = (replace(PAPER, real=Real(receiver_odometer=x, receiver_odometer_time=15.0))
+                    for x in (0.02, 0.0))
+    ahead = (north(fused, [450.0]) - north(exact, [450.0]))[0]
+    # at 20 m/s since 340 s: exp(-110 / 15) of it is missing
+    assert ahead == pytest.approx(0.02 * 20 * 15, rel=3e-3)
+
+
+def test_errors_of_satellites_are_smoothed_by_an_odometer_in_the_receiver():
+    t, options = np.arange(0.0, 4000.0), replace(PAPER, real=Real(receiver_odometer=0.01))
+    white = np.random.default_rng(1).standard_normal((len(t), 3))
+    left = real_fixes.fused(t, white, options)
+    a = np.exp(-1 / 20)
+    # 4000 / 40 independent draws an axis
+    assert left[200:].var() == pytest.approx((1 - a) / (1 + a), rel=5 * np.sqrt(2 / 300))
+    assert real_fixes.fused(t, white, PAPER) is white
+
+
 def test_slow_errors_have_their_size_and_the_covariance_knows():
     slow = ((1.2, 5.0), (0.9, 20.0))
     options = replace(PAPER, fix_sigma=0.3, fix_rate=10.0, real=Real(slow_errors=slow,

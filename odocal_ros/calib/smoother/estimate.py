@@ -23,6 +23,8 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
+from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.long_run import long_run
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels, ROAD
 from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
@@ -31,6 +33,7 @@ from odocal_ros.calib.smoother.priors import SIZE, SIZES
 from odocal_ros.calib.smoother.problem import Problem
 from odocal_ros.calib.smoother.slow_error import SlowError
 from odocal_ros.calib.smoother.state import (
+    FIX_TIME,
     IMPERFECT,
     M,
     PITCH,
@@ -87,6 +90,9 @@ PRIOR_GIVES_WAY = 2.0
 # of the logarithm of a size. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
 # (docs/decisions/0016)
 SIZE_SPREAD = 1.0
+# most receivers have no odometer, the others one that is up to 2 % off. Tuned: at 1 the sigma of
+# the scale is up to 2.8 times as large in drives without one, at 3 1.7 times (docs/decisions/0019)
+SIZE_SPREADS = {'size_fix_error_by_motion': 3.0}
 # share of the last step from which on a step that turns back is shortened. Judgement: those that
 # turn back by less are halved with each pass by themselves
 TURNS_BACK = -0.5
@@ -229,13 +235,17 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
 
     pace : power and last step of each level, kept up to date.
     """
-    new = {}
-    for name, (quadratic, expected) in weighted.components(neighbours).items():
+    new, found = {}, weighted.components(neighbours)
+    if 'slow' in weighted.parts:
+        for name, by in long_run(weighted[Fixes], levels, found).items():
+            found[name] = by * found[name][0], found[name][1]
+    for name, (quadratic, expected) in found.items():
         level = levels[name]
         if name in SIZES:
             if not fitted:      # what multiplies noise waits until residuals are noise
                 continue
-            new[name] = max(level * _size_step(level, quadratic, expected), problem.least[name])
+            step = _size_step(level, quadratic, expected, SIZE_SPREADS.get(name, SIZE_SPREAD))
+            new[name] = max(level * step, problem.least[name])
             continue
         # the others have one that a level is as it is: more end the way to a small noise too early
         pseudo = PRIOR_ROWS.get(name, 1.0)
@@ -251,10 +261,10 @@ def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: 
     return levels.but(**new)
 
 
-def _size_step(level: float, quadratic: float, expected: float) -> float:
+def _size_step(level: float, quadratic: float, expected: float, spread: float) -> float:
     """Return the factor on a size, log-normal about the usual one: a safeguarded Newton step."""
-    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / SIZE_SPREAD**2
-    ratio = gradient / (max(expected, quadratic) / 2 + SIZE_SPREAD**-2)
+    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / spread**2
+    ratio = gradient / (max(expected, quadratic) / 2 + spread**-2)
     step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio
     return float(np.exp(min(step, 2.0)))
 
@@ -295,7 +305,9 @@ def widened(first: Priors, now: Priors, state: State, solved: Solved,
     variance = np.diag(solved.covariance)
     constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
     constants[IMPERFECT] = now.constants[IMPERFECT]       # whose sizes are levels
-    constants[SPEED_OFFSET] = now.constants[SPEED_OFFSET]     # the grid holds it
+    # the grid holds that offset; times are of receivers as they are made
+    held = [SPEED_OFFSET, FIX_TIME]
+    constants[held] = now.constants[held]
     return replace(
         now,
         gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),

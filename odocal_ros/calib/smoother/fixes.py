@@ -23,7 +23,9 @@ from odocal_ros.calib.smoother.state import (
     BA,
     BARE,
     BG,
+    FIX_BY_MOTION,
     FIX_LAG2,
+    FIX_TIME,
     GNSS_ARM,
     GNSS_DELAY,
     M,
@@ -37,7 +39,7 @@ from odocal_ros.calib.smoother.state import (
 )
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.nav.earth import earth_rate_n
-from odocal_ros.nav.receiver_filter import smoothing
+from odocal_ros.nav.receiver_filter import odometer_error, smoothing
 from odocal_ros.nav.rotations import skew
 
 if TYPE_CHECKING:
@@ -75,10 +77,17 @@ class Fixes(PointRows):
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
         # of a receiver that smooths the mean age is a delay
-        smoothed, self.by_lag = smoothing(
-            state.t, *_antenna(state, here.intervals.mean_rate, arm_b),
-            state.t[k] + points.tau, state.constants[FIX_LAG2])
-        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - smoothed
+        track = (state.t, *_antenna(state, here.intervals.mean_rate, arm_b),
+                 state.t[k] + points.tau)
+        smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
+        added, self.by_motion, self.by_time = odometer_error(
+            *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
+        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - smoothed - added
+
+    def errors(self) -> Floats:
+        """Return what the fixes err by, white and slow, where they are linearised: (m, 3) m."""
+        s, share = self.state.slow_n, self.share[:, None]
+        return self.raw + s[self.k] * (1 - share) + s[self.k + 1] * share
 
     def jacobians(self, n: int) -> tuple[Floats, Floats]:
         """
@@ -102,6 +111,7 @@ class Fixes(PointRows):
         # stamps late by d: the place is that of d before
         c[:, :, GNSS_DELAY] = self.v_n
         c[:, :, FIX_LAG2] = -self.by_lag
+        c[:, :, FIX_BY_MOTION], c[:, :, FIX_TIME] = -self.by_motion, -self.by_time
         c[:, :, ACCEL] = self.C @ self.points.FF
         return J, c
 

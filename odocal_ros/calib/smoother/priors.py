@@ -57,6 +57,8 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'accelerometer_scale': constants_from('accelerometer_scale_x', 'accelerometer_scale_z'),
           'accelerometer_axes': constants_from('accelerometer_axis_xy', 'accelerometer_axis_yz'),
           'receiver_smoothing': constants_from('fix_lag_square'),
+          'receiver_odometer': constants_from('fix_error_by_motion'),
+          'receiver_odometer_time': constants_from('fix_motion_time'),
           'tyre_changes': TYRES,
           'body_lean': constants_from('squat', 'pitch_centre'),
           'speed_truncation': constants_from('speed_offset'),
@@ -71,7 +73,8 @@ class PriorRows(Part):
     def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.base = here.state, here.priors
         absent = {'heading'} - {*problem.outside}
-        absent |= {'speed_truncation'} if problem.leg.travel.coarse is None else set()
+        coarse = problem.leg.travel.coarse
+        absent |= set() if coarse and coarse.truncates else {'speed_truncation'}
         self.level = not problem.leg.felt
         self.shared = {name: where for name, where in SHARED.items() if name not in absent}
 

@@ -31,6 +31,7 @@ from odocal_ros.calib.smoother.state import (
     ACCEL,
     ACCEL_AXIS,
     ACCEL_SIGNAL,
+    FIX_TIME,
     GNSS_ARM,
     GNSS_DELAY,
     GYRO,
@@ -216,7 +217,8 @@ def imperfect_sigmas(grade: Grade) -> Floats:
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
-    Those of the Imu by its grade. A receiver that smooths does so over a second.
+    Those of the Imu by its grade. A receiver that smooths does so over a second;
+    most have no odometer (SIZE_SPREADS).
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;
     a body pitches by 1.7 deg/g, a car's rear axle drifts by 0.3 deg per m/s^2, both late by 0.1 s.
@@ -228,6 +230,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
         'gyro_by_force': grade.gyro_by_force,       # rad/s per m/s^2
         'accelerometer_scale': grade.accel_scale_error, 'accelerometer_axis': axes,
         'fix_lag_square': 1.0,                      # s^2
+        'fix_error_by_motion': 1.4e-3,
         'scale_by_speed': 1e-4,                     # s/m at FAST_SPEED
         'scale_by_time': 2.5e-3 / WARM_TIME,        # 1 / s
         'scale_by_force': 4e-3,                     # 1 / (m/s^2)
@@ -258,6 +261,8 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     up = np.hypot(accel, grade.accel_scale_error * G)
     accel_bias = np.maximum([accel, accel, up], 1e-6)
     centre = np.zeros(M)
+    # physical: receivers with an odometer trust it for 5 to 60 s
+    centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
     if not leg.felt:        # nothing tells the mounting from the attitude: it is as set
         sigma[ACCEL] = sigma[PITCH] = NO_ERROR
@@ -274,4 +279,4 @@ def nominal_yaw(config: Config) -> float:
 
 def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:
     """Return what a speed in steps lacks, and its sigma: none of a step to half of it."""
-    return (0.0, NO_ERROR) if coarse is None else (coarse.step / 4, coarse.step / 4)
+    return (coarse.step / 4, coarse.step / 4) if coarse and coarse.truncates else (0.0, NO_ERROR)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from odocal_ros.calib.receiver_lag import lag_reasons
+from odocal_ros.calib.receiver import lag_reasons, odometer_reasons
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.leg import SmootherLeg
@@ -25,7 +25,9 @@ from odocal_ros.calib.smoother.state import (
     BY_SPEED,
     BY_TIME,
     CONSTANTS,
+    FIX_BY_MOTION,
     FIX_LAG2,
+    FIX_TIME,
     GNSS_ARM,
     IMPERFECT,
     LN_K,
@@ -101,6 +103,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
     c, leg = fit.state.constants, problem.leg
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
+            *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME]),
             *_varies(fit, sigma)]
     usual = imperfect_sigmas(grade_of(config.imu))
     off = np.zeros(len(c))

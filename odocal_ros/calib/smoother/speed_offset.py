@@ -31,7 +31,7 @@ def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     from the nearer, one sound drive in 2000.
     """
     coarse = problem.leg.travel.coarse
-    if coarse is None:
+    if coarse is None or not coarse.truncates:
         return now
     sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     found = float(now.state.constants[SPEED_OFFSET])

@@ -57,9 +57,9 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_lever_arm_x', 'odometer_lever_arm_y', 'odometer_lever_arm_z',
              'antenna_lever_arm_x', 'antenna_lever_arm_y', 'antenna_lever_arm_z',
              'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
-             'fix_lag_square', 'scale_by_speed', 'scale_by_time', 'scale_by_pull',
-             'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk', 'sideslip_by_jerk',
-             'pitch_centre', 'speed_offset')
+             'fix_lag_square', 'fix_error_by_motion', 'scale_by_speed', 'scale_by_time',
+             'scale_by_pull', 'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk',
+             'sideslip_by_jerk', 'pitch_centre', 'fix_motion_time', 'speed_offset')
 
 
 def constants_from(first: str, last: str = '') -> slice:
@@ -78,8 +78,12 @@ ODO_DELAY, GNSS_DELAY, HEADING = map(CONSTANTS.index, ('odometer_delay', 'gnss_d
 GYRO = constants_from('gyro_scale_z', 'gyro_z_by_force_y')
 GYRO_SCALE = GYRO.start
 ACCEL = constants_from('accelerometer_scale_x', 'accelerometer_axis_yz')
-# s^2, square of the time constant by which a receiver smooths
+# s^2, of a receiver's filter: square of the time constant of the mean of the past, or, below zero,
+# of a filter of position and velocity (nav/receiver_filter.py)
 FIX_LAG2 = CONSTANTS.index('fix_lag_square')
+# of an odometer in the receiver: its relative error, and the time constant, logarithm of s, with
+# which satellites take its places back
+FIX_BY_MOTION, FIX_TIME = map(CONSTANTS.index, ('fix_error_by_motion', 'fix_motion_time'))
 # relative change of the scale from its mean by distance: with the square of the speed (its slope
 # at FAST_SPEED, s/m), with time as tyres warm (its rate at the begin of the leg, 1/s), and with
 # what the tyres pull and brake, 1/(m/s^2): a wheel that is not driven only brakes
@@ -94,9 +98,9 @@ PITCH_CENTRE = CONSTANTS.index('pitch_centre')
 IMPERFECT = constants_from('gyro_scale_z', 'pitch_centre')
 # kinds of these, whose sizes are alike, and how many constants each has
 KIND_SIZES = {'gyro_scale': 3, 'gyro_axis': 4, 'gyro_by_force': 6, 'accelerometer_scale': 3,
-              'accelerometer_axis': 5, 'fix_lag_square': 1, 'scale_by_speed': 1,
-              'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1, 'sideslip': 1,
-              'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
+              'accelerometer_axis': 5, 'fix_lag_square': 1, 'fix_error_by_motion': 1,
+              'scale_by_speed': 1, 'scale_by_time': 1, 'scale_by_force': 2, 'squat': 1,
+              'sideslip': 1, 'squat_by_jerk': 1, 'sideslip_by_jerk': 1, 'pitch_centre': 1}
 KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # of IMPERFECT
 # scale units per s: of a speed sent in steps, what a value of it lacks, half a step where the
 # sender truncates

@@ -1,0 +1,37 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Reasons about what a receiver does to its fixes: a filter, an odometer of its own."""
+
+import numpy as np
+
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import FAULT_SIGMAS, REMARK_SIGMAS
+
+
+def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
+    """Return FIXES_SMOOTHED, where so; of the filter's unknown and its sigma, s^2."""
+    worth = 0.1     # s: a fix at 10 Hz is as old anyway
+    if abs(square) <= max(REMARK_SIGMAS * sigma, worth**2):
+        return ()
+    what, time = ('averages its fixes', np.sqrt(square)) if square > 0 else (
+        'filters position and velocity', np.sqrt(-square / 2))
+    return (Reason(Code.FIXES_SMOOTHED, f'the receiver {what} with a time constant of about '
+                   f'{time:.2f} s; accounted for'),)
+
+
+def odometer_reasons(share: float, sigma: float, log_time: float) -> tuple[Reason, ...]:
+    """Return FIXES_FOLLOW_ODOMETER, where so; of the error of the receiver's own odometer."""
+    worth = 5e-4    # relative: less changes no scale by more than its sigma
+    if abs(share) <= max(FAULT_SIGMAS * sigma, worth):
+        return ()
+    return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes move with an odometer that is '
+                   f'{100 * share:+.2f} % +- {100 * sigma:.2f} % off, over spans below about '
+                   f'{np.exp(log_time):.0f} s, as fixes fused with a wheel speed do; accounted '
+                   'for'),)

@@ -1,0 +1,73 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The growth of fix errors with time, against that of the model: docs/method.md (S17a).
+
+A receiver that filters has errors whose rate lasts. They grow with time, those of a Gauss-Markov
+process with its root: steps from one fix to the next then say too little of what becomes of them.
+"""
+
+import numpy as np
+
+from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.data.arrays import Floats
+from odocal_ros.settings.levels import NORMAL_MEDIAN
+
+# spans that the fixes must hold to be compared: statistical, their variance is then good to 35 %,
+# with two axes
+FEWEST_SPANS = 8
+COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
+TAIL = 3.0      # robust sigmas of a span from which on more counts as much. Statistical: 1 in 370
+
+
+def long_run(fixes: Fixes, levels: Levels,
+             found: dict[str, tuple[float, float]]) -> dict[str, float]:
+    """
+    Return the factors, 1 or more, by which slow errors exceed what their steps say.
+
+    Of spans of 1, 2, 4, ... s the largest ratio of the mean square of what errors change by to
+    what is expected, less two of its standard deviations.
+
+    Parameters
+    ----------
+    fixes : Fixes
+        Whose errors are looked at, white and slow together.
+    levels : Levels
+        Of the pass.
+    found : dict
+        Quadratic sum and expectation of the levels slow and slow_up: what their steps say.
+
+    """
+    t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()
+    stated = 1 / np.diagonal(fixes.root, axis1=1, axis2=2)**2
+    time, out = levels.correlation_time, dict.fromkeys(COLUMNS, 1.0)
+    span = max(1.0, 2 * float(np.median(np.diff(t))))
+    while t[-1] - t[0] > FEWEST_SPANS * span:
+        end = np.searchsorted(t, t + span)
+        a = np.flatnonzero(end < len(t))
+        b = end[a]
+        grown = float((1 - np.exp(-(t[b] - t[a]) / time)).mean())
+        spans = (t[-1] - t[0]) / span
+        for (name, columns), white in zip(COLUMNS.items(), Fixes.levels_of, strict=True):
+            quadratic, expected = found[name]
+            power = levels[name] * quadratic / max(expected, 1e-9) * time / 2
+            want = 2 * levels[white] * float(stated[a, columns].mean()) + 2 * power * grown
+            change = error[b, columns] - error[a, columns]
+            chance = 1 + 2 * np.sqrt(2 / (spans * change.shape[1]))
+            out[name] = max(out[name], _mean_square(change) / want / chance)
+        span *= 2
+    return out
+
+
+def _mean_square(change: Floats) -> float:
+    """Return the mean square of changes (k, c) with their tails cut."""
+    size = np.abs(change)
+    return float((np.minimum(size, TAIL * np.median(size, axis=0) / NORMAL_MEDIAN)**2).mean())

@@ -1,0 +1,95 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What receivers do to their fixes: filters, an odometer of their own, errors whose rate lasts."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from smoother_legs import made
+
+from odocal_ros.calib.smoother import smooth
+from odocal_ros.calib.smoother.long_run import long_run
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.reasons import Code
+from odocal_ros.sim.noise import gauss_markov
+from odocal_ros.sim.real import Real
+
+DRIVE = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_noise': 'rtk'}
+
+
+def smoothed(seed=4, **real):
+    """Return a drive, its result, the error of its scale in sigmas, and its reasons."""
+    drive, config, leg = made(**DRIVE, seed=seed, real=Real(**real))
+    found = smooth(leg, config)
+    scale = found.estimates['scale_factor']
+    return (found, (scale.value - drive.truth.scale) / scale.sigma,
+            {r.code: r.text for r in found.reasons})
+
+
+@pytest.mark.parametrize('share', [0.02, -0.003])
+def test_an_odometer_in_the_receiver_is_told_from_the_vehicles(share):
+    found, z, said = smoothed(receiver_odometer=share)
+    seen, time = (found.details[name] for name in ('fix_error_by_motion', 'fix_motion_time'))
+    assert abs(seen['value'] - share) < 3 * seen['sigma'] < 0.3 * abs(share)
+    assert abs(time['value'] - np.log(20.0)) < 3 * time['sigma']
+    assert abs(z) < 3
+    assert f'{100 * seen["value"]:+.2f} %' in said[Code.FIXES_FOLLOW_ODOMETER]
+
+
+def test_a_filter_of_position_and_velocity_is_said_with_its_time():
+    _, z, said = smoothed(receiver_tracking=0.8)
+    assert abs(z) < 3
+    text = said[Code.FIXES_SMOOTHED]
+    assert 'position and velocity' in text
+    assert float(re.search(r'about (.*) s;', text)[1]) == pytest.approx(0.8, rel=0.02)
+
+
+def test_of_a_plain_receiver_nothing_is_said():
+    _, _, said = smoothed()
+    assert not {Code.FIXES_FOLLOW_ODOMETER, Code.FIXES_SMOOTHED} & said.keys()
+
+
+def fixes_of(error, t):
+    """Return what long_run takes of fixes every second with these errors (m, 3), sigma 1 m."""
+    return SimpleNamespace(
+        k=np.arange(len(t)), state=SimpleNamespace(t=t), errors=lambda: error,
+        points=SimpleNamespace(tau=np.zeros(len(t))), root=np.tile(np.eye(3), (len(t), 1, 1)))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_errors_as_the_model_has_them_are_left_as_they_are(seed):
+    t, sigma, time, white = np.arange(0.0, 900.0), 1.5, 60.0, 0.3
+    rng = np.random.default_rng(seed)
+    error = gauss_markov(rng, sigma, time, t) + white * rng.standard_normal((len(t), 3))
+    gain = 2 * sigma**2 / time
+    levels = Levels({'slow': gain, 'slow_up': gain, 'fix': white**2, 'fix_up': white**2,
+                     'correlation_time': time})
+    found = long_run(fixes_of(error, t), levels, {'slow': (2.0, 2.0), 'slow_up': (1.0, 1.0)})
+    # beyond two sigmas by chance, of nine spans that hardly differ
+    assert max(found.values()) < 1.3
+    # a level that is four times too high, as its own steps say, is no reason
+    high = levels.but(slow=4 * gain, slow_up=4 * gain)
+    again = long_run(fixes_of(error, t), high, {'slow': (0.5, 2.0), 'slow_up': (0.25, 1.0)})
+    assert again == pytest.approx(found)
+
+
+def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
+    t, seconds = np.arange(0.0, 900.0), 20
+    steps = np.random.default_rng(3).standard_normal((len(t) + seconds, 3))
+    # the mean of a walk over 20 s: steps of 1 / sqrt(20), in the long run as large as before
+    error = np.stack([np.convolve(x, np.full(seconds, 1 / seconds), 'valid')
+                      for x in np.cumsum(steps, axis=0).T], -1)[:len(t)]
+    levels = Levels({'slow': 1 / seconds, 'slow_up': 1 / seconds, 'fix': 1e-6, 'fix_up': 1e-6,
+                     'correlation_time': 1e4})
+    found = long_run(fixes_of(error, t), levels, {'slow': (2.0, 2.0), 'slow_up': (1.0, 1.0)})
+    for factor in found.values():
+        assert seconds / 3 < factor < 1.5 * seconds
