@@ -28,7 +28,7 @@ ARGUMENTS = (
      "The right wheel, where odometer.right is 'topic'; as odometer_topic."),
     ('fix_topic', 'fix', 'sensor_msgs/NavSatFix: GNSS positions.'),
     ('fix_velocity_topic', 'fix_velocity',
-     'GNSS velocity, TwistStamped or TwistWithCovarianceStamped, where gnss.use_velocity is set.'),
+     'GNSS velocity, TwistStamped or TwistWithCovarianceStamped, ENU; optional.'),
     ('heading_topic', 'heading',
      'sensor_msgs/Imu: ENU yaw of a dual antenna or the like, where alignment.heading_source '
      'allows it.'),

@@ -97,6 +97,8 @@ class Code(Enum):
     COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
     FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
                                      'the receiver and the sky.')
+    VELOCITY_UNUSABLE = NOTE, ('Send east, north, up in m/s on fix_velocity, or set '
+                               'gnss.use_velocity to false; the leg is estimated without it.')
     # the drive
     NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark: level, gyro '
                               'bias and heading then come from rest.')

@@ -129,6 +129,9 @@ MEANINGS: dict[str, dict[Code, str]] = {
         '`gnss.default_sigma` was taken.',
         Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '
         'that they claim. The sigma was made to match what is seen.',
+        Code.VELOCITY_UNUSABLE: 'Displacements by the velocity were compared with those between '
+        'fixes, 10 s apart. They differ by more than 10 % in size or direction. Usual causes are '
+        'north and east swapped, axes of the vehicle, a speed without direction, and km/h.',
     },
     'The drive': {
         Code.NO_STANDSTILL: 'There is no rest before the start mark. Level and gyro bias then '

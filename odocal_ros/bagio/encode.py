@@ -22,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
-from odocal_ros.data.samples import FixSamples, HeadingSamples, ImuSamples, OdometerSamples
+from odocal_ros.data.samples import (
+    FixSamples,
+    HeadingSamples,
+    ImuSamples,
+    OdometerSamples,
+    VelocitySamples,
+)
 
 VECTOR, SQUARE = ('<f8', 3), ('<f8', 9)    # format: of sensor_msgs and geometry_msgs
 
@@ -195,6 +201,19 @@ def fix(name: str, samples: FixSamples, frame: str = 'gnss') -> Topic:
         out['cov'] = samples.covariance_n[rows].reshape(-1, 9)
         out['cov_type'] = samples.covariance_type[rows]
     return Topic(name, 'sensor_msgs/msg/NavSatFix', samples.received_ns,
+                 layout.packer(fill, len(samples.stamp_ns)))
+
+
+def velocity(name: str, samples: VelocitySamples, frame: str = 'gnss') -> Topic:
+    """Return geometry_msgs/TwistWithCovarianceStamped of VelocitySamples: linear ones."""
+    layout = _Layout().header(frame).add('linear', VECTOR).add('angular', VECTOR).add(
+        'cov', ('<f8', 36))
+
+    def fill(out: NDArray[Any], rows: slice) -> None:
+        _stamp(out, samples.stamp_ns[rows])
+        out['linear'] = samples.velocity_n[rows]
+        out['cov'][:, :15:7] = samples.variance_n[rows]
+    return Topic(name, 'geometry_msgs/msg/TwistWithCovarianceStamped', samples.received_ns,
                  layout.packer(fill, len(samples.stamp_ns)))
 
 

@@ -45,6 +45,8 @@ def drive_topics(drive: Any) -> list[Topic]:
         topics.append(encode.counter('/odometer', left))
     if len(drive.heading.stamp_ns):
         topics.append(encode.heading('/heading', drive.heading))
+    if len(drive.velocity.stamp_ns):
+        topics.append(encode.velocity('/fix_velocity', drive.velocity))
     return topics
 
 

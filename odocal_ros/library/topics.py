@@ -10,6 +10,7 @@
 """Which topic of a bag is which input: by message type, where exactly one can be meant."""
 
 from collections.abc import Iterable
+import re
 
 from odocal_ros.bagio.read import TopicInfo
 from odocal_ros.errors import BadUsage
@@ -60,7 +61,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
         found = candidates(topics, slot, config, chosen)
         if len(found) == 1:
             chosen[slot] = found[0]
-        elif slot != 'heading' or config.alignment.heading_source == 'heading_topic':
+        elif not _optional(slot, config):
             troubles.append(_trouble(topics, slot, found, config))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
@@ -103,8 +104,23 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'fix':
         found = _unless_all(found, ('filtered', 'fused'))
     elif slot == 'fix_velocity':
-        found = [name for name in found if _has(name, GNSS)] or found
+        found = [name for name in found if _of_receiver(name)]
+        named_so = [name for name in found if _last(name) == slot]
+        found = named_so or found       # by the name the node listens to
     return found
+
+
+def _optional(slot: str, config: Config) -> bool:
+    """Tell whether a leg can do without a slot whose topic is not clear."""
+    return slot == 'fix_velocity' or (
+        slot == 'heading' and config.alignment.heading_source != 'heading_topic')
+
+
+def _of_receiver(name: str) -> bool:
+    """Tell whether a topic's name has the word of a receiver, and none of another source."""
+    words = re.split('[/_]', name.lower())
+    return (any(word.startswith(GNSS) for word in words)
+            and not _has(name, (*COMMANDS, 'filtered', 'fused', 'ekf', 'odom', 'wheel', 'speed')))
 
 
 def _types(slot: str, config: Config) -> Iterable[str]:

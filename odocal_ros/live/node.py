@@ -43,7 +43,8 @@ usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO
 Calibrates a vehicle's odometer against IMU and GNSS while it is driven (a ROS 2 node; the same
 over recorded bags is 'odocal replay').
 
-listens to   imu/data, odometer, fix; where set so odometer_right, fix_velocity, heading
+listens to   imu/data, odometer, fix; fix_velocity and heading where they are sent; where set so
+             odometer_right
              (another name: -r odometer:=/your/topic)
 services     ~/start_leg before a drive and ~/stop_leg after it, which answers with the result;
              ~/cancel_leg, ~/undo_leg, ~/reset, ~/save   (all std_srvs/srv/Trigger)

@@ -133,7 +133,7 @@ class Publishing:
             input_status(f'{node}: {PARTS.get(slot, slot)}', one.health, one.why(),
                          one in needed, now_ns)
             for slot, one in recording.inputs.by_slot.items()
-            if slot != 'heading' or one.reader is not None]))
+            if one in needed or one.reader is not None]))
 
     def _array(self, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
         array = DiagnosticArray(status=statuses)

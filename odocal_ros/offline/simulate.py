@@ -49,6 +49,13 @@ NUMBERS = {
     'fix_delay': ('S', 'seconds by which fix stamps are late'),
     'outliers': ('SHARE', 'share of the fixes that are far off, 0 to 0.5'),
     'outlier_size': ('M', 'how far off they are (default 20)'),
+    'velocity_sigma': ('M/S', 'the receiver sends its velocity on /fix_velocity, 1 sigma an axis'),
+    'velocity_rate': ('HZ', 'rate of /fix_velocity (default 10)'),
+    'velocity_correlation_time': ('S', 'of its errors (default 0: white)'),
+    'velocity_delay': ('S', 'seconds by which its stamps are late'),
+    'velocity_lag': ('S', 'seconds over which the receiver smooths it'),
+    'velocity_scale_error': ('X', 'by which it is too large, relative (default 0)'),
+    'velocity_outliers': ('SHARE', 'share of it that is far off, 0 to 0.5'),
     'height': ('M', 'ellipsoidal height at the start (default 50)'),
 }
 DEGREES = {

@@ -16,7 +16,7 @@ import numpy as np
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
-from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, HEADING_RATE
+from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
 from odocal_ros.calib.smoother.state import M, State
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.alignment import HEADING_LIMIT
@@ -137,8 +137,8 @@ def _heading(drive: PlannedDrive, config: Config, t_begin: float, spacing: float
     if asked == 'fixed' or asked == 'auto' and not np.isnan(config.alignment.heading):
         t, noise, asked = np.zeros(1), GIVEN_HEADING_NOISE, 'fixed'
     elif asked in SENT and sigma <= HEADING_LIMIT:
-        t = _times(t_begin, drive.duration, HEADING_RATE, spacing)
-        noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * HEADING_RATE))
+        t = _times(t_begin, drive.duration, OUTSIDE_RATE, spacing)
+        noise = sigma * np.sqrt(len(t) / max(1.0, (drive.duration - t_begin) * OUTSIDE_RATE))
     else:
         return Heading()
     return Heading(t, np.interp(t, drive.t, drive.yaw), np.full(len(t), noise), sigma, asked)

@@ -37,6 +37,7 @@ from odocal_ros.screening.imu_rhythm import on_rhythm
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
+from odocal_ros.screening.velocity_screen import contradicted
 from odocal_ros.screening.wheel_faults import broken_wheels
 from odocal_ros.screening.wheel_travel import wheels
 from odocal_ros.settings.config import Config
@@ -125,6 +126,10 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
     found += why
     _gaps('fix', t_fix, found)       # of the stream: what is screened here is no gap in it
     t_fix, geodetic = t_fix[use], np.stack([fix.latitude, fix.longitude, fix.height], -1)[use]
+    unlike = contradicted(t_velocity, velocity.velocity_n, t_fix, geodetic, covariance[use]) \
+        if config.gnss.use_velocity else ()
+    found += unlike
+    some = slice(0 if unlike else None)
     _gaps('odometer', travelled.mean.t, found)
     if travelled.right is not None:      # the mean stands on the left wheel's rows
         _gaps('odometer_right', travelled.right.t, found)
@@ -146,8 +151,8 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
         doubt_t=travelled.doubt_t, doubt_sigma=travelled.doubt_sigma,
         t_fix=t_fix, geodetic=geodetic, covariance_n=covariance[use],
         t_heading=t_heading, q_heading=heading.q_ni, heading_variance=heading.yaw_variance,
-        t_velocity=t_velocity, velocity_n=velocity.velocity_n,
-        velocity_variance=velocity.variance_n,
+        t_velocity=t_velocity[some], velocity_n=velocity.velocity_n[some],
+        velocity_variance=velocity.variance_n[some],
         fixes_rejected=len(leg.fix.stamp_ns) - int(use.sum()),
         scale_unit=leg.form.scale_unit, felt=not unfelt)
     if unfelt:

@@ -131,8 +131,11 @@ class GnssConfig:
                                    'come without a covariance.')
     correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Time over which fix errors stay '
                                       'alike; 0: white; NaN: estimated from the data.')
-    use_velocity: bool = setting(False, ro=True, about='Subscribe to GNSS velocity '
-                                 '(fix_velocity).')
+    use_velocity: bool = setting(True, ro=True, about='Use the GNSS velocity (fix_velocity) '
+                                 'where it is sent.')
+    velocity_scale_sigma: float = setting(1e-3, '1', 0.0, 0.1, about='Relative scale error of the '
+                                          'GNSS velocity, 1 sigma. Pure Doppler: 1e-5. A receiver '
+                                          'that fuses wheel speeds: 0.05.')
 
 
 @dataclass(frozen=True, kw_only=True)

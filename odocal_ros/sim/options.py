@@ -85,6 +85,14 @@ class SimOptions:
     heading_sigma: float | None = None     # rad; None: no heading topic
     heading_rate: float = 10.0             # Hz
 
+    velocity_sigma: float | None = None    # m/s, each axis; None: no velocity of the receiver
+    velocity_rate: float = 10.0            # Hz
+    velocity_correlation_time: float = 0.0  # s, of its errors; 0: white
+    velocity_delay: float = 0.0            # s by which its stamps are late
+    velocity_lag: float = 0.0              # s over which the receiver smooths it, first order
+    velocity_scale_error: float = 0.0      # relative
+    velocity_outliers: float = 0.0         # share of it
+
     real: Real = Real()                    # what real sensors do beyond this
 
 
@@ -98,15 +106,18 @@ DEFAULTS = {
     'yard': {'duration': 600.0, 'imu_grade': 'consumer'},
 }
 SCALES = {'counts': (0.0213, 0.02), 'speed': (1.02, 1.0), 'angle': (0.31, 0.3)}   # K, K0
-POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'scale', 'nominal_scale',
-            'track_width', 'fix_correlation_time', 'duration')
+POSITIVE = ('imu_rate', 'odometer_rate', 'fix_rate', 'heading_rate', 'velocity_rate', 'scale',
+            'nominal_scale', 'track_width', 'fix_correlation_time', 'duration')
 NOT_NEGATIVE = ('orientation_sigma', 'heading_sigma', 'fix_sigma', 'speed_noise', 'slip_walk',
                 'slip_events', 'slip_size', 'start_slip', 'start_slip_time', 'sway', 'outliers',
-                'outlier_size', 'seed')
+                'outlier_size', 'seed', 'velocity_sigma', 'velocity_correlation_time',
+                'velocity_lag', 'velocity_outliers')
 # largest size, and how a person gives it: rad inside, degrees on the command line
 LIMITS = {'outliers': 0.5, 'start_slip': 0.5, 'sway': 1.0, 'wheel_difference': 0.5,
           'gyro_scale_error': 0.5, 'accel_scale_error': 0.5, 'odometer_delay': 10.0,
-          'fix_delay': 10.0, 'duration': 36_000.0, 'imu_rate': 10_000.0,
+          'fix_delay': 10.0, 'velocity_delay': 10.0, 'velocity_lag': 10.0,
+          'velocity_scale_error': 0.5, 'velocity_outliers': 0.5, 'velocity_rate': 1000.0,
+          'duration': 36_000.0, 'imu_rate': 10_000.0,
           'odometer_rate': 10_000.0, 'fix_rate': 1000.0, 'heading_rate': 1000.0}
 ANGLES = {'latitude': 85.0, 'longitude': 180.0, 'heading': 360.0, 'slope': 20.0, 'yaw': 180.0,
           'pitch': 45.0, 'roll': 180.0, 'orientation_sigma': 90.0, 'heading_sigma': 90.0}

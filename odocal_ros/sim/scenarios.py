@@ -22,6 +22,7 @@ from odocal_ros.data.samples import (
     no_odometer,
     OdometerForm,
     OdometerSamples,
+    VelocitySamples,
 )
 from odocal_ros.nav.angles import heading_from_yaw, yaw_from_heading
 from odocal_ros.nav.rotations import matrix_from_rpy
@@ -32,6 +33,7 @@ from odocal_ros.sim.noise import stream
 from odocal_ros.sim.options import DEFAULTS, resolved, SimOptions
 from odocal_ros.sim.profile import hermite, Profile
 from odocal_ros.sim.routes import Route, ROUTES
+from odocal_ros.sim.velocity import velocity
 
 __all__ = ['Drive', 'SCENARIOS', 'SimOptions', 'Truth', 'motion_of', 'simulate']
 
@@ -80,12 +82,13 @@ class Drive:
     odometer_right: OdometerSamples
     fix: FixSamples
     heading: HeadingSamples
+    velocity: VelocitySamples
 
     def leg(self) -> Leg:
         """Return the drive as one leg between its marks, with all that came before."""
         return Leg(start_ns=self.truth.start_ns, stop_ns=self.truth.stop_ns, imu=self.imu,
                    odometer=self.odometer, odometer_right=self.odometer_right, fix=self.fix,
-                   heading=self.heading, form=self.form)
+                   heading=self.heading, fix_velocity=self.velocity, form=self.form)
 
 
 def motion_of(options: SimOptions) -> Motion:
@@ -136,7 +139,8 @@ def simulate(options: SimOptions | None = None) -> Drive:
         odometer_right=wheels[1] if len(wheels) > 1 else no_odometer(),
         fix=sensors.fixes(motion, options),
         heading=(no_heading() if options.heading_sigma is None
-                 else sensors.heading(motion, options, options.heading_sigma)))
+                 else sensors.heading(motion, options, options.heading_sigma)),
+        velocity=velocity(motion, options))
 
 
 def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:

@@ -25,7 +25,8 @@ SHORT = {'scenario': 'town', 'duration': 140.0, 'imu_rate': 50.0}
 
 @pytest.fixture(scope='module')
 def drive():
-    return simulate(SimOptions(**SHORT, orientation_sigma=0.02, heading_sigma=0.01))
+    return simulate(SimOptions(**SHORT, orientation_sigma=0.02, heading_sigma=0.01,
+                               velocity_sigma=0.05))
 
 
 def messages(path):
@@ -56,7 +57,7 @@ def test_a_drive_comes_back_value_for_value(tmp_path, drive, storage, compressio
     path = tmp_path / ('drive.bag' if storage == 'rosbag1' else 'drive')
     assert write_bag(path, drive_topics(drive), storage, compression) == path
     back = messages(path)
-    assert sorted(back) == ['/fix', '/heading', '/imu/data', '/odometer']
+    assert sorted(back) == ['/fix', '/fix_velocity', '/heading', '/imu/data', '/odometer']
     assert sorted(p.name for p in tmp_path.iterdir()) == [path.name]   # no left-overs
     imu = back['/imu/data']
     assert header_ns(imu) == drive.imu.stamp_ns.tolist()
@@ -71,6 +72,12 @@ def test_a_drive_comes_back_value_for_value(tmp_path, drive, storage, compressio
     assert [t for t, _ in odometer] == drive.odometer.stamp_ns.tolist()
     assert [m.data for _, m in odometer] == drive.odometer.value.tolist()
     _same_fixes(back['/fix'], drive.fix)
+    velocity = back['/fix_velocity']
+    assert header_ns(velocity) == drive.velocity.stamp_ns.tolist()
+    assert np.array_equal([xyz(m.twist.twist.linear) for _, m in velocity],
+                          drive.velocity.velocity_n)
+    assert np.array_equal([m.twist.covariance[:15:7] for _, m in velocity],
+                          drive.velocity.variance_n)
     heading = back['/heading']
     assert header_ns(heading) == drive.heading.stamp_ns.tolist()
     assert np.array_equal([[*xyz(m.orientation), m.orientation.w] for _, m in heading],

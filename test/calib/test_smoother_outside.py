@@ -52,7 +52,6 @@ def off(drive, method):
 def test_rows_are_true_at_the_truth():
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
                             heading_sigma=0.0, **ARMS)
-    config = with_settings(config, {'gnss.use_velocity': True})
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
     problem, state = Problem.of(leg, config), truth(drive, config, leg)
     parts = Equations(problem, state, problem.sums(state)).parts
@@ -65,10 +64,10 @@ def test_rows_are_true_at_the_truth():
 def test_a_velocity_helps_and_its_size_is_found():
     drive, config, leg = made(**SHORT)
     without = smooth(leg, config)
-    said = fitted(with_velocity(drive, lambda e: SIGMA * e), config, gnss__use_velocity=True)
-    silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), config,
-                    gnss__use_velocity=True)
-    unasked = fitted(with_velocity(drive, lambda e: SIGMA * e), config)
+    pure = with_settings(config, {'gnss.velocity_scale_sigma': 1e-5})
+    said = fitted(with_velocity(drive, lambda e: SIGMA * e), pure)
+    silent = fitted(with_velocity(drive, lambda e: SIGMA * e, 0.0), pure)
+    unasked = fitted(with_velocity(drive, lambda e: SIGMA * e), config, gnss__use_velocity=False)
     assert off(drive, said) < 3.3
     assert sigma_of(said) < 0.9 * sigma_of(without)
     # the same but for how a library rounds arrays that lie elsewhere
@@ -88,7 +87,7 @@ def test_outliers_of_a_velocity_do_not_pull():
         bad = np.arange(len(e)) % 50 == 0
         return SIGMA * e + 5.0 * bad[:, None]
 
-    method = fitted(with_velocity(drive, errors), config, gnss__use_velocity=True)
+    method = fitted(with_velocity(drive, errors), config)
     assert off(drive, method) < 3.3
     # 2 % of the rows at the edge of what counts in full, 9 in place of 1: 1.18 in variance
     assert method.details['noise']['velocity'] < 1.18
@@ -105,11 +104,45 @@ def test_velocity_errors_that_stay_promise_no_more():
             out[i] = SIGMA * x
         return out
 
-    method = fitted(with_velocity(drive, slow), config, gnss__use_velocity=True)
+    method = fitted(with_velocity(drive, slow), config)
     # neighbours are 0.95 alike: (1 + 0.95) / (1 - 0.95) = 39 count as one, less what the
     # smoothing takes for motion
     assert 10 < method.details['outside']['velocity']['alike'] < 80
     assert off(drive, method) < 3.3
+
+
+@pytest.mark.parametrize('what', ['late', 'filtered', 'scale', 'fused'])
+def test_what_a_receiver_does_to_a_velocity_is_found_and_does_not_pull(what):
+    error, name, true = {
+        'late': ({'velocity_delay': 0.2}, 'velocity_delay', 0.2),
+        'filtered': ({'velocity_lag': 0.5}, 'velocity_lag_square', 0.25),
+        'scale': ({'velocity_scale_error': 1e-3}, 'velocity_scale', 1e-3),
+        'fused': ({'velocity_scale_error': 0.02}, 'velocity_scale', 0.02)}[what]
+    drive, config, _ = made(**SHORT, velocity_sigma=SIGMA, **error)
+    method = smooth(leg_of(drive.leg(), config), config)
+    found = method.details['outside']['velocity'][name]
+    assert abs(found['value'] - true) < 3.3 * found['sigma']
+    assert found['sigma'] < true / 4 or what == 'scale'     # less than the prior's 1e-3 alone
+    assert off(drive, method) < 3.3
+
+
+def test_a_delay_is_not_lost_in_vibration():
+    # derivatives by single samples would hold the vibration: a delay that is off and looks certain
+    drive, config, _ = made(**SHORT, velocity_sigma=SIGMA, velocity_delay=0.3)
+    leg = drive.leg()
+    shake = 2.0 * np.random.default_rng(3).standard_normal(leg.imu.f_i.shape)
+    leg = replace(leg, imu=changed(leg.imu, f_i=lambda f: np.add(f, shake, out=f)))
+    found = smooth(leg_of(leg, config), config).details['outside']['velocity']['velocity_delay']
+    assert found['value'] == pytest.approx(0.3, abs=3.3 * found['sigma'])
+    assert found['sigma'] < 0.08        # a third of the prior's
+
+
+def test_no_velocity_is_used_without_an_accelerometer():
+    drive, config, _ = made(**SHORT, velocity_sigma=SIGMA)
+    leg = drive.leg()
+    silent = replace(leg, imu=changed(leg.imu, f_i=lambda f: f.fill(0.0)))
+    assert len(leg_of(leg, config).velocity.t)
+    assert not len(leg_of(silent, config).velocity.t)
 
 
 def test_white_errors_are_not_alike():

@@ -30,6 +30,7 @@ from odocal_ros.calib.smoother.state import (
     E,
     FIX_LAG2,
     FIX_TIME,
+    GNSS_ARM,
     GNSS_DELAY,
     GYRO,
     IMPERFECT,
@@ -38,14 +39,16 @@ from odocal_ros.calib.smoother.state import (
     ODO_DELAY,
     P,
     PHI,
+    PITCH,
     SLOW,
     SPEED_OFFSET,
+    VELOCITY_DELAY,
+    VELOCITY_LAG2,
     WITH_SLOW,
     YAW,
 )
 from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.nav.odometer import Travel
-from odocal_ros.settings.config import with_settings
 
 N = WITH_SLOW
 # relative errors that are left out of derivatives. Motion: Earth rate times a second, 7e-5 rad,
@@ -54,8 +57,13 @@ LOOSE = {'motion': 3e-4, 'fixes': 1e-3, 'velocity': 2e-3, 'heading': 2e-3, 'step
 # biases act within a second as under constant force and no turn, of which a vehicle makes 0.3 rad
 BIASES = dict.fromkeys(range(BG.start, BG.stop), 0.3) | dict.fromkeys(
     (*range(BA.start, BA.stop), *range(N + ACCEL.start, N + ACCEL.stop)), 0.1)
-# an arm's swing: at the mean turn rate of the second, and with no delay in it
-SWING = {'fixes': 1e-2, 'velocity': 0.3, 'steps': 0.03}
+# an arm's swing: at the mean turn rate of the second, and with no delay in it. How a velocity
+# changes: in the mean of a second in which the acceleration jumps by 2 m/s^2
+SWING = {'fixes': 1e-2, 'velocity': 0.9, 'steps': 0.03}
+# a velocity has means of the second, off by so much where turn rate or acceleration jump: rad/s
+# of an arm of 1 m, m/s within half a second
+MEANS, BY_MEANS = 0.3, (YAW, PITCH, *range(GNSS_ARM.start, GNSS_ARM.stop),
+                        *range(ACCEL.start, ACCEL.stop))
 
 
 @pytest.fixture(scope='module')
@@ -63,7 +71,6 @@ def shaken():
     """Return the problem of a leg with all sensors, and a state where no term vanishes."""
     drive, config, _ = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, heading_sigma=0.0,
                             antenna_lever_arm=(0.5, -0.3, 1.2))
-    config = with_settings(config, {'gnss.use_velocity': True})
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0,
                   imu_arm=np.array([1.2, 0.3, 0.4]))
     problem, state = Problem.of(leg, config), truth(drive, config, leg)
@@ -75,6 +82,7 @@ def shaken():
     c[SPEED_OFFSET], c[FIX_TIME] = 0.0, np.log(5.0)
     c[IMPERFECT] *= [*[1] * 7, *[0.1] * 6, *[1] * 8, 0.0, 0.1, 0.03, 0.003, *[0.0] * 6, 1e3]
     c[FIX_LAG2] = 2.1e-4    # off zero, about which it is another filter
+    c[VELOCITY_LAG2] = 2.1e-4
     return problem, state.moved(step, c)
 
 
@@ -127,7 +135,9 @@ def test_derivatives_are_those_of_finite_differences(shaken, stepping, name):
         expected = constants[:, :, i - N] if i >= N else np.where(
             even[k][:, None], begin[:, :, i], end[:, :, i])
         loose = LOOSE[name] if name == 'motion' else BIASES.get(i, LOOSE[name])
-        loose = SWING.get(name, loose) if i in (N + GNSS_DELAY, N + ODO_DELAY) else loose
+        delays = N + GNSS_DELAY, N + ODO_DELAY, N + VELOCITY_DELAY
+        loose = SWING.get(name, loose) if i in delays else loose
+        loose = MEANS if name == 'velocity' and i - N in BY_MEANS else loose
         # ahead turns with the bias as well: half as much again of what a turn makes of it
         loose = 1.5 * loose if name == 'steps' and i in BIASES else loose
         np.testing.assert_allclose((raw(h) - raw(-h)) / (2 * h), expected, err_msg=str(i),
@@ -164,7 +174,7 @@ def test_the_way_lacks_the_offset_while_a_coarse_speed_moves(stepping):
 def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, name):
     problem, state = stepping if name == 'steps' else shaken
     # so wide that nothing lies far out: squares only
-    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'velocity_up', 'heading', 'steps'), 1e8)
+    wide = dict.fromkeys(('fix', 'fix_up', 'velocity', 'heading', 'steps'), 1e8)
     levels = problem.first_levels.but(correlation_time=40.0, **wide)
     part = part_at(problem, state, name).weighed(levels)
     normal = Normal(len(state.t), N, M)
@@ -189,7 +199,7 @@ def test_cost_after_a_step_is_what_the_normal_equations_say(shaken, stepping, na
 def test_levels_of_slow_errors_climb_the_restricted_likelihood(shaken, name):
     problem, state = shaken
     levels = problem.first_levels.but(correlation_time=20.0, slow=0.01, slow_up=0.02,
-                                      fix=1e4, fix_up=1e4)
+                                      fix=1e4, fix_up=1e4, velocity=1.0)
 
     weighted, solved, at = least(problem, state, levels)
     quadratic, expected = weighted[SlowError].components(solved.neighbours())[name]

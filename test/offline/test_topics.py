@@ -89,12 +89,24 @@ def test_fixes_are_not_needed_when_the_ends_are_surveyed():
     assert 'fix' not in found
 
 
-def test_velocity_of_the_receiver_only_when_asked_for():
-    found = topics(gps__vel=TWIST)
-    assert choose(found) == choose(topics())
-    assert choose(found, gnss__use_velocity=True)['fix_velocity'] == '/gps/vel'
-    with pytest.raises(BadUsage, match='no GNSS velocity'):
-        choose(topics(), gnss__use_velocity=True)
+def test_velocity_is_taken_where_its_name_is_the_receivers():
+    assert 'fix_velocity' not in choose(topics())
+    assert choose(topics(gps__vel=TWIST))['fix_velocity'] == '/gps/vel'
+    assert 'fix_velocity' not in choose(topics(gps__vel=TWIST), gnss__use_velocity=False)
+    # of two that of the node, else none
+    assert choose(topics(gps__vel=TWIST, ublox__fix_velocity=TWIST))['fix_velocity'] == \
+        '/ublox/fix_velocity'
+    assert 'fix_velocity' not in choose(topics(gps__vel=TWIST, gnss__vel=TWIST))
+
+
+@pytest.mark.parametrize('name', [
+    'cmd_vel', 'vehicle__twist', 'vel', 'prefix__twist', 'gps__filtered_vel', 'fix_speed',
+    'gps_car__wheel_twist', 'gnss__cmd_vel'])
+def test_other_twists_are_taken_for_a_velocity_only_by_name(name):
+    found, topic = topics(**{name: TWIST}), '/' + name.replace('__', '/')
+    ask = {'odometer': '/odometer'}
+    assert 'fix_velocity' not in choose(found, ask)
+    assert choose(found, ask | {'fix_velocity': topic})['fix_velocity'] == topic
 
 
 def test_heading():

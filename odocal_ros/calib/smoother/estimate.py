@@ -167,6 +167,8 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     # passes in which heavy tails are looked for: before, residuals are none, and in the end they
     # rest
     tails, last_tails = 1 if about else 3, 15
+    # pass that counts errors in a row; the better of two starts is counted when it goes on
+    judged = 3 if about is None else 0 if problem.per_effective else 1
     of_all = np.where(np.arange(M) < WANTED, 1.0, SETTLING.others)
     flat = np.where(np.isin(np.arange(M), (YAW, PITCH)), SETTLING.flat_angle, np.inf)
     pace: dict[str, tuple[float, float]] = {}
@@ -195,7 +197,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             still = np.abs(solved.step_border / sigma)[:3].max()
             settled = settled or bool(max(still, change) < SETTLING.nearly)
             break
-        if about is None and count == 3:
+        if count == judged:
             problem.judge_effective(weighted)
         if not frozen:
             near = solved.neighbours()

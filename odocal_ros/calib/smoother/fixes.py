@@ -77,12 +77,12 @@ class Fixes(PointRows):
         place = state.p_n[k] + v * tau + dp + g * tau**2 / 2 - np.cross(w, v) * tau**2
         raw = leg.fixes_n[problem.use] - place - self.arm_n - slow
         # of a receiver that smooths the mean age is a delay
-        track = (state.t, *_antenna(state, here.intervals.mean_rate, arm_b),
+        track = (state.t, *antenna(state, here.intervals.mean_rate, arm_b),
                  state.t[k] + points.tau)
         smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
-        self.raw = np.nan_to_num(raw) + self.v_n * here.fix_later - smoothed - added
+        self.raw = np.nan_to_num(raw) + self.v_n * here.change[GNSS_DELAY] - smoothed - added
 
     def errors(self) -> Floats:
         """Return what the fixes err by, white and slow, where they are linearised: (m, 3) m."""
@@ -138,7 +138,7 @@ class Fixes(PointRows):
         return known
 
 
-def _antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
+def antenna(state: State, mean_rate: Floats, arm_b: Floats) -> tuple[Floats, Floats]:
     """Return places and velocities of the antenna at the keyframes, (N, 3) m and m/s."""
     rate = np.concatenate([mean_rate[:1], (mean_rate[:-1] + mean_rate[1:]) / 2, mean_rate[-1:]])
     return (state.p_n + state.C_nb @ arm_b,

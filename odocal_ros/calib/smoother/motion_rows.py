@@ -24,7 +24,7 @@ from odocal_ros.calib.smoother.part import Here, Part, Total
 from odocal_ros.calib.smoother.signals import Signals
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.state import BG, M, State
+from odocal_ros.calib.smoother.state import BG, M, ODO_DELAY, State
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.mapped import room
 
@@ -51,7 +51,7 @@ class MotionRows(Part):
     name = 'motion'
 
     def __init__(self, problem: 'Problem', here: Here) -> None:
-        change = here.gyro_change, here.odo_later
+        change = here.gyro_change, here.change[ODO_DELAY]
         self.motion = Motion(problem, here.state, here.intervals, change, here.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion) if here.fitted else None

@@ -50,6 +50,7 @@ from odocal_ros.calib.smoother.state import (
     M,
     ODO_ARM,
     PITCH,
+    VELOCITY,
     YAW,
 )
 from odocal_ros.calib.smoother.wheel_result import unknown_wheels, wheel_details, wheel_estimates
@@ -65,7 +66,7 @@ AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
 UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
                                          'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
                                          'gnss_delay': 's'}
-SCALES = range(GYRO.start, M)    # errors of Imu, receiver, tyres, body
+SCALES = range(GYRO.start, VELOCITY.start)    # errors of Imu, receiver, tyres, body
 # estimates where the drive determines them: lever arms and delays
 OPTIONAL = range(ODO_ARM.start, HEADING)
 
@@ -291,12 +292,16 @@ def _details(leg: SmootherLeg, problem: Problem, fit: Fit, sources: list[Source]
 
 
 def _outside(leg: SmootherLeg, problem: Problem, fit: Fit,
-             sigma: Floats) -> dict[str, dict[str, float | str]]:
+             sigma: Floats) -> dict[str, dict[str, Any]]:
     """Return what the drive says of velocity and heading from outside."""
-    out: dict[str, dict[str, float | str]] = {}
+    out: dict[str, dict[str, Any]] = {}
     for name, sent in problem.outside.items():
         out[name] = {'messages': len(sent.t),
                      'alike': problem.per_effective.get(name, 1.0)}
+    if 'velocity' in out:
+        out['velocity'] |= {CONSTANTS[i]: {'value': float(fit.state.constants[i]),
+                                           'sigma': float(sigma[i])}
+                            for i in range(VELOCITY.start, VELOCITY.stop)}
     if 'heading' in out:
         out['heading'] |= {'source': leg.heading.source, 'sigma_stated': leg.heading.sigma,
                            'error': float(fit.state.constants[HEADING]),

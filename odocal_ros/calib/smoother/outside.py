@@ -16,7 +16,7 @@ is one such message.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,15 @@ from odocal_ros.nav.dead_reckoning import Origin
 from odocal_ros.nav.earth import C_en
 from odocal_ros.nav.rotations import matrix_from_quat, transpose
 from odocal_ros.screening.screen import Inputs
-from odocal_ros.settings.config import Config
+from odocal_ros.settings.config import Config, GnssConfig
 
 Floats = NDArray[np.float64]
 VELOCITY_SIGMA = 0.1        # m/s, to start from where a receiver does not say: physical, Doppler
-# Hz: physical, errors of a heading stay longer than a fifth of a second
-HEADING_RATE = 5.0
+# of a GNSS velocity, s and s^2, 1 sigma: physical, receivers are late by up to 0.25 s and smooth
+# over as much
+VELOCITY_TIME_SIGMA, VELOCITY_LAG2_SIGMA = 0.25, 0.1
+# Hz: physical, errors of velocity and heading last longer than a fifth of a second
+OUTSIDE_RATE = 5.0
 GIVEN_HEADING_NOISE = 1e-4  # rad, of a heading given at the mark, beside its error: next to none
 
 
@@ -42,12 +45,11 @@ def _none(*shape: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Velocity:
-    """Velocity of the antenna, in n: (m,) s, (m, 3) m/s."""
+    """Horizontal velocity of the antenna, in n: (m,) s, (m, 2) m/s."""
 
-    from_fixes: ClassVar[bool] = True       # stamps are as late as those of the fixes
     t: Floats = _none()
-    velocity_n: Floats = _none(3)
-    sigma: Floats = _none(3)
+    velocity_n: Floats = _none(2)
+    sigma: Floats = _none(2)
 
     def between(self, first: float, last: float) -> 'Velocity':
         """Return what lies between two times."""
@@ -63,7 +65,6 @@ class Heading:
     noise : (m,) rad.   sigma : rad, of the error that is the same through the leg.
     """
 
-    from_fixes: ClassVar[bool] = False
     t: Floats = _none()
     yaw: Floats = _none()
     noise: Floats = _none()
@@ -77,14 +78,22 @@ class Heading:
 
 
 def outside_velocity(inputs: Inputs, config: Config, origin: Origin) -> Velocity:
-    """Return the velocity of the antenna, turned from where it is to n; empty: not asked for."""
-    if not config.gnss.use_velocity or not len(inputs.t_velocity) or not len(inputs.t_fix):
+    """Return the velocity of the antenna, turned from where it is to n; empty: not used."""
+    # without an accelerometer nothing says how it changes between keyframes
+    if not (config.gnss.use_velocity and len(inputs.t_velocity) and inputs.felt):
         return Velocity()
-    variance = inputs.velocity_variance
+    some = _thinned(inputs.t_velocity)
+    t, variance = inputs.t_velocity[some], inputs.velocity_variance[some, :2]
     known = np.isfinite(variance) & (variance > 0)
     sigma = np.sqrt(np.where(known, variance, VELOCITY_SIGMA**2))
-    C_np = _from_place(inputs, inputs.t_velocity, origin)
-    return Velocity(inputs.t_velocity, (C_np @ inputs.velocity_n[:, :, None])[:, :, 0], sigma)
+    v_n = (_from_place(inputs, t, origin) @ inputs.velocity_n[some, :, None])[:, :2, 0]
+    return Velocity(t, v_n, sigma)
+
+
+def velocity_sigmas(gnss: GnssConfig) -> Floats:
+    """Return the prior sigmas of the constants VELOCITY: (3,)."""
+    return np.array([np.hypot(VELOCITY_TIME_SIGMA, gnss.time_sigma), VELOCITY_LAG2_SIGMA,
+                     max(gnss.velocity_scale_sigma, 1e-6)])
 
 
 def outside_heading(inputs: Inputs, config: Config, origin: Origin) -> Heading:
@@ -110,8 +119,8 @@ def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
     t, q, variance = t[good], q[good], variance[good]
     if len(t) < 2 or not len(inputs.t_fix):
         return Heading()
-    every = max(1, int((len(t) - 1) / max(t[-1] - t[0], 1e-9) / HEADING_RATE))
-    t, q, variance = t[::every], q[::every], variance[::every]
+    some = _thinned(t)
+    t, q, variance = t[some], q[some], variance[some]
     stated = float(np.median(variance))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
@@ -119,6 +128,12 @@ def _sent(inputs: Inputs, t: Floats, q: Floats, variance: Floats, offset: float,
     C = matrix_from_quat(q) @ C_ib
     yaw = arctan2(C[:, 1, 0], C[:, 0, 0]) + offset + _convergence(inputs, t, origin)
     return Heading(t, wrap(yaw), np.full(len(t), sigma), float(max(sigma, 1e-5)), source)
+
+
+def _thinned(t: Floats) -> slice:
+    """Return what takes OUTSIDE_RATE or a little more of sorted times."""
+    rate = (len(t) - 1) / max(t[-1] - t[0], 1e-9)
+    return slice(None, None, max(1, round(rate / OUTSIDE_RATE)))
 
 
 def _from_place(inputs: Inputs, t: Floats, origin: Origin) -> Floats:

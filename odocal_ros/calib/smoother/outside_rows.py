@@ -18,7 +18,7 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outside import Heading, Velocity
 from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.point_rows import PointRows
-from odocal_ros.calib.smoother.state import BARE, GNSS_DELAY
+from odocal_ros.calib.smoother.state import BARE
 from odocal_ros.data.arrays import Floats
 
 if TYPE_CHECKING:
@@ -56,9 +56,7 @@ class OutsideRows(PointRows):
     @classmethod
     def times(cls, problem: 'Problem', constants: Floats) -> Floats:
         """Return when they were true, s."""
-        sent = problem.outside[cls.name]
-        out: Floats = sent.t - constants[GNSS_DELAY] * sent.from_fixes
-        return out
+        return problem.outside[cls.name].t
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:

@@ -45,8 +45,8 @@ class Here:
     Where the equations are linearised: a state, and sums over samples brought to it.
 
     points : sums to the times of the rows, by the name of their part.   gyro_change (K, 3) rad/s,
-    odo_later, fix_later s : by what gyro bias and delays exceed those that the sums were made
-    with.   spread : (K, SPREAD) factors on the variances of intervals that lie far out.
+    change (M,) : by what gyro bias and constants exceed those that the sums were made with.
+    spread : (K, SPREAD) factors on the variances of intervals that lie far out.
     fitted : as for ``Motion``.
     """
 
@@ -54,8 +54,7 @@ class Here:
     intervals: Intervals
     points: dict[str, Points]
     gyro_change: np.ndarray | float
-    odo_later: float
-    fix_later: float
+    change: np.ndarray
     priors: Priors
     spread: np.ndarray | None
     fitted: bool = False

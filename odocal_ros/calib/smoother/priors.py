@@ -32,6 +32,7 @@ from odocal_ros.calib.smoother.state import (
     PHI,
     TYRES,
     V,
+    VELOCITY,
 )
 from odocal_ros.data.arrays import Floats
 
@@ -62,7 +63,7 @@ SHARED = {'odometer_lever_arm': ODO_ARM, 'antenna_lever_arm': GNSS_ARM,
           'tyre_changes': TYRES,
           'body_lean': constants_from('squat', 'pitch_centre'),
           'speed_truncation': constants_from('speed_offset'),
-          'heading': constants_from('heading_offset')}
+          'heading': constants_from('heading_offset'), 'velocity': VELOCITY}
 
 
 class PriorRows(Part):
@@ -72,7 +73,7 @@ class PriorRows(Part):
 
     def __init__(self, problem: 'Problem', here: Here) -> None:
         self.state, self.base = here.state, here.priors
-        absent = {'heading'} - {*problem.outside}
+        absent = {'heading', 'velocity'} - {*problem.outside}
         coarse = problem.leg.travel.coarse
         absent |= set() if coarse and coarse.truncates else {'speed_truncation'}
         self.level = not problem.leg.felt

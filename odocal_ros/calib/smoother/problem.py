@@ -20,7 +20,7 @@ from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
 from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outside import Heading, Velocity
+from odocal_ros.calib.smoother.outside import Heading, Velocity, velocity_sigmas
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import alike, PointRows
 from odocal_ros.calib.smoother.preintegrate import Intervals, owners, Points, preintegrate
@@ -47,6 +47,8 @@ from odocal_ros.calib.smoother.state import (
     Priors,
     SPEED_OFFSET,
     State,
+    VELOCITY,
+    VELOCITY_DELAY,
     YAW,
 )
 from odocal_ros.data.arrays import Floats
@@ -185,14 +187,12 @@ class Sums:
         gyro = np.concatenate([gyro, np.broadcast_to(c[GYRO], (len(gyro), len(c[GYRO])))], axis=1)
         return gyro, (a.accel_bias - b.accel_bias)[:-1], c
 
-    def near(self,
-             state: State) -> tuple[Intervals, dict[str, Points], Floats | float, float, float]:
+    def near(self, state: State) -> tuple[Intervals, dict[str, Points], Floats | float, Floats]:
         """Return the sums for a state nearby, and what they leave to be taken in: see Here."""
         gyro, accel, c = self._apart(state)
-        later = c[ODO_DELAY], c[GNSS_DELAY]
         if not (gyro.any() or accel.any() or c[ACCEL].any()):
-            return self.intervals, self.points, 0.0, *later
-        return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, *later
+            return self.intervals, self.points, 0.0, c
+        return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, c
 
     def hold_at(self, state: State, limits: Floats = SAME_SUMS) -> bool:
         """Tell whether a state is near enough: for first order, or within other limits."""
@@ -201,7 +201,7 @@ class Sums:
         signals = np.concatenate([rate, force], axis=1)
         gyro = gyro[:, :3] + _errors(signals, c[GYRO], GYRO_AXIS, GYRO_SIGNAL)
         accel = accel + _errors(force, c[ACCEL], ACCEL_AXIS, ACCEL_SIGNAL)
-        apart = (gyro, accel, c[:3], c[ODO_DELAY], c[GNSS_DELAY])
+        apart = (gyro, accel, c[:3], c[ODO_DELAY], c[[GNSS_DELAY, VELOCITY_DELAY]])
         return bool(np.all(np.array([np.abs(a).max() for a in apart]) < limits))
 
 
@@ -264,6 +264,7 @@ def _priors(config: Config, grade: Grade, leg: SmootherLeg) -> Priors:
     # physical: receivers with an odometer trust it for 5 to 60 s
     centre[FIX_TIME], sigma[FIX_TIME] = np.log(20.0), 0.7
     centre[SPEED_OFFSET], sigma[SPEED_OFFSET] = _offset(leg.travel.coarse)
+    sigma[VELOCITY] = velocity_sigmas(config.gnss) if len(leg.velocity.t) else NO_ERROR
     if not leg.felt:        # nothing tells the mounting from the attitude: it is as set
         sigma[ACCEL] = sigma[PITCH] = NO_ERROR
         if not len(leg.heading.t):

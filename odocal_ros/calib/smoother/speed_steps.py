@@ -80,7 +80,7 @@ class SpeedSteps(PointRows):
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
-        self.raw = (self.said - self.speed + self.gained * here.odo_later)[:, None]
+        self.raw = (self.said - self.speed + self.gained * here.change[ODO_DELAY])[:, None]
 
     @classmethod
     def there(cls, problem: 'Problem') -> bool:

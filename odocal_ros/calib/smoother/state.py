@@ -59,7 +59,8 @@ CONSTANTS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle',
              'odometer_delay', 'gnss_delay', 'heading_offset', *GYRO_ERRORS, *ACCEL_ERRORS,
              'fix_lag_square', 'fix_error_by_motion', 'scale_by_speed', 'scale_by_time',
              'scale_by_pull', 'scale_by_braking', 'squat', 'sideslip', 'squat_by_jerk',
-             'sideslip_by_jerk', 'pitch_centre', 'fix_motion_time', 'speed_offset')
+             'sideslip_by_jerk', 'pitch_centre', 'fix_motion_time', 'speed_offset',
+             'velocity_delay', 'velocity_lag_square', 'velocity_scale')
 
 
 def constants_from(first: str, last: str = '') -> slice:
@@ -105,6 +106,10 @@ KIND_OF = np.repeat(np.arange(len(KIND_SIZES)), list(KIND_SIZES.values()))    # 
 # scale units per s: of a speed sent in steps, what a value of it lacks, half a step where the
 # sender truncates
 SPEED_OFFSET = CONSTANTS.index('speed_offset')
+# of a GNSS velocity: delay of its stamps, s, square of the time constant by which the receiver
+# smooths it, s^2, and by how much it is too large, relative
+VELOCITY = constants_from('velocity_delay', 'velocity_scale')
+VELOCITY_DELAY, VELOCITY_LAG2, VELOCITY_SCALE = range(VELOCITY.start, VELOCITY.stop)
 M = len(CONSTANTS)
 
 

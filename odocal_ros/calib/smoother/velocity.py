@@ -7,59 +7,86 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A velocity from outside, docs/method.md (S18): the GNSS antenna's, when it was true."""
+"""
+The horizontal velocity of the GNSS antenna as rows, docs/method.md (S18).
+
+Derivatives by constants go by means of the interval. Those by samples hold vibration, by which a
+delay and axes look certain, and a lever arm short.
+"""
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from odocal_ros.calib.smoother.fixes import antenna
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import Velocity
 from odocal_ros.calib.smoother.outside_rows import OutsideRows, Rows
 from odocal_ros.calib.smoother.part import Here
 from odocal_ros.calib.smoother.preintegrate import Points, turn
+from odocal_ros.calib.smoother.signals import lasting, UPRIGHT
 from odocal_ros.calib.smoother.state import (
     ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
     BA,
     BARE,
     BG,
     GNSS_ARM,
-    GNSS_DELAY,
     GYRO_SCALE,
     M,
     PHI,
     PITCH,
-    State,
     V,
+    VELOCITY_DELAY,
+    VELOCITY_LAG2,
+    VELOCITY_SCALE,
     YAW,
 )
-from odocal_ros.nav.rotations import skew
+from odocal_ros.data.arrays import Floats, Ints
+from odocal_ros.nav.receiver_filter import smoothing
+from odocal_ros.nav.rotations import skew, transpose
 
 if TYPE_CHECKING:
     from odocal_ros.calib.smoother.problem import Problem
+
+
+# m/s, to start from: judgement, 2 m/s^2 times 0.25 s. With less, accelerations look like outliers
+FIRST_SIGMA = 0.5
 
 
 class VelocityRows(OutsideRows):
     """Residuals of a velocity (sent less predicted) and their derivatives at one state."""
 
     name, source = 'velocity', 'fix_velocity'
-    levels_of = {'velocity': slice(0, 2), 'velocity_up': slice(2, 3)}
+    levels_of = {'velocity': slice(0, 2)}
 
     def rows(self, problem: 'Problem', here: Here) -> Rows:
         """Return the rows."""
-        return _velocity(problem, here.state, here.points['velocity'], here.fix_later)
+        return _velocity(problem, here, here.points['velocity'])
+
+    @classmethod
+    def times(cls, problem: 'Problem', constants: Floats) -> Floats:
+        """Return when it was true, s."""
+        out: Floats = super().times(problem, constants) - constants[VELOCITY_DELAY]
+        return out
+
+    @classmethod
+    def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
+        """Return the first level, of residuals before the delay is known, and the least."""
+        first, least = super().first_levels(problem)
+        sigma = float(np.median(problem.outside[cls.name].sigma))
+        return {name: max(x, (FIRST_SIGMA / sigma)**2) for name, x in first.items()}, least
 
     @staticmethod
     def least(sent: Velocity) -> dict[str, float]:
-        """Return the least levels."""
-        sigma = np.median(sent.sigma, axis=0)
-        return {'velocity': (LEAST.velocity / sigma[0])**2,
-                'velocity_up': (LEAST.velocity / sigma[2])**2}
+        """Return the least level."""
+        return {'velocity': (LEAST.velocity / float(np.median(sent.sigma)))**2}
 
 
-def _velocity(problem: 'Problem', state: State, points: Points, later: float) -> Rows:
-    leg, sent, k = problem.leg, problem.outside['velocity'], points.interval
+def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
+    leg, state, sent, k = problem.leg, here.state, problem.outside['velocity'], points.interval
     assert isinstance(sent, Velocity)
     C, tau = state.C_nb[k], points.tau[:, None]
     C_t = C @ points.R
@@ -67,9 +94,14 @@ def _velocity(problem: 'Problem', state: State, points: Points, later: float) ->
     arm_b = state.C_bv @ arm_v
     dv, g = turn(C, points.dv), gravity_n(state.p_n[k], leg.origin)
     swing = turn(C_t, np.cross(points.rate, arm_b))
-    faster = turn(C, points.force) + g
-    raw = sent.velocity_n - (state.v_n[k] + dv + g * tau + swing) + faster * later
-    m, t = len(k), tau[:, :, None]
+    _, at_keys = antenna(state, here.intervals.mean_rate, arm_b)
+    faster = (np.diff(at_keys, axis=0) / here.intervals.T[:, None])[k]
+    smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
+                                 state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
+    v = state.v_n[k] + dv + g * tau + swing + smoothed - faster * here.change[VELOCITY_DELAY]
+    # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
+    times = 1 + state.constants[VELOCITY_SCALE]
+    m, t, rate = len(k), tau[:, :, None], here.intervals.mean_rate[k]
     J, c = np.zeros((m, 3, BARE)), np.zeros((m, 3, M))
     J[:, :, V] = -np.eye(3)
     J[:, :, PHI] = skew(dv + swing)
@@ -77,10 +109,24 @@ def _velocity(problem: 'Problem', state: State, points: Points, later: float) ->
     # a turn rate less by the bias: half the turn acts on what force did, all of it on the arm
     J[:, :, BG] = -(skew(dv) / 2 + skew(swing)) @ C * t - C_t @ skew(arm_b)
     by_yaw, by_pitch = state.C_bv_gradient()
-    W = C_t @ skew(points.rate)
+    W = C_t @ skew(rate)
     c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
     c[:, :, GNSS_ARM] = -W @ state.C_bv
-    c[:, :, GNSS_DELAY] = faster
-    c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * points.rate[:, 2:]
-    c[:, :, ACCEL] = C @ points.F
-    return Rows(k, raw, J, c, np.asarray(1 / sent.sigma))
+    c[:, :, VELOCITY_DELAY], c[:, :, VELOCITY_LAG2] = faster, -by_lag
+    c[:, :, GYRO_SCALE] = J[:, :, BG.start + 2] * rate[:, 2:]
+    c[:, :, ACCEL] = C @ _signals(here, k, turn(transpose(C), faster - g)) * t
+    J, c = J[:, :2] * times, c[:, :2] * times
+    c[:, :, VELOCITY_SCALE] = -v[:, :2]
+    return Rows(k, sent.velocity_n - times * v[:, :2], J, c, np.asarray(1 / sent.sigma))
+
+
+def _signals(here: Here, k: Ints, force: Floats) -> Floats:
+    """
+    Return what errors of the accelerometer multiply, by the axes they enter: (m, 3, a) m/s^2.
+
+    As of the intervals (signals.py) it is the force as fitted, and upright what lasts of it.
+    """
+    force[:, UPRIGHT] = lasting(here.intervals.mean_force, here.intervals.T)[k, UPRIGHT]
+    out = np.zeros((len(k), 3, len(ACCEL_AXIS)))
+    out[:, ACCEL_AXIS, range(len(ACCEL_AXIS))] = force[:, ACCEL_SIGNAL]
+    return out

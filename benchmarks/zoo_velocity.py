@@ -1,0 +1,109 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What a GNSS velocity does to the results: drives of the zoo with it and without.
+
+    python benchmarks/zoo_velocity.py --drives 40 [--kind white] [--file F]
+
+Drives are those of ``zoo.py`` with all effects, seeds from 70_000_000 on; drive k has the k-th
+kind of velocity error, in turns, unless ``--kind`` says one. Printed by kind, for scale, yaw and
+pitch, without and with: share within 1.96 sigma, RMS and worst of error over sigma; the median
+ratio of the sigmas, with over without; and the ratio of CPU time.
+"""
+
+import argparse
+import json
+import os
+from pathlib import Path
+import time
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+from resumed import read_rows
+from zoo import configured, FIRST_SEED, grade_of, kind_of, outcome
+
+SIGMA = 0.05        # m/s
+ERRORS = {
+    'white': {},
+    'filtered': {'velocity_lag': 0.5, 'velocity_correlation_time': 0.5},
+    'late': {'velocity_delay': 0.2},
+    'scale': {'velocity_scale_error': 1e-3},
+    'correlated': {'velocity_correlation_time': 5.0},
+    'outliers': {'velocity_outliers': 0.05},
+    'fused': {'velocity_scale_error': 0.02, 'velocity_correlation_time': 5.0}}
+
+
+def run_drive(k, error):
+    """Return rows of a drive without and with the velocity."""
+    from odocal_ros.pipeline.calibrate import calibrate, combine
+    from odocal_ros.settings.config import with_settings
+    from odocal_ros.sim.draw import drawn
+    from odocal_ros.sim.scenarios import simulate
+    options, _ = drawn(FIRST_SEED + k, kind_of(k), grade_of(k), None, velocity_sigma=SIGMA,
+                       **ERRORS[error])
+    drive = simulate(options)
+    row = {'seed': FIRST_SEED + k, 'error': error, 'kind': kind_of(k), 'grade': grade_of(k)}
+    for name, use in (('without', False), ('with', True)):
+        config = with_settings(configured(drive), {'gnss.use_velocity': use})
+        begin = time.process_time()
+        calibration = combine([calibrate(drive.leg(), config)], config)
+        row[name] = {'seconds': time.process_time() - begin, **outcome(calibration, drive.truth)}
+        smoother = calibration.legs[0].methods.get('smoother')
+        details = smoother.details if smoother else {}
+        row[name] |= {'outside': details.get('outside', {}).get('velocity'),
+                      'level': details.get('noise', {}).get('velocity')}
+    return row
+
+
+def print_table(name, rows):
+    """Print the figures of some drives."""
+    print(f'{name}: {len(rows)} drives')
+    for key in ('scale', 'yaw', 'pitch'):
+        text = f'  {key:6}'
+        for run in ('without', 'with'):
+            z = np.array([r[run][f'{key}_error'] / r[run][f'{key}_sigma'] for r in rows
+                          if f'{key}_error' in r[run] and r[run]['verdict'] != 'rejected'])
+            if len(z):
+                text += (f'  {run} {len(z)}: {100 * (abs(z) < 1.96).mean():5.1f} %, '
+                         f'rms {np.sqrt((z**2).mean()):.2f}, worst {abs(z).max():.1f};')
+        ratio = [r['with'][f'{key}_sigma'] / r['without'][f'{key}_sigma'] for r in rows
+                 if all(f'{key}_sigma' in r[run] for run in ('without', 'with'))]
+        print(text + (f'  sigmas {np.median(ratio):.3f}' if ratio else ''))
+    cpu = [r['with']['seconds'] / r['without']['seconds'] for r in rows]
+    print(f'  CPU: {np.median(cpu):.2f}')
+
+
+def main():
+    """Run what the file does not hold yet, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--drives', type=int, default=40)
+    parser.add_argument('--kind', choices=ERRORS)
+    parser.add_argument('--file', type=Path, default=Path('/tmp/zoo_velocity.jsonl'))
+    args = parser.parse_args()
+    have = read_rows(args.file)
+    for k in range(args.drives):
+        error = args.kind or list(ERRORS)[k % len(ERRORS)]
+        if have.get(FIRST_SEED + k, {}).get('error') == error:
+            continue
+        have[FIRST_SEED + k] = row = run_drive(k, error)
+        with args.file.open('a') as out:
+            out.write(json.dumps(row) + '\n')
+    rows = [have[FIRST_SEED + k] for k in range(args.drives)]
+    for error in ERRORS:
+        some = [row for row in rows if row['error'] == error]
+        if some:
+            print_table(error, some)
+    print_table('all', rows)
+
+
+if __name__ == '__main__':
+    main()
