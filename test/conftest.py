@@ -57,9 +57,9 @@ SLOW = ('test_ament_lint', 'test_calibrate', 'test_cli', 'test_damage', 'test_da
         'test_scale_change', 'test_several_bags', 'test_shutdown', 'test_site', 'test_slow_slip',
         'test_smoother_memory', 'test_smoother_noise', 'test_smoother_outside',
         'test_smoother_parts', 'test_smoother_result', 'test_smoother_run', 'test_smoother_slip',
-        'test_smoother_so_far', 'test_speed_steps', 'test_stream_faults', 'test_wheel_faults',
-        'test_wheel_survey', 'test_wheel_unseen', 'test_wheels_fit', 'test_wheels_run',
-        'test_wire', 'test_write')
+        'test_smoother_so_far', 'test_speed_steps', 'test_stream_faults', 'test_try',
+        'test_wheel_faults', 'test_wheel_survey', 'test_wheel_unseen', 'test_wheels_fit',
+        'test_wheels_run', 'test_wire', 'test_write')
 
 
 def pytest_collection_modifyitems(items):

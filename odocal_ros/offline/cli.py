@@ -21,6 +21,7 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.offline.say import warn
 
 COMMANDS = {
+    'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate from it, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
     'fleet': ('odocal_ros.fleet.command', 'calibrate many vehicles from many bags, on many cores'),
     'inspect': ('odocal_ros.offline.inspect_bag', 'tell what a bag holds and what it lacks'),

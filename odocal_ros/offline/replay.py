@@ -77,11 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if series:
         from odocal_ros.library.export import check_names
         check_names(series)
-    output = Path(args.output) if args.output else Path(
-        f'odocal_{one_line(Path(args.bags[0]).stem)}')
-    if (output / 'calibration.json').exists() and not args.force:     # said before the work
-        raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
-                       'or another --output')
+    output = output_folder(args.output, args.bags[0], args.force)
     from odocal_ros.calib.failed import traces
     from odocal_ros.library.calibrate_bag import calibrate_bag
     from odocal_ros.offline.cli import trace_file
@@ -94,6 +90,15 @@ def run(args: argparse.Namespace) -> int:
         exported = calibration.export(*(output / name for name in series))
         _Screen(args).note(f'exported: {", ".join(map(str, exported))}')
     return code
+
+
+def output_folder(asked: str | None, bag: str, force: bool) -> Path:
+    """Return the folder for the results; BadUsage if it holds one and ``force`` is false."""
+    output = Path(asked or f'odocal_{one_line(Path(bag).stem)}')
+    if (output / 'calibration.json').exists() and not force:      # before the work
+        raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
+                       'or another --output')
+    return output
 
 
 class _Screen(Hearer):

@@ -43,6 +43,25 @@ def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
             not worded if 'odometer' in slot else 0, -info.count, info.name)
 
 
+# why a topic is before another, by the first element of their ranks that differs
+WHY = ('it counts, where others send speeds', 'it has the usual name',
+       'it is named like an odometer', 'it has the most messages', 'it is the first by name')
+
+
+def others(topics: dict[str, TopicInfo], slot: str, config: Config,
+           mapping: dict[str, str]) -> list[str]:
+    """Return the topics that could be a slot's beside the one in ``mapping``, likeliest first."""
+    taken = {s: t for s, t in mapping.items() if s != slot}
+    return sorted(set(candidates(topics, slot, config, taken)) - {mapping[slot]},
+                  key=lambda name: _rank(slot, topics[name]))
+
+
+def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str) -> str:
+    """Return why ``topic`` is suggested for a slot and not ``other``."""
+    pairs = zip(_rank(slot, topics[topic]), _rank(slot, topics[other]), strict=True)
+    return next(why for why, (own, its) in zip(WHY, pairs, strict=True) if own != its)
+
+
 def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
     """Return what replay would say without options: which topics it cannot choose; '' if none."""
     try:

@@ -1,0 +1,197 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""odocal try: inspect a bag, replay it as inspect suggests, open the report."""
+
+import argparse
+from dataclasses import dataclass
+import math
+import os
+from pathlib import Path
+import shlex
+import sys
+import textwrap
+from typing import Any, TYPE_CHECKING
+
+from odocal_ros.errors import BadData
+from odocal_ros.offline import replay
+from odocal_ros.offline.say import say
+
+if TYPE_CHECKING:
+    from odocal_ros.bagio.read import Bag
+    from odocal_ros.settings.config import Config
+
+LABELS = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+          'heading': 'heading', 'fix_velocity': 'GNSS velocity'}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options: those of replay that say how to calibrate, and --no-browser."""
+    add = parser.add_argument
+    add('bag', metavar='BAG', help='bag folder or file')
+    replay.add_calibration_arguments(parser)
+    add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
+    add('--force', action='store_true', help='replace an existing calibration.json')
+    add('--no-browser', action='store_true', help='do not open the report')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Inspect a bag, replay it and open the report; return the exit code of the replay."""
+    output = replay.output_folder(args.output, args.bag, args.force)
+    found, choices = _look(args)
+    if not found['command']:
+        from odocal_ros.offline.inspection_text import text
+        say(text(found))
+        raise BadData(f'{args.bag}: {_missing(found)}; for a topic of another type give its '
+                      'option, such as --odometer-topic TOPIC')
+    options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
+    say('\n'.join(_told(found, choices, options)))
+    parser = argparse.ArgumentParser()
+    replay.add_arguments(parser)
+    code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
+    _open(output / 'report.html', args.no_browser)
+    from odocal_ros.outside.names import for_shell
+    say(f'\nnext time:\n  {for_shell(["odocal", "replay", args.bag, *options, "--force"])}')
+    return code
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A topic that was taken where several could be meant."""
+
+    slot: str
+    topic: str
+    others: list[str]
+    why: str
+
+    def words(self) -> str:
+        """Return the choice as a line for people."""
+        from odocal_ros.library.topics import OPTION
+        return (f'{LABELS[self.slot]}: {self.topic}, because {self.why}; other candidates: '
+                f'{", ".join(self.others)} ({OPTION[self.slot]})')
+
+
+def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
+    """Return what inspect finds with the topics chosen, and the choices."""
+    from odocal_ros.bagio.read import open_bag
+    from odocal_ros.offline.inspection import inspect
+    from odocal_ros.settings.config import Config, with_settings
+    config = with_settings(Config(), replay.asked_config(args))
+    topics = replay.asked_topics(args)
+    with open_bag(Path(args.bag)) as bag:
+        choices = _choices(bag, config, topics)
+        if choices and sys.stdin and sys.stdin.isatty() and sys.stdout.isatty():
+            choices = [_asked(bag, choice) for choice in choices]
+            topics |= {choice.slot: choice.topic for choice in choices}
+        return inspect(bag, args.bag, config, topics), choices
+
+
+def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str]) -> list[_Choice]:
+    """Return the likeliest topic of each slot that has several candidates."""
+    from odocal_ros.offline.suggest import likely_mapping, others, why_before
+    mapping, config = likely_mapping(bag.topics, config, topics)
+    found = []
+    for slot in mapping.keys() - topics.keys():
+        if rest := others(bag.topics, slot, config, mapping):
+            why = why_before(bag.topics, slot, mapping[slot], rest[0])
+            found.append(_Choice(slot, mapping[slot], rest, why))
+    return sorted(found, key=lambda choice: list(LABELS).index(choice.slot))
+
+
+def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
+    """Return the choice of a person at the terminal; an empty line takes the first."""
+    names = [choice.topic, *choice.others]
+    say(f'{len(names)} topics could be the {LABELS[choice.slot]}:')
+    for number, name in enumerate(names, 1):
+        info = bag.topics[name]
+        say(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
+    while True:
+        say(f'which one? [1: {choice.why}] ', end='')
+        sys.stdout.flush()
+        line = sys.stdin.readline()
+        if not line:
+            raise KeyboardInterrupt
+        answer = line.strip() or '1'
+        if answer == '1':
+            return choice
+        if answer.isdecimal() and 1 < int(answer) <= len(names):
+            names.insert(0, names.pop(int(answer) - 1))
+            return _Choice(choice.slot, names[0], names[1:], 'you chose it')
+        say(f'enter a number from 1 to {len(names)}')
+
+
+def _missing(found: dict[str, Any]) -> str:
+    missing = [LABELS[slot] for slot in ('imu', 'odometer', 'fix') if slot not in found['mapping']]
+    return f'no topic was found for: {", ".join(missing)}'
+
+
+def _suggested(command: str, without_legs: bool) -> list[str]:
+    """Return the options of the replay that inspect suggests, each followed by its value."""
+    words = shlex.split(command)[3:]
+    pairs = zip(words[::2], words[1::2], strict=True)
+    return [word for pair in pairs if not (without_legs and pair[0] == '--leg') for word in pair]
+
+
+def _own_options(args: argparse.Namespace) -> list[str]:
+    """Return the options of the user that inspect does not repeat in its suggestion."""
+    words = []
+    for option, given in (('--config', [args.config]), ('--set', args.settings),
+                          ('--leg', args.leg), ('--method', [args.method]),
+                          ('--accept', args.accept), ('--output', [args.output])):
+        for value in given:
+            words += [option, value] if value else []
+    return words + ['--strict'] * args.strict
+
+
+def _told(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> list[str]:
+    """Return what was chosen and why, as lines for people."""
+    from odocal_ros.settings.config import SETTINGS
+    chosen = {choice.slot: choice.words() for choice in choices}
+    lines = ['topics']
+    for slot, topic in found['mapping'].items():
+        lines += _wrapped(chosen.get(slot, f'{LABELS[slot]}: {topic}'))
+    pairs = list(zip(options, options[1:], strict=False))
+    settings = [value for option, value in pairs if option == '--set']
+    lines += ['settings'] * bool(settings)
+    for setting in settings:
+        name = setting.partition('=')[0]
+        why = _why_mounting(found['mounting']) if name == 'imu.mounting_rpy' else ''
+        lines += _wrapped(f'{setting}: {why or SETTINGS[name].about}')
+    legs = [value for option, value in pairs if option == '--leg'] or [
+        f'{leg["start"]:.1f}:{leg["stop"]:.1f}' for leg in found['legs']]
+    lines += ['legs, seconds from the first message'] * bool(legs)
+    return [*lines, *_wrapped(', '.join(legs)), '']
+
+
+def _why_mounting(mounting: dict[str, Any] | None) -> str:
+    """Return how the axes of the IMU were found; '' where they were not."""
+    if not mounting or not mounting['needed']:
+        return ''
+    if mounting['assumed_forward']:
+        return 'up is known from gravity; x is assumed to be forward'
+    return ('up is known from gravity, forward from accelerations and turns, '
+            f'to {math.degrees(mounting["forward_sigma"]):.0f} deg (1 sigma)')
+
+
+def _wrapped(line: str) -> list[str]:
+    from odocal_ros.output.summary import WIDTH
+    return textwrap.wrap(line, WIDTH, initial_indent='  ', subsequent_indent='    ',
+                         break_long_words=False, break_on_hyphens=False)
+
+
+def _open(report: Path, never: bool) -> None:
+    """Show the report in a browser, where there is a display."""
+    import webbrowser
+    if never or not report.exists():
+        return
+    # without one, a text browser would take over the terminal
+    display = sys.platform != 'linux' or any(
+        os.environ.get(name) for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'))
+    if not (display and webbrowser.open(report.resolve().as_uri())):
+        say(f'no browser could be started: open {report.resolve()}')
