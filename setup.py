@@ -20,6 +20,8 @@ HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"^__version__ = '(.+)'$", (HERE / NAME / '__init__.py').read_text(),
                     re.MULTILINE).group(1)
 SHARE = f'share/{NAME}'
+# where the repository is published: <url type="repository"> of package.xml
+REPOSITORY = re.search(r'<url type="repository">(.+)</url>', (HERE / 'package.xml').read_text())
 SITE = ['furo>=2024', 'myst-parser>=3', 'sphinx>=7']
 # pyarrow: 24 and later refuse numpy 1.26, which is Ubuntu 24.04's
 # ament's linters as a build farm has them; of flake8's plugins all but docstrings, pep257's work
@@ -30,15 +32,38 @@ LINT = ['flake8-blind-except', 'flake8-builtins', 'flake8-class-newline', 'flake
 FLEET = ['cryptography>=41', 'dask>=2024.8', 'distributed>=2024.8', 'fsspec>=2024.2',
          'pandas>=2.2', 'pyarrow>=15,<24']
 
+
+def index_page(text: str, repository: str) -> str:
+    """
+    Return the README as a package index shows it, where relative links lead nowhere.
+
+    They are made absolute; without a published repository pictures go and links are plain text.
+    """
+    picture, link = r'!\[([^]]*)\]\((?!https?:)([^)#]+)\)', r'\[([^]]*)\]\((?!https?:)([^)]+)\)'
+    if not repository:
+        return re.sub(link, r'\1', re.sub(picture + r'\n*', '', text))
+    text = re.sub(picture, rf'![\1]({repository}/raw/{VERSION}/\2)', text)
+    return re.sub(link, rf'[\1]({repository}/blob/{VERSION}/\2)', text)
+
+
 setup(
     name=NAME,
     version=VERSION,
     description="Calibrate a vehicle's odometer against IMU and GNSS, live or from bags",
-    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description=index_page((HERE / 'README.md').read_text(encoding='utf-8'),
+                                REPOSITORY[1].rstrip('/') if REPOSITORY else ''),
     long_description_content_type='text/markdown',
     author='Seed 08f791d2 maintainers',
     author_email='maintainers@users.noreply.h-seed-08f791d2.example',
     license='Apache-2.0',
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering',
+    ],
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={f'{NAME}.{room}': ['templates/*'] for room in ('fleet', 'output')},
     data_files=[
@@ -86,6 +111,7 @@ setup(
             # GPL-3.0, read by one test, imported by nothing of the package
             'evo>=1.36',
             'hypothesis>=6',
+            'jsonschema>=4',
             'mpmath>=1.3',
             'mypy>=1.8',
             'pandas>=2',
@@ -97,10 +123,14 @@ setup(
             'ruff>=0.6',
         ],
     },
-    entry_points={'console_scripts': [
-        'calibrator = odocal_ros.live.node:main',
-        'odocal = odocal_ros.offline.cli:main',
-        'odometry = odocal_ros.live.odometry:main',
-    ]},
+    entry_points={
+        'console_scripts': [
+            'calibrator = odocal_ros.live.start:calibrator',
+            'odocal = odocal_ros.offline.cli:main',
+            'odometry = odocal_ros.live.start:odometry',
+        ],
+        # ros2 odocal ...
+        'ros2cli.command': ['odocal = odocal_ros.offline.ros2_command:OdocalCommand'],
+    },
     zip_safe=True,
 )

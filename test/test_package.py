@@ -33,13 +33,15 @@ XML = ElementTree.parse(ROOT / 'package.xml').getroot()
 KEYS = {'numpy': ('python3-numpy', 'numpy'), 'yaml': ('python3-yaml', 'PyYAML'),
         'jinja2': ('python3-jinja2', 'jinja2'),
         'matplotlib': ('python3-matplotlib', 'matplotlib'), 'pyproj': ('python3-pyproj', 'pyproj'),
-        'rich': ('python3-rich', 'rich'), 'rosbags': ('python3-rosbags-pip', 'rosbags'),
+        'rich': ('python3-rich', 'rich'), 'rosbags': ('rosbags', 'rosbags'),
         'scipy': ('python3-scipy', 'scipy'), 'tqdm': ('python3-tqdm', 'tqdm')}
 EXTRA = {'rich': 'watch'}     # import name: the extra of setup.py that brings it
 TABLES = {'pandas', 'pyarrow'}      # of the extra tables: who wants them is told what to install
 # of the extra for fleets, which pip alone brings: a vehicle's computer has no use for it
 FLEET = {'dask', 'distributed', 'fsspec'} | TABLES
 WITH_DISTRIBUTED = {'psutil'}
+# what lacks them says what to install: rosdep has no key of the first, and not everywhere of rich
+BY_PIP = {'rosbags', 'rich'}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 
@@ -90,7 +92,7 @@ def test_the_changelog_is_as_bloom_reads_it():
 def test_package_xml_names_all_that_is_imported():
     declared = {e.text for e in XML.findall('exec_depend')}
     wanted = {KEYS[name][0] if name in KEYS else name
-              for name in imported() - FLEET - WITH_DISTRIBUTED}
+              for name in imported() - FLEET - WITH_DISTRIBUTED - BY_PIP}
     assert len(wanted) > 10
     assert wanted <= declared
     assert XML.attrib['format'] == '3'
@@ -167,6 +169,11 @@ def test_pip_puts_both_commands_on_the_path(tmp_path, editable):
     assert 'replay' in run(bin_ / 'odocal', '--help', env=env, cwd=tmp_path).stdout
     version = run(bin_ / 'odocal', '--version', env=env, cwd=tmp_path).stdout
     assert version.strip() == f'odocal_ros {odocal_ros.__version__}'
+    for command in ('calibrator', 'odometry'):
+        done = subprocess.run([bin_ / command], capture_output=True, text=True, env=env)
+        assert done.returncode == 2
+        assert done.stderr.startswith(f'{command}: a live node needs ROS 2 (Python module ')
+        assert done.stderr.count('\n') == 1
 
 
 @pytest.fixture(scope='module')

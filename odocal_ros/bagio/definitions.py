@@ -16,6 +16,8 @@ import signal
 import threading
 from typing import Any
 
+from odocal_ros.bagio.optional import rosbags_for
+
 BAR = '=' * 80 + '\n'    # format: between definitions, of ros2msg in mcap.dev/spec/registry
 TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/@()]+|.',
                    re.DOTALL)
@@ -23,7 +25,8 @@ TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/
 
 def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:
     """Return the fields of a type and those it stands on; form is 'msg' or 'idl'."""
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+    with rosbags_for('a message type that is no standard one'):
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg
     if form == 'msg':
         return get_types_from_msg(text, msgtype)
     parts = [part.split('\n', 1)[1] for part in text.split(BAR)[1:]] if text.startswith(

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from odocal_ros.bagio.channels import Channel, Recording
+from odocal_ros.bagio.optional import rosbags_for
 from odocal_ros.errors import BadBag, OdocalError
 from odocal_ros.outside.limits import Allowance, LATEST_NS, LimitReached
 
@@ -91,13 +92,15 @@ class Rosbag1File(Recording):
 
 
 def _decompressors() -> dict[str, Callable[..., Any]]:
-    from rosbags.rosbag1 import reader
+    with rosbags_for('a rosbag1 file'):
+        from rosbags.rosbag1 import reader
     return reader.decompressors
 
 
 def _reader(path: Path) -> Any:
     """Return a reader of rosbags whose index holds no more than the file."""
-    from rosbags.rosbag1 import Reader
+    with rosbags_for('a rosbag1 file'):
+        from rosbags.rosbag1 import Reader
     most = path.stat().st_size
 
     class Bounded(io.BufferedReader):

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from odocal_ros.bagio.definitions import parsed, within
+from odocal_ros.bagio.optional import rosbags_for
 from odocal_ros.errors import BadData
 from odocal_ros.outside.limits import check, DEFINITION, ELEMENTS, factor, LimitReached, SECONDS
 
@@ -51,7 +52,8 @@ class Types:
     def _with(self, msgtype: str) -> Any:
         """Return the store once it knows a type, or raise BadData."""
         if self._store is None:
-            from rosbags.typesys import get_typestore, Stores
+            with rosbags_for(msgtype):
+                from rosbags.typesys import get_typestore, Stores
             self._store = get_typestore(Stores.ROS2_JAZZY)
         if msgtype not in self._store.fielddefs:
             self._register(msgtype)

@@ -20,6 +20,7 @@ import numpy as np
 
 from odocal_ros.bagio import encode
 from odocal_ros.bagio.encode import Topic
+from odocal_ros.bagio.optional import rosbags_for
 from odocal_ros.errors import BadUsage
 
 STORAGES = ('mcap', 'sqlite3', 'rosbag1')
@@ -122,8 +123,9 @@ def _remove(path: Path) -> None:
 
 def _write_rosbag2(path: Path, topics: Sequence[Topic], storage: str, compression: str,
                    progress: Callable[[float], None] | None) -> None:
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-    from rosbags.typesys import get_typestore, Stores
+    with rosbags_for('writing a bag'):
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+        from rosbags.typesys import get_typestore, Stores
     store = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
@@ -151,8 +153,9 @@ def _with_checksums(storage: Any) -> None:
 
 def _write_rosbag1(path: Path, topics: Sequence[Topic], storage: str, compression: str,
                    progress: Callable[[float], None] | None) -> None:
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import get_typestore, Stores
+    with rosbags_for('writing a bag'):
+        from rosbags.rosbag1 import Writer
+        from rosbags.typesys import get_typestore, Stores
     store, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
     with Writer(path) as writer:
         connections = [writer.add_connection(t.name, t.msgtype, typestore=store) for t in topics]

@@ -19,7 +19,6 @@ from typing import Any
 from odocal_ros.errors import BadUsage, OdocalError
 
 NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
-INSTALL = "pip install 'odocal_ros[fleet]'"
 MEMORY = 2 * 2**30       # judgement: bytes for a task, unless said
 FEWEST = 50              # judgement: of them, least: workers may be on their way
 LOST = ('the Dask scheduler is gone; start it again and give the same command: what is done is '
@@ -34,7 +33,8 @@ def check_installed() -> None:
     """Raise BadUsage with the line that installs what is missing."""
     missing = [name for name in NEEDS if find_spec(name) is None]
     if missing:
-        raise BadUsage(f'odocal fleet needs {", ".join(missing)}: {INSTALL}')
+        raise BadUsage(f'odocal fleet needs {", ".join(missing)}: pip install '
+                       f'{" ".join(missing)}')
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from argparse import ArgumentParser, Namespace
 from odocal_ros.errors import BadUsage
 
 NEEDS = {'rich': 'pip install rich (or apt install python3-rich)',
-         'rclpy': "source ROS 2 Jazzy, or pip install 'odocal_ros[ros]'"}
+         'rclpy': "source ROS 2 Jazzy, or install odocal_ros with the extra 'ros'"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -22,8 +22,9 @@ import sys
 from odocal_ros import __version__
 from odocal_ros.offline.say import say
 
-NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'rosbags', 'matplotlib', 'jinja2', 'tqdm')
-OPTIONAL = {'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
+NEEDED = ('numpy', 'scipy', 'pyproj', 'PyYAML', 'matplotlib', 'jinja2', 'tqdm')
+OPTIONAL = {'rosbags': 'rosbag1 files, message types of a bag, written bags',
+            'rich': 'odocal watch', 'pandas': 'to_frame', 'pyarrow': 'Parquet'}
 WORTH = ('ROS_DISTRO', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY',
          'ROS_HOME', 'ODOCAL_LIMITS')     # of the environment; no other is shown
 MISSING = 'MISSING'

@@ -15,6 +15,8 @@ import math
 import numpy as np
 import pytest
 
+pytest.importorskip('diagnostic_msgs', reason='no ROS here: pip install odocal_ros[ros]')
+
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.data.samples import HeadingSamples
 from odocal_ros.foresee import ability as ability_module, quantities

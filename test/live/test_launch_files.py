@@ -54,7 +54,7 @@ def test_the_files_named_are_installed():
     for path in (Path(node.parameters[0]), Path(rviz.arguments[1])):
         assert path.exists()
         assert f"glob('{path.parent.name}/*')" in setup
-    assert f"'{node.executable} = odocal_ros.live.node:main'" in setup
+    assert f"'{node.executable} = odocal_ros.live.start:calibrator'" in setup
 
 
 def test_an_empty_method_leaves_the_one_of_the_file():

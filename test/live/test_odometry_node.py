@@ -148,7 +148,7 @@ def test_the_launch_file_starts_it_with_both_files():
                                {'calibration': '/tmp/calibration.yaml', 'imu_topic': '/a/imu'})
     assert declared['calibration'][0] == ''       # must be given
     assert node.executable == 'odometry'
-    assert f"'{node.executable} = odocal_ros.live.odometry:main'" in (
+    assert f"'{node.executable} = odocal_ros.live.start:odometry'" in (
         ROOT / 'setup.py').read_text()
     assert node.parameters[:2] == [str(ROOT / 'config' / 'odometry.yaml'),
                                    '/tmp/calibration.yaml']

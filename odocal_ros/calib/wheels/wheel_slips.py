@@ -47,7 +47,6 @@ class WheelSlips:
         """Return the middle of each, s."""
         return (self.begin + self.end) / 2
 
-
     def doubts(self) -> tuple[Floats, Floats]:
         """
         Return where the mean of both wheels is in doubt, and by how much: (d,) s, (d,) m.

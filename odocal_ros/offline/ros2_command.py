@@ -1,0 +1,37 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The command ``ros2 odocal``: the command ``odocal`` as an extension of ros2cli.
+
+ros2cli makes an instance of the class that the entry point names and calls the two methods. It is
+not derived from ros2cli's class, so that this room needs no ROS.
+"""
+
+import argparse
+
+from odocal_ros.offline import cli
+
+
+class OdocalCommand:
+    """Calibrate a vehicle's odometer against IMU and GNSS, from recorded bags."""
+
+    NAME = 'odocal'
+    EXTENSION_POINT_VERSION = '0.1'
+
+    def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
+        """Declare that all words after the command are odocal's own."""
+        parser.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND ...',
+                            help=f'a command of odocal and its options; {cli_name} COMMAND --help')
+        parser.epilog = 'commands:\n' + '\n'.join(
+            f'  {name:<10}{about}' for name, (_, about) in cli.COMMANDS.items())
+
+    def main(self, *, parser: argparse.ArgumentParser, args: argparse.Namespace) -> int:
+        """Run the command; return its exit code."""
+        return cli.main(args.argv)
