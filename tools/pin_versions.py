@@ -1,0 +1,52 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Write .ci/constraints.txt: the versions of all that odocal_ros needs, as installed here.
+
+``python -m tools.pin_versions``, in the environment that the tests ran in.
+"""
+
+from importlib.metadata import distribution, PackageNotFoundError
+from pathlib import Path
+import platform
+
+from packaging.requirements import Requirement
+
+PATH = Path(__file__).resolve().parent.parent / '.ci' / 'constraints.txt'
+EXTRAS = ('', 'fleet', 'ros', 'tables', 'watch')
+
+
+def needed(name: str, extras: tuple[str, ...], found: dict[str, str]) -> None:
+    """Add name -> version of a package's requirements, and of theirs."""
+    for line in distribution(name).requires or ():
+        wanted = Requirement(line)
+        if wanted.marker and not any(wanted.marker.evaluate({'extra': extra}) for extra in extras):
+            continue
+        key = wanted.name.lower().replace('_', '-')
+        if key in found:
+            continue
+        try:
+            found[key] = distribution(wanted.name).version
+        except PackageNotFoundError:      # of another platform, or left out
+            continue
+        needed(wanted.name, ('', *wanted.extras), found)
+
+
+def main() -> None:
+    """Write the file."""
+    found: dict[str, str] = {}
+    needed('odocal_ros', EXTRAS, found)
+    head = (f'# made by tools/pin_versions.py on Python {platform.python_version()}: all that is '
+            'installed with\n# the extras fleet, ros, tables and watch\n')
+    PATH.write_text(head + ''.join(f'{name}=={found[name]}\n' for name in sorted(found)))
+
+
+if __name__ == '__main__':
+    main()
