@@ -1,0 +1,52 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The table of real drives: made here of a simulated one, with its truth as the reference."""
+
+import sys
+
+from drives import drive
+import pytest
+import yaml
+
+from odocal_ros.bagio.encode import counter, fix, imu, twist
+from odocal_ros.bagio.write import write_bag
+from tools import real_drives
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """Return a folder of one drive that has a counter and a speed."""
+    made = drive(scenario='straight', duration=200.0, fix_noise='rtk')
+    speed = drive(scenario='straight', duration=200.0, fix_noise='rtk', odometer='speed')
+    write_bag(tmp_path / 'a_drive' / 'bag', [
+        imu('/imu/data', made.imu), fix('/fix', made.fix), counter('/ticks', made.odometer),
+        twist('/speed', speed.odometer)])
+    truth = {'odometer': {'pulses': '/ticks', 'twist': '/speed', 'k0_m_per_pulse': 0.02},
+             'scale': {'value': made.truth.scale / 0.02, 'sigma': 1e-4},
+             'yaw_mounting_deg': {'value': 1.0, 'sigma': 0.1}}
+    (tmp_path / 'a_drive' / 'truth.yaml').write_text(yaml.safe_dump(truth))
+    (tmp_path / 'no_drive').mkdir()
+    monkeypatch.setenv('ODOCAL_DATA', str(tmp_path))
+    return tmp_path
+
+
+def test_the_page_gets_a_row_for_each_odometer(data, monkeypatch):
+    page = data / 'page.md'
+    page.write_text(f'before\n{real_drives.BEGIN}old\n{real_drives.END}after\n')
+    monkeypatch.setattr(real_drives, 'PAGE', page)
+    monkeypatch.setattr(sys, 'argv', ['real_drives', '--write'])
+    real_drives.main()
+    text = page.read_text()
+    assert text.startswith(f'before\n{real_drives.BEGIN}{real_drives.HEAD}| `a_drive` |')
+    assert text.endswith(f'{real_drives.END}after\n')
+    rows = [line.split(' | ') for line in text.splitlines() if line.startswith('| `a_drive`')]
+    assert [row[1] for row in rows] == ['`/ticks`', '`/speed`']
+    assert abs(float(rows[0][4])) < 4           # sigmas, of the counter beside its own truth
+    assert all(row[-2] in ('accepted', 'caution') for row in rows)

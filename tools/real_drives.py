@@ -1,0 +1,102 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Make the table of docs/recordings.md: each real drive, calibrated, beside its reference.
+
+``python -m tools.real_drives`` prints the table, ``--write`` puts it into the page. Drives are the
+folders of ``$ODOCAL_DATA`` (else ``../shared/data``) that hold ``bag`` and ``truth.yaml``; each is
+calibrated as ``odocal try`` does, once for each odometer topic that the truth names.
+"""
+
+import argparse
+from collections.abc import Iterator
+import contextlib
+import io
+import json
+import math
+import os
+from pathlib import Path
+import sys
+import tempfile
+import time
+from typing import Any
+
+import yaml
+
+from odocal_ros.offline.cli import main as odocal
+from odocal_ros.output.figures import with_sigma
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / 'docs' / 'recordings.md'
+BEGIN, END = '<!-- made by tools/real_drives.py -->\n', '<!-- end -->\n'
+HEAD = ('| drive | odometer | scale factor, found | reference | off by, sigma | yaw, deg, found | '
+        'reference | verdict | s |\n|---|---|---|---|---|---|---|---|---|\n')
+DEG = math.degrees(1.0)    # definition
+
+
+def table(data: Path) -> str:
+    """Return the table of all drives in a folder."""
+    return HEAD + ''.join(row for folder in sorted(data.iterdir())
+                          if (folder / 'truth.yaml').exists() for row in _rows(folder))
+
+
+def _rows(folder: Path) -> Iterator[str]:
+    """Yield a row for each odometer of a drive."""
+    truth = yaml.safe_load((folder / 'truth.yaml').read_text(encoding='utf-8'))
+    odometer = truth['odometer']
+    for kind in ('pulses', 'twist'):
+        with tempfile.TemporaryDirectory() as out:
+            begin = time.monotonic()
+            with contextlib.redirect_stdout(io.StringIO()):
+                code = odocal(['try', str(folder / 'bag'), '--odometer-topic', odometer[kind],
+                               '--no-browser', '--output', out])
+            if code > 1:
+                raise SystemExit(f'{folder.name}: odocal try ended with {code}')
+            seconds = time.monotonic() - begin
+            found = json.loads((Path(out) / 'calibration.json').read_text(encoding='utf-8'))
+        unit = odometer['k0_m_per_pulse'] if kind == 'pulses' else 1.0
+        yield _row(folder.name, odometer[kind], found, unit, truth, seconds)
+
+
+def _row(name: str, topic: str, found: dict[str, Any], unit: float, truth: dict[str, Any],
+         seconds: float) -> str:
+    scale = found['result']['scale_factor']
+    value, sigma = (None if x is None else x / unit for x in (scale['value'], scale['sigma']))
+    references = {key.removeprefix('scale').strip('_'): truth[key]
+                  for key in truth if key.startswith('scale')}
+    off = [f'{(value - r["value"]) / math.hypot(sigma, r["sigma"]):+.1f}'
+           for r in references.values()] if value is not None and sigma is not None else ['-']
+    said = [f'{_stated(r)} {word}'.strip().replace('_', ' ') for word, r in references.items()]
+    yaw = found['result']['yaw_mounting_angle']
+    angle = '-' if yaw['value'] is None else with_sigma(yaw['value'], yaw['sigma'], DEG)
+    return (f'| `{name}` | `{topic}` | {"-" if value is None else with_sigma(value, sigma)} | '
+            f'{"; ".join(said)} | {"; ".join(off)} | {angle} | '
+            f'{_stated(truth["yaw_mounting_deg"])} | {found["verdict"]} | {seconds:.0f} |\n')
+
+
+def _stated(reference: dict[str, float]) -> str:
+    return with_sigma(float(reference['value']), float(reference['sigma']))
+
+
+def main() -> None:
+    """Print the table, or write it into the page."""
+    parser = argparse.ArgumentParser(description='real drives against their references')
+    parser.add_argument('--write', action='store_true', help='into docs/recordings.md')
+    args = parser.parse_args()
+    made = table(Path(os.environ.get('ODOCAL_DATA') or ROOT.parent / 'shared' / 'data'))
+    if not args.write:
+        sys.stdout.write(made)
+        return
+    before, _, rest = PAGE.read_text(encoding='utf-8').partition(BEGIN)
+    PAGE.write_text(before + BEGIN + made + END + rest.partition(END)[2], encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
