@@ -29,6 +29,8 @@ source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'
 napoleon_google_docstring = False
+# else -- becomes a dash, in options too
+smartquotes = False
 html_theme = 'furo'
 html_title = f'odocal_ros {release}'
 exclude_patterns = ['_build', 'site']

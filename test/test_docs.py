@@ -32,11 +32,8 @@ ELSEWHERE = {
     '.ci/run': 'runs these tests',
     '.venv/bin/ruff': '.ci/run runs it',
     '.venv/bin/mypy': '.ci/run runs it',
+    'export': 'the TLS of a Dask cluster: test/fleet',
     '.venv/bin/python': 'test_comma2k19.py runs that module',
-    'export': 'for pip inside rosdep',
-    'rosdep': 'needs its database from the network',
-    'colcon': 'test_package.py builds with colcon and starts what it installed',
-    'source': 'of what colcon installed: test_package.py starts that',
 }
 FLEET = 'docs/first_fleet.md'      # whose commands go on from each other
 RESULTS = ('ACCEPTED: ', 'CAUTION: ', 'REJECTED: ')     # a block that shows what is printed
@@ -99,7 +96,7 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for text in yaml_blocks(page_of(page)):
         (tmp_path / 'my_vehicle.yaml').write_text(text)
-    if words[0] in ('replay', 'inspect'):
+    if words[0] in ('replay', 'inspect', 'try'):
         put_bag(tmp_path, words, {'odometer': '/ticks'} if page == 'README.md' else {})
     if words[0] == 'compare':
         put_results(tmp_path, [w for w in words[1:] if not w.startswith('-')])
@@ -118,6 +115,8 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         assert {p.name for p in tmp_path.iterdir()} >= {'drive', 'truth.yaml'}
     elif words[0] == 'plan':
         assert 'predicted sigma' in out
+    elif words[0] == 'try':
+        assert f'next time:\n  odocal replay {words[1]} ' in out
     elif words[0] == 'inspect':
         assert '<- imu' in out
         assert 'try' in out

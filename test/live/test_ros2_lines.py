@@ -23,6 +23,7 @@ from test_shown_names import has_field, INPUT_TYPES
 import yaml
 
 from odocal_ros.live.definitions import message_class
+from odocal_ros.offline import cli
 from odocal_ros.sim.scenarios import SimOptions, simulate
 
 LINES = [(page, shlex.split(line)) for page, line in all_commands('ros2')]
@@ -79,8 +80,9 @@ def ask(node, name, kind):
 
 
 def test_every_line_is_of_a_kind_that_is_tried_here():
-    assert {tuple(words[1:3]) if words[1] != 'run' and words[1] != 'launch' else (words[1],)
-            for _, words in LINES} == {('run',), ('launch',), ('service', 'call'),
+    alone = ('run', 'launch', 'odocal')
+    assert {(words[1],) if words[1] in alone else tuple(words[1:3])
+            for _, words in LINES} == {*((word,) for word in alone), ('service', 'call'),
                                        ('topic', 'echo'), ('param', 'get'), ('param', 'set'),
                                        ('param', 'dump'), ('bag', 'record')}
 
@@ -90,6 +92,11 @@ def test_run_names_an_entry_point_of_the_package():
     for package, executable, *_ in of('run'):
         assert package == 'odocal_ros'
         assert executable in entries
+
+
+def test_odocal_lines_are_commands_of_odocal():
+    for command, *options in of('odocal'):
+        assert cli._parser({command}).parse_args([command, *options]).command == command
 
 
 def test_launch_names_a_file_and_arguments_that_are_there():
