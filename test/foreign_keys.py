@@ -31,3 +31,21 @@ DEVICES = {              # how the line begins that the system is to be given
     'OxTS': 'Pulses per metre = ',            # RT3000 manual, NAVconfig, wheel speed input
     'NovAtel': 'SETWHEELPARAMETERS '}         # novatel_span_driver; OEM7 SPAN manual v14, page 119
 UBLOX_FACTOR_ID = '0x40070007'                # u-blox_config_keys.h of SparkFun; ublox_dgnss
+# what docs/recipes.md and config/ekf_odocal.yaml set: node -> parameters
+RECIPES = {
+    # robot_localization, params/ekf.yaml
+    'ekf_filter_node': {'frequency', 'sensor_timeout', 'two_d_mode', 'publish_tf', 'odom_frame',
+                        'base_link_frame', 'world_frame', 'twist0', 'twist0_queue_size',
+                        'twist0_config'},
+    # navigation2, nav2_bringup/params/nav2_params.yaml
+    'bt_navigator': {'odom_topic', 'global_frame', 'robot_base_frame'},
+    # slam_toolbox, config/mapper_params_online_async.yaml
+    'slam_toolbox': {'odom_frame', 'map_frame', 'base_frame'},
+    # autoware, speed_scale_corrector (or _estimator), declare_parameter in its parameters
+    'speed_scale_corrector': {'initial_speed_scale_factor',
+                              'initial_speed_scale_factor_covariance'}}
+# ArduPilot, AP_WheelEncoder.cpp and AP_NavEKF_Source.cpp
+ARDUPILOT = {'WENC_TYPE', 'WENC_CPR', 'WENC_RADIUS', 'WENC_POS_Y', 'WENC2_RADIUS',
+             'EK3_SRC1_VELXY'}
+# LIO-SAM, config/params.yaml; FAST_LIO, config/velodyne.yaml
+LIDAR_INERTIAL = {'extrinsicRot', 'extrinsicTrans', 'extrinsic_R', 'extrinsic_T'}
