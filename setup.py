@@ -101,6 +101,10 @@ setup(
         'watch': [
             'rich>=13',
         ],
+        # --export drive.rrd
+        'rerun': [
+            'rerun-sdk>=0.41',
+        ],
         # odocal fleet
         'fleet': FLEET,
         'dev': [

@@ -41,7 +41,7 @@ TABLES = {'pandas', 'pyarrow'}      # of the extra tables: who wants them is tol
 FLEET = {'dask', 'distributed', 'fsspec'} | TABLES
 WITH_DISTRIBUTED = {'psutil'}
 # what lacks them says what to install: rosdep has no key of the first, and not everywhere of rich
-BY_PIP = {'rosbags', 'rich'}
+BY_PIP = {'rosbags', 'rich', 'rerun'}
 WITH_ROSBAGS = {'lz4', 'backports', 'compression'}  # decompressors that rosbags itself requires
 
 

@@ -23,6 +23,7 @@ from odocal_ros.bagio.write import write_bag
 from odocal_ros.calib.result import Calibration
 from odocal_ros.data.samples import FixSamples, ImuSamples, OdometerSamples
 from odocal_ros.errors import BadUsage
+from odocal_ros.library.export_rerun import INSTALL as RERUN, rrd
 from odocal_ros.library.residuals import Left, left_in, residuals
 from odocal_ros.library.series import Series, stacked, states, trajectory
 from odocal_ros.outside.whole import whole_file
@@ -142,7 +143,7 @@ def _there(module: str) -> bool:
 SERIES: dict[str, Callable[[Calibration], Series]] = {
     'trajectory': trajectory, 'track': trajectory, 'states': states, 'residuals': residuals}
 TEXTS = {'tum': tum, 'csv': csv, 'kml': kml}
-KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', *(
+KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
     f'{name}.{ending}' for name in ('trajectory', 'states', 'residuals')
     for ending in ('csv', 'parquet')))
 
@@ -152,6 +153,8 @@ def check_names(files: Iterable[Path | str]) -> None:
     for file in files:
         if Path(file).suffix == '.parquet' and not _there('pyarrow'):
             raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES}')
+        if Path(file).suffix == '.rrd' and not _there('rerun'):
+            raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: {RERUN}')
         if Path(file).name not in KNOWN:
             raise BadUsage(f'export: {file}: there are {", ".join(KNOWN)}')
 
@@ -181,6 +184,8 @@ def _write(result: Calibration, file: Path) -> None:
     name, ending = file.stem, file.suffix[1:]
     if ending == 'mcap':
         mcap(result, file)
+    elif ending == 'rrd':
+        rrd(result, file)
     elif ending == 'parquet':
         parquet(SERIES[name](result), file)
     else:

@@ -26,7 +26,8 @@ from odocal_ros.offline.cli import main
 def exported(calibration, tmp_path_factory):
     """Write all that need nothing beyond the package itself."""
     folder = tmp_path_factory.mktemp('exported')
-    calibration.export(*(folder / name for name in KNOWN if not name.endswith('.parquet')))
+    calibration.export(*(folder / name for name in KNOWN
+                         if not name.endswith(('.parquet', '.rrd'))))
     return folder
 
 
@@ -113,6 +114,23 @@ def test_mcap_is_a_bag(calibration, exported):
         np.testing.assert_array_equal(values[:, names.index(sigma)], left['sigma'][one])
 
 
+def test_rerun_reads_what_was_written(calibration, tmp_path):
+    chunks = pytest.importorskip('rerun.chunk', reason='no rerun: pip install rerun-sdk')
+    calibration.export(tmp_path / 'drive.rrd')
+    found = {chunk.entity_path: chunk
+             for chunk in chunks.RrdReader(tmp_path / 'drive.rrd').stream()}
+    pose, state = calibration.trajectory(), calibration.states()
+    assert {name.rpartition('/')[2] for name in found if '/states/' in name} == {
+        *state} - {'leg', 'stamp_ns', 't_s'}
+    table = found['/leg_1/states/gyro_bias_z'].to_record_batch().to_pydict()
+    stamps = np.array([t.value for t in table['time']])
+    np.testing.assert_array_equal(stamps, pose['stamp_ns'])
+    values, = (column for name, column in table.items() if name.startswith('Scalars'))
+    np.testing.assert_array_equal(np.ravel(values), state['gyro_bias_z'])
+    assert found['/leg_1/track'].is_static
+    assert found['/leg_1/map'].is_static
+
+
 def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
     out = tmp_path / 'out'
     argv = ['replay', str(town[1]), '--method', 'two_point', '--leg', '0:', '--output', str(out)]
@@ -130,3 +148,6 @@ def test_without_pyarrow_the_line_that_installs_it_is_said(calibration, tmp_path
     with pytest.raises(OdocalError, match=r'pip install pandas pyarrow'):
         calibration.export(tmp_path / 'residuals.parquet')
     assert not list(tmp_path.iterdir())
+    monkeypatch.setitem(__import__('sys').modules, 'rerun', None)
+    with pytest.raises(OdocalError, match=r'pip install rerun-sdk'):
+        calibration.export(tmp_path / 'drive.rrd')
