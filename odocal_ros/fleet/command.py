@@ -66,6 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--again', action='store_true', help='try bags once more that failed')
     add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles whose '
         'own report is drawn')
+    add('--kpi', action='store_true', help='with limits (--accept): judge each leg by them, and '
+        "the decisions by each vehicle's result of all legs; kpi.json")
     add('--files', action='store_true', help='write the load-ready files of each vehicle')
     add('--quiet', action='store_true', help='print nothing but errors, and the lines of --accept')
     add_calibration_arguments(parser)
@@ -78,13 +80,17 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.bags import find_bags
     from odocal_ros.fleet.engine import dashboard, engine
     from odocal_ros.fleet.jobs import bag_jobs, writable
-    from odocal_ros.fleet.outcome import exit_code, said, write_outcome
+    from odocal_ros.fleet.kpi import limits_of, write_kpi
+    from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
     from odocal_ros.offline.cli import OK, REJECTED
     if not args.task_timeout > 0:
         raise BadUsage(f'--task-timeout {args.task_timeout:g}: want seconds above 0')
     output = Path(args.output)
     bags = find_bags(args.bags, args.vehicle_from)
     jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
+    limits = limits_of(asked(jobs))
+    if args.kpi and not limits:
+        raise BadUsage('--kpi judges legs by limits: give --accept NAME=LOW:HIGH')
     writable(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
@@ -92,12 +98,13 @@ def run(args: argparse.Namespace) -> int:
                  f'dashboard: {dashboard(client)}')
         rows = _computed(client, jobs, args)
         vehicles = write_outcome(client, jobs, rows, output, args)
+    kpi = write_kpi(vehicles, limits, output) if args.kpi else ''
     if args.accept or any(row['decision'] for row in vehicles):
         for row in vehicles:
             say(row['line'])
     if not args.quiet:
         shown = 20    # vehicles that are named on the terminal
-        say(said(vehicles, output, shown))
+        say(said(vehicles, output, shown) + kpi)
     return OK if exit_code(vehicles, args.strict) == 0 else REJECTED
 
 

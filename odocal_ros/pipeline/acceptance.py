@@ -90,7 +90,8 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
     A vehicle fails with any of its values, and passes with all of them. A rejected calibration
     decides nothing, and with ``accept.strict`` one with a caution does not pass.
     """
-    values = tuple(_held(name, calibration, low, high)
+    unknown = Estimate(None, None, '')
+    values = tuple(hold(name, calibration.estimates.get(name, unknown), low, high)
                    for name, (low, high) in config.accept.limits.items())
     if not values:
         return None
@@ -109,8 +110,8 @@ def accept(calibration: Calibration, config: Config) -> Acceptance | None:
                       ' '.join(dict.fromkeys(do for _, do in said)))
 
 
-def _held(name: str, calibration: Calibration, low: float, high: float) -> Held:
-    found = calibration.estimates.get(name, Estimate(None, None, ''))
+def hold(name: str, found: Estimate, low: float, high: float) -> Held:
+    """Return a value with the decision that its limits give."""
     value, sigma = found.value, found.sigma
     if value is None or sigma is None:
         return Held(name, found, low, high, Decision.UNDECIDED)

@@ -1,0 +1,162 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+How good short drives are at telling good vehicles from bad ones: odocal fleet --kpi.
+
+The result of all legs of a vehicle since its last change is the reference. Its sigma is widened by
+the scatter of these legs beyond their own sigmas, since tyres warm and wear between drives. Where
+two sigma of it lie within all limits the vehicle is good, where they lie outside of one it is bad;
+others are on the limit and left out. Each leg is judged by the same limits alone.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from odocal_ros.calib.result import Estimate
+from odocal_ros.fleet.tables import LEGS, VALUES
+from odocal_ros.outside.whole import locked, write_text
+from odocal_ros.pipeline.acceptance import Decision, hold
+from odocal_ros.reasons import Verdict
+from odocal_ros.settings.config import Config, with_settings
+
+KPI = 'kpi.json'
+NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors
+FEWEST = 3                       # judgement: legs of a reference, of which a piece is one
+MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: ends of the rows of the table
+Limits = dict[str, tuple[float, float]]
+
+
+@dataclass
+class Count:
+    """Legs by what they were said to be and what their vehicles are."""
+
+    good_pass: int = 0
+    good_fail: int = 0
+    good_open: int = 0
+    bad_pass: int = 0
+    bad_fail: int = 0
+    bad_open: int = 0
+
+    def add(self, good: bool, decision: Decision) -> None:
+        """Count a leg."""
+        said = {'PASS': 'pass', 'FAIL': 'fail', 'UNDECIDED': 'open'}[decision.value]
+        name = f'{"good" if good else "bad"}_{said}'
+        setattr(self, name, getattr(self, name) + 1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return counts and rates; None where there is nothing to divide by."""
+        good = self.good_pass + self.good_fail + self.good_open
+        bad = self.bad_pass + self.bad_fail + self.bad_open
+        return {
+            'legs': good + bad, 'legs_of_good': good, 'legs_of_bad': bad,
+            'precision': _ratio(self.good_pass, self.good_pass + self.bad_pass),
+            'recall': _ratio(self.good_pass, good), 'false_accept': _ratio(self.bad_pass, bad),
+            'false_reject': _ratio(self.good_fail, good),
+            'undecided': _ratio(self.good_open + self.bad_open, good + bad)}
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def limits_of(settings: dict[str, Any]) -> Limits:
+    """Return the limits that settings hold."""
+    return dict(with_settings(Config(), settings).accept.limits)
+
+
+def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
+        limits: Limits) -> dict[str, Any]:
+    """Return the figures of rows of vehicles.parquet and legs.parquet, of all and by duration."""
+    last: dict[str, list[dict[str, Any]]] = {}
+    for leg in legs:
+        kept = last.setdefault(leg['vehicle'], [])
+        if kept and leg['period'] != kept[-1]['period']:
+            kept.clear()          # by date: a change of the vehicle begins anew
+        kept.append(leg)
+    counts = {end: Count() for end in (*MINUTES, math.inf)}
+    whole, judged = Count(), {'good': 0, 'bad': 0, 'on_the_limit': 0}
+    for row in vehicles:
+        pieces = last.get(row['vehicle'], [])
+        decision = _decision(row | _widened(row, pieces, limits), limits)
+        if decision is Decision.UNDECIDED or len(pieces) < FEWEST:
+            judged['on_the_limit'] += 1
+            continue
+        good = decision is Decision.PASS
+        judged['good' if good else 'bad'] += 1
+        for leg in pieces:
+            end = next(end for end in counts if leg['duration_s'] / 60 <= end)
+            for count in (whole, counts[end]):
+                count.add(good, _decision(leg, limits))
+    return {'limits': limits, 'vehicles': judged, 'all': whole.as_dict(), 'by_minutes': [
+        {'up_to': None if math.isinf(end) else end} | count.as_dict()
+        for end, count in counts.items() if count.as_dict()['legs']]}
+
+
+def _estimate(row: dict[str, Any], name: str) -> Estimate:
+    return Estimate(row[name], row[f'{name}_sigma'], 'rad' if 'angle' in name else '')
+
+
+def _decision(row: dict[str, Any], limits: Limits) -> Decision:
+    """Return what limits say of a vehicle or a leg; a rejected one is undecided."""
+    if row['verdict'] == Verdict.REJECTED.value:
+        return Decision.UNDECIDED
+    return max((hold(name, _estimate(row, name), *ends).decision
+                for name, ends in limits.items()), key=list(Decision).index)
+
+
+def _widened(row: dict[str, Any], legs: Sequence[dict[str, Any]],
+             limits: Limits) -> dict[str, float]:
+    """Return the sigmas of a reference with the scatter of its legs."""
+    found = {}
+    for name in limits:
+        sigma = f'{name}_sigma'
+        known = [leg for leg in legs if None not in (leg[name], leg[sigma])]
+        if row[name] is not None and row[sigma] is not None and known:
+            # by the median: a leg that is plainly wrong is what is to be counted
+            scatter = NORMAL * median(abs(leg[name] - row[name]) for leg in known)
+            beyond = scatter**2 - median(leg[sigma] for leg in known)**2
+            found[sigma] = math.sqrt(row[sigma]**2 + max(beyond, 0.0))
+    return found
+
+
+def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) -> str:
+    """Write kpi.json; return it as lines for a terminal."""
+    import pyarrow.parquet as pq
+    columns = ['vehicle', 'verdict', 'period', 'duration_s', *(
+        f'{name}{part}' for name in VALUES for part in ('', '_sigma'))]
+    table = pq.ParquetFile(output / LEGS).read(columns=columns, use_threads=False)
+    found = kpi(vehicles, table.to_pylist(), limits)
+    plain = found | {'limits': {name: [x if math.isfinite(x) else None for x in ends]
+                                for name, ends in limits.items()}}
+    with locked(output):
+        write_text(output / KPI, json.dumps(plain, indent=2) + '\n')
+    return _lines(found, output)
+
+
+def _lines(found: dict[str, Any], output: Path) -> str:
+    of = found['vehicles']
+    lines = ['', f'legs judged by the limits: {of["good"]} good vehicles, {of["bad"]} bad, '
+             f'{of["on_the_limit"]} left out (on the limit, or fewer than {FEWEST} legs)',
+             f'  {"minutes":<10}{"legs":>7}{"precision":>11}{"recall":>9}{"false accept":>14}'
+             f'{"false reject":>14}{"undecided":>11}']
+    for row in [*found['by_minutes'], {'up_to': 'all'} | found['all']]:
+        label = 'longer' if row['up_to'] is None else row['up_to'] if row['up_to'] == 'all' \
+            else f'up to {row["up_to"]:g}'
+        shares = [row[k] for k in ('precision', 'recall', 'false_accept', 'false_reject',
+                                   'undecided')]
+        texts = ['-' if x is None else f'{100 * x:.1f} %' for x in shares]
+        lines.append(f'  {label:<10}{row["legs"]:>7}{texts[0]:>11}{texts[1]:>9}{texts[2]:>14}'
+                     f'{texts[3]:>14}{texts[4]:>11}')
+    return '\n'.join([*lines, f'written: {output / KPI}'])
