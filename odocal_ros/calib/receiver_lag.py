@@ -21,4 +21,4 @@ def lag_reasons(square: float, sigma: float) -> tuple[Reason, ...]:
     if square <= max(REMARK_SIGMAS * sigma, worth**2):
         return ()
     return (Reason(Code.FIXES_SMOOTHED, 'the receiver smooths its fixes over about '
-                   f'{np.sqrt(square):.2f} s; the values allow for it'),)
+                   f'{np.sqrt(square):.2f} s; accounted for'),)

@@ -65,7 +65,7 @@ class BagJob:
 
 @dataclass(frozen=True)
 class Done:
-    """What the command is told of a bag; the rest is in its row."""
+    """The report on a bag to the command; the rest is in its row."""
 
     key: str
     status: str
@@ -93,7 +93,7 @@ def calibrate_bag(job: BagJob) -> Done:
         except Exception as error:     # noqa: BLE001 one bag stops nobody
             why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
             if isinstance(error, MemoryError) or NO_THREAD in str(error):
-                why = f'needs more memory than --task-memory gives ({job.memory / 2**20:g} MiB)'
+                why = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
         row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
         store.put(row)
         return Done(row.key, FAILED, row.reason, row.seconds, True)
@@ -161,14 +161,14 @@ def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
 
     def end() -> None:
         with suppress(Exception):
-            give_up(f'took longer than --task-timeout gives ({job.seconds:g} s)')
+            give_up(f'exceeded the time limit --task-timeout ({job.seconds:g} s)')
         os.kill(os.getpid(), signal.SIGKILL)
 
     clock = threading.Timer(job.seconds, end)
     clock.daemon = True
     if job.seconds:
         clock.start()
-        later = 10.0    # s after which what cannot even be told is ended
+        later = 10.0    # s after which a worker without an answer is ended
         faulthandler.dump_traceback_later(job.seconds + later, exit=True)   # needs no interpreter
     before = resource.getrlimit(resource.RLIMIT_DATA)
     if job.memory:

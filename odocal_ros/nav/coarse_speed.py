@@ -62,13 +62,13 @@ class CoarseSpeed:
 
     @cached_property
     def most(self) -> float:
-        """Return how far a speed may be from the line between rows, bends in between too."""
+        """Return the maximum deviation of a speed from the line between rows, with bends."""
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
     def way_variance(self, t: Floats) -> Floats:
         """
-        Return the variance of the way between n times, s, by rounding: (n - 1,) scale units^2.
+        Return the variance of travel between n times, s, by rounding: (n - 1,) scale units^2.
 
         A run of one value has one error, uniform in its cell, which a cruise does not average: as
         much white noise as adds up to the same over the run.
@@ -120,7 +120,7 @@ class CoarseSpeed:
 
 def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     """
-    Return how fast a speed may change at its crossings (m,): the faster of both sides.
+    Return the limit of the speed change at its crossings (m,): the faster of both sides.
 
     As fast as three quarters of the drive's do at least: a small step between two cruises is made
     as quickly as a large one, though no other edge is near to show it; and by its own neighbours
@@ -193,7 +193,7 @@ def _coherence(u: Ints, size: int) -> Floats:
 
 def _may_be_grid(u: Ints) -> bool:
     """
-    Return whether a grid may be among distinct cells u, by a tenth of the work.
+    Return True if distinct cells u can contain a grid: a quick test of a tenth of them.
 
     One of GRID_COHERENCE c is within half a step of these frequencies, so at most pi / 4 either
     side of it in phase: there (c - sqrt(1 - c^2)) / sqrt(2) is left of it at least.

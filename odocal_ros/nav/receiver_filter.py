@@ -8,7 +8,7 @@
 # the License.
 
 """
-What a receiver that smooths makes of a way: the mean of its past, weighted exp(-age / tau) / tau.
+Smoothing of a receiver: the mean of past positions, weighted by exp(-age / tau) / tau.
 
 A stamp's delay is the mean age; what is computed here is the rest of it, by the square of tau: the
 smoothed place at t + tau less the place at t. Of small tau that is a tau^2 / 2, a series that does
@@ -26,7 +26,7 @@ LEAST_LAG2 = 1e-4
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
               ) -> tuple[Floats, Floats]:
     """
-    Return by how far smoothed places lie off the true ones, and the derivative by ``square``.
+    Return the error of smoothed positions, and the derivative by ``square``.
 
     t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
     at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, of tau.
@@ -49,7 +49,7 @@ def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) ->
     On a cubic the filter's answer is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is
     left of before dies away.
     """
-    track_beyond = 10.0    # s that the way goes on at its last velocity
+    track_beyond = 10.0    # s of extrapolation at the last velocity
     t = np.append(t, t[-1] + track_beyond)
     place = np.concatenate([place, place[-1:] + track_beyond * velocity[-1:]])
     velocity = np.concatenate([velocity, velocity[-1:]])

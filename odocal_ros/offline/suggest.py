@@ -44,7 +44,7 @@ def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
 
 
 def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
-    """Return what replay would say without options: which topics it cannot choose; '' if none."""
+    """Return the topics that replay cannot choose without options; '' if none."""
     try:
         choose_topics(topics, config, overrides)
     except BadUsage as error:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What positioning systems with a wheel input want to be told of the wheel."""
+"""Wheel settings for positioning systems with a wheel input."""
 
 import textwrap
 from typing import Any
@@ -55,5 +55,5 @@ def _settings(scale: float, pulses: float) -> list[tuple[str, str]]:
         ('OxTS, NAVconfig, advanced tools, tab Wheel speed input: pulses per metre',
          f'Pulses per metre = {per_metre}'),
         ('NovAtel SPAN, firmware up to 7.06: ticks per revolution, circumference m, spacing of '
-         'ticks m. Later firmware (DMICONFIG) is told no size and finds it itself.'
+         'ticks m. Later firmware (DMICONFIG) takes no size; it estimates it.'
          + ('' if wheel else ' Needs a whole number in wheels.pulses_per_revolution.'), wheel)]

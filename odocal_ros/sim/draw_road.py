@@ -122,7 +122,7 @@ def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Lose the sky, and a fix in a hundred."""
+    """Outages, and a loss of one fix in a hundred."""
     spans, span = [], 500.0
     for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.alone):
         begin = float(rng.uniform(30.0, span))

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a real receiver adds: a lag, slow errors, multipath, sigmas that are not those told."""
+"""Effects of a real receiver: lag, correlated errors, multipath, wrong stated sigmas."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
-    """Return latitude, longitude (rad), height (m) that a receiver without noise tells at t."""
+    """Return latitude, longitude (rad), height (m) of a receiver without noise at t."""
     lag = options.real.receiver_lag
     if not lag:
         return _antenna(motion, t, options)

@@ -44,23 +44,23 @@ def slip_share(state: State, real: Real) -> Floats:
 
 def tyre_slip(state: State, real: Real) -> Floats:
     """Return the metres spun beyond the ground by then: (n,)."""
-    way = np.diff(state.travel, prepend=state.travel[:1])
-    return np.cumsum(slip_share(state, real) * way)
+    path_length = np.diff(state.travel, prepend=state.travel[:1])
+    return np.cumsum(slip_share(state, real) * path_length)
 
 
 def leg_factor(state: State, real: Real) -> float:
     """
     Return true metres rolled over those of a wheel that neither grew nor slipped.
 
-    state : between the marks of the leg. The mean is by travel, to and fro alike.
+    state : between the marks of the leg. The mean is by travel in both directions.
     """
     if not (real.speed_law or real.warming or real.tyre_slip):
         return 1.0
-    way = np.diff(state.travel)
+    path_length = np.diff(state.travel)
     spun = np.diff(tyre_slip(state, real)) if real.tyre_slip else 0.0
     grown = growth(state, real) + np.zeros_like(state.t)
-    counted = (way + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
-    return float(np.abs(way).sum() / np.abs(counted).sum())
+    counted = (path_length + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
+    return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
 def coarse(speed: Floats, real: Real) -> Floats:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What values against limits say, and what an Imu tells of its own units and axes."""
+"""What values against limits say, and what an IMU tells of its own units and axes."""
 
 import numpy as np
 import pytest
@@ -48,9 +48,9 @@ def test_good_values_say_nothing():
 
 @pytest.mark.parametrize(('values', 'nominal', 'code', 'text'), [
     (estimates(relative=2e-3), 0.0, Code.SCALE_SIGMA_TOO_LARGE, '2000 ppm, 1000 ppm asked'),
-    (estimates(relative=0.0157), 0.0, Code.SCALE_SIGMA_TOO_LARGE, 'sigma 1.6 %, 1000 ppm asked'),
-    (estimates(yaw_sigma=0.02), 0.0, Code.YAW_SIGMA_TOO_LARGE, '1.146 deg, 0.498 deg asked'),
-    (estimates(scale=0.03), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '+50.0 % from the nominal 0.02'),
+    (estimates(relative=0.0157), 0.0, Code.SCALE_SIGMA_TOO_LARGE, 'is 1.6 %; the limit is 1000 ppm'),
+    (estimates(yaw_sigma=0.02), 0.0, Code.YAW_SIGMA_TOO_LARGE, '1.146 deg; the limit is 0.498 deg'),
+    (estimates(scale=0.03), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '+50.0 % from the nominal value '),
     (estimates(scale=0.01), 0.02, Code.SCALE_FAR_FROM_NOMINAL, '-50.0 %')])
 def test_each_limit_has_its_sentence(values, nominal, code, text):
     reasons = judge(values, nominal, CONFIG)
@@ -109,7 +109,7 @@ class TestImu:
     def test_g_is_known_and_told_the_factor(self):
         reasons, _ = self.say([0, 0, 1], size=1.0)
         assert codes(reasons) == [Code.IMU_UNITS]
-        assert 'as g would: set imu.accel_scale to 9.80665' in reasons[0].text
+        assert 'probably g: set imu.accel_scale to 9.80665' in reasons[0].text
         reasons, _ = self.say([0, 0, 1], size=0.5)
         assert 'a gravity of 0.5 m/s^2 instead of 9.8' in reasons[0].text
 
@@ -136,7 +136,7 @@ class TestImu:
     def test_a_sideways_imu_is_named(self, up, name):
         reasons, turned = self.say(up)
         assert codes(reasons) == [Code.IMU_AXES]
-        assert f'gravity shows on {name}' in reasons[0].text
+        assert f'gravity is on {name}' in reasons[0].text
         assert not turned
 
     def test_an_imu_that_shows_nothing_is_no_crash(self):

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Wheel slip is seen where odometer and Imu part, and nowhere else."""
+"""Wheel slip is seen where odometer and IMU part, and nowhere else."""
 
 from dataclasses import replace
 

@@ -54,7 +54,7 @@ class Load:
 
 
 def messages(drive, begin_ns):
-    """Return the messages of Imu, fixes and a counter for each leg, by when they go out."""
+    """Return the messages of IMU, fixes and a counter for each leg, by when they go out."""
     def moved(samples):
         stamps = samples.stamp_ns + begin_ns - drive.imu.stamp_ns[0]
         return replace(samples, stamp_ns=stamps, received_ns=stamps)
