@@ -150,7 +150,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
     assert 'gnss.lever_arm x by +0.8' in said[Code.LEVER_ARM_OFF]
-    assert ' 2.0 times as much' in said[Code.FIXES_NOISIER_THAN_SAID]
+    assert ' 2.0 times as large' in said[Code.FIXES_NOISIER_THAN_SAID]
     assert 'from low to high speed' in said[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']
     true = 2 * real.speed_law / 36.0**2 * FAST_SPEED

@@ -414,7 +414,7 @@ def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
     assert Code.YAW_NOT_DETERMINED not in {r.code for r in whole.reasons}
     two = combine([leg_result(refused(one), i) for i, one in enumerate(results[:2])], config)
     assert two.estimates[YAW].value is None
-    assert [r.text[:4] for r in two.reasons if r.code is Code.YAW_NOT_DETERMINED] == ['the ']
+    assert [r.text[:4] for r in two.reasons if r.code is Code.YAW_NOT_DETERMINED] == ['yaw ']
 
 
 def test_a_leg_that_is_rejected_is_left_out_and_named(legs):

@@ -46,7 +46,7 @@ def test_legs_of_one_vehicle_are_fine():
 
 def test_a_scale_that_no_tyre_makes():
     text, = said(leg(1, scale=0.0203), leg(2, scale=0.02), leg(3, scale=0.022))
-    assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: more than')
+    assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: larger than')
 
 
 def test_a_mounting_that_was_moved():

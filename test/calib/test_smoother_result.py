@@ -242,7 +242,7 @@ def test_a_fit_that_makes_the_imu_what_no_imu_is_gives_nothing(monkeypatch):
     assert method.estimates['scale_factor'].value is None
     reason, = method.reasons
     assert reason.code is Code.NOT_CONVERGED
-    assert 'accelerometer scale y is -21 % off' in reason.text
+    assert 'accelerometer scale y -21 %' in reason.text
 
 
 @pytest.mark.parametrize(('times', 'said'), [(30.0, False), (200.0, True)])

@@ -167,7 +167,7 @@ def test_swapped_wheels_are_told_by_the_gyro():
         options = TOWN | {'seed': seed}
         reasons, _ = faults(options, swap=True)
         assert [r.code for r in reasons] == [Code.WHEELS_SWAPPED]
-        assert 'track width of -1.' in reasons[0].text
+        assert 'track width -1.' in reasons[0].text
         assert faults(options)[0] == ()
 
 
@@ -256,7 +256,7 @@ def test_a_ratio_that_changes_anywhere_is_said_with_where(share):
     def slips_on(s):
         return s + np.floor(0.01 * np.maximum(s - share * s[-1], 0.0))
     (reason,), slips = faults(options, right=slips_on)
-    assert f'after about {100 * share:.0f} % of the way' in reason.text
+    assert f'after about {100 * share:.0f} % of the path' in reason.text
     percent = float(reason.text.split('the right wheel counts ')[1].split()[0])
     assert abs(percent - 1.0) < 0.1
     # either part may be the right one: as far off as 1 % of the shorter or of the longer one
@@ -305,7 +305,7 @@ def test_wheels_of_other_resolution_are_said_with_what_the_mean_then_is():
     (reason,), _ = faults(TOWN, right=lambda s: 2 * s, rough=2 / 3, track_width=1.6)
     assert reason.code is Code.WHEEL_COUNTERS_DIFFER
     # factors 1.004 apart: the right wheel weighs 0.6657, 0.1657 of 1.6 m off the middle
-    assert 'a point 0.27 m right of the middle' in reason.text
+    assert 'a point 0.27 m right of the axle centre' in reason.text
     assert faults(TOWN, right=lambda s: 1.3 * s)[0] == ()
 
 

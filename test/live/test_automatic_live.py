@@ -167,7 +167,7 @@ def test_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_
 
 
 def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
-    assert 'goes on from' in seen.again.text
+    assert 'continues ' in seen.again.text
     assert seen.later['carried_legs'] == '2'
     assert seen.carried['legs'] == 3
     latest = json.loads((seen.folder / 'latest' / 'calibration.json').read_text())
