@@ -64,7 +64,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
             troubles.append(_trouble(topics, slot, found, config))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
-            '' if all(': name ' in text for text in troubles) else
+            '' if all('; choose one with ' in text for text in troubles) else
             f'; the bag has {_described(topics, topics)}'))
     return chosen
 
