@@ -126,7 +126,7 @@ def test_how_far_a_leg_is_computed_is_said(seen):
     assert shares == sorted(shares)
     assert shares[-1] < 100
     for status in seen.computing:
-        stage = status['computing_stage'] or 'begun'
+        stage = status['computing_stage'] or 'started'
         assert status['hint'].startswith(f'computing: {stage}')
         assert '%' not in status['hint']
     assert seen.next['computing_percent'] == '0.0'

@@ -312,7 +312,7 @@ def test_live_distance_is_near_the_computed_one(session):
 
 def test_parameters_are_frozen_during_a_leg(session):
     assert not session.set_in_leg.successful
-    assert 'frozen' in session.set_in_leg.reason
+    assert 'fixed; end it' in session.set_in_leg.reason
     assert not session.set_result.successful
     assert 'set by the node' in session.set_result.reason
     assert session.set_between.successful
