@@ -59,7 +59,7 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'way', 'asked 1000 ppm'):
+    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'way', 'limit 1000 ppm'):
         assert words in ended.stdout
 
 
@@ -92,9 +92,9 @@ def test_the_bars_are_shares_of_what_is_asked():
     done = {'state': 'calibrated', 'asked_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
             'scale_factor_sigma': '0.00004', 'asked_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
-    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, asked 1000 ppm')
-    assert shares(done)['yaw'] == (1.0, '0.25 deg, asked 0.5 deg')
-    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, asked 1000 ppm')
+    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, limit 1000 ppm')
+    assert shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
+    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, limit 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
 
 
