@@ -28,7 +28,8 @@ from odocal_ros.fleet.leg_text import leg_text
 from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, Row, RowStore
 from odocal_ros.outside.names import said_by
 
-NO_THREAD = "can't start new thread"      # what Python says where there is no memory for its stack
+# what is said where there is no memory for a thread's stack, or for a library
+NO_MEMORY = ("can't start new thread", 'failed to map segment')
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,12 @@ def calibrate_bag(job: BagJob) -> Done:
             why = said_by(error)
         except Exception as error:     # noqa: BLE001 one bag stops nobody
             why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
-            if isinstance(error, MemoryError) or NO_THREAD in str(error):
+            if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
                 why = f'needs more memory than --task-memory gives ({job.memory / 2**20:g} MiB)'
-        row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
-        store.put(row)
-        return Done(row.key, FAILED, row.reason, row.seconds, True)
+    # where memory is not refused any more: the row needs some
+    row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
+    store.put(row)
+    return Done(row.key, FAILED, row.reason, row.seconds, True)
 
 
 def _known(store: RowStore, job: BagJob, seen: str) -> Row | None:
