@@ -31,7 +31,7 @@ def odometer_reasons(share: float, sigma: float, log_time: float) -> tuple[Reaso
     worth = 5e-4    # relative: less changes no scale by more than its sigma
     if abs(share) <= max(FAULT_SIGMAS * sigma, worth):
         return ()
-    return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes move with an odometer that is '
-                   f'{100 * share:+.2f} % +- {100 * sigma:.2f} % off, over spans below about '
-                   f'{np.exp(log_time):.0f} s, as fixes fused with a wheel speed do; accounted '
+    return (Reason(Code.FIXES_FOLLOW_ODOMETER, 'the fixes contain an odometer with a scale error '
+                   f'of {100 * share:+.2f} % +- {100 * sigma:.2f} % (time constant '
+                   f'{np.exp(log_time):.0f} s), as fixes fused with a wheel speed do; accounted '
                    'for'),)

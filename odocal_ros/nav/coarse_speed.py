@@ -54,17 +54,20 @@ class CoarseSpeed:
 
     step : scale units per s.   t, value : (n,) s and scale units per s, the rows that are data.
     interpolated : rows between these were sent, which say nothing more.
-    truncates : whether all values may be too small by up to half a step.
     """
 
     step: float
     t: Floats
     value: Floats
     interpolated: bool = False
-    truncates: bool = True
 
-    def times(self, sign: Floats) -> 'CoarseSpeed':
-        """Return the speed times signs (n,)."""
+    @property
+    def truncation(self) -> float:
+        """Return by how much all values may be too small: half a step, where they are cut."""
+        return self.step / 2
+
+    def mirrored(self, sign: Floats) -> 'CoarseSpeed':
+        """Return the speed with signs (n,) of its own."""
         return replace(self, value=self.value * sign)
 
     @cached_property

@@ -35,10 +35,14 @@ class HeldSpeed(CoarseSpeed):
     """A speed held until it has changed by ``step``; ``value``: the middle of where it may be."""
 
     sent: Floats             # (n,) as it was sent
-    truncates: bool = False
 
-    def times(self, sign: Floats) -> 'HeldSpeed':
-        """Return the speed times signs (n,)."""
+    @property
+    def truncation(self) -> float:
+        """Return by how much all values may be too small: not at all."""
+        return 0.0
+
+    def mirrored(self, sign: Floats) -> 'HeldSpeed':
+        """Return the speed with signs (n,) of its own."""
         return replace(self, value=self.value * sign, sent=self.sent * sign)
 
     @cached_property

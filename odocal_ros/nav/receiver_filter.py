@@ -29,7 +29,7 @@ LEAST_LAG2 = 1e-4
 def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: float,
               ) -> tuple[Floats, Floats]:
     """
-    Return by how far filtered places lie off the true ones, and the derivative by ``square``.
+    Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
 
     t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
     at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, as above.

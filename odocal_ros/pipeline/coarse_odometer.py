@@ -30,11 +30,11 @@ def half_step(inputs: Inputs) -> float:
     rounds, and the grid does not say which.
     """
     coarse = _coarse(inputs)
-    if coarse is None or not coarse.truncates:
+    if coarse is None:
         return 0.0
     pick = (coarse.t >= 0.0) & (coarse.t <= inputs.t_stop) & (coarse.value != 0)
     mean = float(np.abs(coarse.value[pick]).mean()) if pick.any() else 0.0
-    return coarse.step / 2 / mean if mean else 0.0
+    return coarse.truncation / mean if mean else 0.0
 
 
 def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
@@ -55,12 +55,12 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
                        'by up to that')]
     coarse = _coarse(inputs)
     coarse_worth = 5e-4    # of the scale: half a step that is worth a word
-    if coarse is None or coarse.truncates and size < coarse_worth:
+    if coarse is None or coarse.truncation and size < coarse_worth:
         return []
     metres = coarse.step * K
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
         else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
-    if not coarse.truncates:
+    if not coarse.truncation:
         return [Reason(Code.SPEED_ON_CHANGE, 'the odometer repeats its speed until it has changed '
                        f'by {sent}; half a step is added towards the last change')]
     between = ', with values interpolated in between' if coarse.interpolated else ''

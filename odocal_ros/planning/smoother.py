@@ -14,11 +14,13 @@ import numpy as np
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive, solve
 from odocal_ros.calib.smoother.equations import Equations
-from odocal_ros.calib.smoother.estimate import Fit, SLIPPING
+from odocal_ros.calib.smoother.estimate import Fit
 from odocal_ros.calib.smoother.imu_noise import sensor_noise
+from odocal_ros.calib.smoother.level_steps import SLIPPING
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import outcome, refused
+from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import Problem, SPACING
+from odocal_ros.calib.smoother.refusal import refused
 from odocal_ros.calib.smoother.slow_error import WHITE_SHARE
 from odocal_ros.calib.smoother.smoother import too_little
 from odocal_ros.planning.drive import PlannedDrive

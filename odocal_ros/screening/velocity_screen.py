@@ -14,13 +14,13 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.earth import radii
 from odocal_ros.reasons import Code, Reason
+from odocal_ros.settings.levels import REMARK_SIGMAS
 
 # s, of the displacements that are compared: judgement, longer than delays of receivers
 WINDOW = 10.0
 # relative to the displacements by the fixes. Judgement: wheel speeds are off by a few per cent,
 # wrong axes, units and frames by far more
 MOST_UNLIKE = 0.1
-SURE = 3.0      # sigmas of what fix errors leave
 
 
 def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
@@ -52,7 +52,7 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
         return ()
     z = complex((V.conj() * D).sum() / power)
     sigma = float(np.sqrt(2 * np.median(covariance[:, 0, 0]) / power))
-    if abs(z - 1) < MOST_UNLIKE + SURE * sigma:
+    if abs(z - 1) < MOST_UNLIKE + REMARK_SIGMAS * sigma:
         return ()
     return (Reason(Code.VELOCITY_UNUSABLE, 'the GNSS velocity does not agree with the fixes: '
                    f'displacements by the fixes are {abs(z):.2f} times those by the velocity, '

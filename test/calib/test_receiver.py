@@ -23,6 +23,8 @@ from odocal_ros.reasons import Code
 from odocal_ros.sim.noise import gauss_markov
 from odocal_ros.sim.real import Real
 
+# quadratic sums and expectations of levels that are as the rows have them
+AS_IT_IS = dict.fromkeys(('fix', 'fix_up', 'slow', 'slow_up'), (1.0, 1.0))
 DRIVE = {'scenario': 'town', 'duration': 400.0, 'imu_grade': 'industrial', 'fix_noise': 'rtk'}
 
 
@@ -73,12 +75,13 @@ def test_errors_as_the_model_has_them_are_left_as_they_are(seed):
     gain = 2 * sigma**2 / time
     levels = Levels({'slow': gain, 'slow_up': gain, 'fix': white**2, 'fix_up': white**2,
                      'correlation_time': time})
-    found = long_run(fixes_of(error, t), levels, {'slow': (2.0, 2.0), 'slow_up': (1.0, 1.0)})
+    found = long_run(fixes_of(error, t), levels, AS_IT_IS)
     # beyond two sigmas by chance, of nine spans that hardly differ
     assert max(found.values()) < 1.3
     # a level that is four times too high, as its own steps say, is no reason
     high = levels.but(slow=4 * gain, slow_up=4 * gain)
-    again = long_run(fixes_of(error, t), high, {'slow': (0.5, 2.0), 'slow_up': (0.25, 1.0)})
+    steps = AS_IT_IS | {'slow': (0.25, 1.0), 'slow_up': (0.25, 1.0)}
+    again = long_run(fixes_of(error, t), high, steps)
     assert again == pytest.approx(found)
 
 
@@ -90,6 +93,6 @@ def test_errors_whose_rate_lasts_grow_more_than_their_steps_say():
                       for x in np.cumsum(steps, axis=0).T], -1)[:len(t)]
     levels = Levels({'slow': 1 / seconds, 'slow_up': 1 / seconds, 'fix': 1e-6, 'fix_up': 1e-6,
                      'correlation_time': 1e4})
-    found = long_run(fixes_of(error, t), levels, {'slow': (2.0, 2.0), 'slow_up': (1.0, 1.0)})
+    found = long_run(fixes_of(error, t), levels, AS_IT_IS)
     for factor in found.values():
         assert seconds / 3 < factor < 1.5 * seconds

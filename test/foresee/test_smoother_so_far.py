@@ -178,22 +178,25 @@ def test_what_is_believed_of_the_accelerometer_is_carried_on_and_judged_anew(con
 
 
 def test_the_size_of_an_imperfection_is_carried_on(config):
-    drive = drive_of(accel_scale_error=3e-3)        # as large as is usual for the grade
     graded = with_settings(config, {'imu.accel_scale_sigma': math.nan})
-    first, later = looked(drive, graded, (40.0, 60.0))
-    assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
-    leg = SmootherSoFar().look(later.leg, graded)
 
     def size(running):
         return running.method.details['noise']['size_accelerometer_scale']
 
-    # two passes of a level that one fit settles: within a tenth of its own sigma of about 1
-    assert size(later.running) == pytest.approx(size(leg), rel=0.1)
-    (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
+    offs = []
+    for seed in range(3, 11):
+        drive = drive_of(accel_scale_error=3e-3, seed=seed)       # as large as is usual
+        first, later = looked(drive, graded, (40.0, 60.0))
+        assert (first.once_s, later.once_s) == (0.0, 0.0)     # not grown by half: no cold start
+        leg = SmootherSoFar().look(later.leg, graded)
+        # two passes of a level that one fit settles: within a tenth of its own sigma of about 1
+        assert size(later.running) == pytest.approx(size(leg), rel=0.1)
+        (off, ratio), *_ = apart(later.running.method.estimates, leg.method.estimates)
+        assert ratio == pytest.approx(1.0, abs=0.2)
+        offs.append(off)
     # as of any look that goes on from the last; in 80 s the level of slow errors is good to a
     # factor of e in its variance, and still falls by a tenth a pass where a fit may end
-    assert abs(off) < 0.3
-    assert ratio == pytest.approx(1.0, abs=0.2)
+    assert np.sqrt(np.mean(np.square(offs))) < 0.3
 
 
 @pytest.mark.parametrize('allowed', [0, 3])
@@ -216,7 +219,7 @@ def test_slow_errors_are_allowed_for_before_they_can_be_seen(config, looks):
     def seen(leg, config):
         return SmootherSoFar().look(leg, config)
 
-    drive = drive_of(fix_noise='correlated', seed=12)
+    drive = drive_of(fix_noise='correlated', seed=27)
     leg = looked(drive, config, (30.0,))[0].leg       # and the standstill
     slow, white = (e.method.estimates['scale_factor'] for e in (seen(leg, config),
                                                                 seen(leg, whites)))
@@ -349,7 +352,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; 700 m more bring it to the asked 1000 ppm; yaw ' in told
+    assert ' m/pulse +- 2000 ppm so far; 760 m more bring it to the asked 1000 ppm; yaw ' in told
     assert told.endswith('; stop and start 12 times, or turn as often, for the yaw')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; as it was 40 s ago; ' in told

@@ -23,25 +23,15 @@ import numpy as np
 
 from odocal_ros.calib.smoother.chain import Neighbours, solve, Solved
 from odocal_ros.calib.smoother.equations import Equations, Weighted
-from odocal_ros.calib.smoother.fixes import Fixes
-from odocal_ros.calib.smoother.long_run import long_run
+from odocal_ros.calib.smoother.level_steps import update
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels, ROAD
 from odocal_ros.calib.smoother.part import JUMP, SPREAD, WANTED
 from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
-from odocal_ros.calib.smoother.priors import SIZE, SIZES
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.relaxed_priors import relaxed
 from odocal_ros.calib.smoother.slow_error import SlowError
-from odocal_ros.calib.smoother.state import (
-    FIX_TIME,
-    IMPERFECT,
-    M,
-    PITCH,
-    Priors,
-    SPEED_OFFSET,
-    State,
-    YAW,
-)
+from odocal_ros.calib.smoother.state import M, PITCH, Priors, State, YAW
 from odocal_ros.data.arrays import Floats
 
 # called with each pass, last with its largest move of a constant, in sigmas
@@ -69,30 +59,7 @@ class Settling:
     flat_angle: float = 0.1
 
 
-@dataclass(frozen=True)
-class OverRelaxation:
-    """Powers on the steps of a level: the fixed point is slow where a noise is small."""
-
-    first: float = 1.6          # from 2 on a level by itself goes to and fro: its steps overshoot
-    faster: float = 1.25        # times, with each step the same way
-    slower: float = 0.5         # times, with each that turns back
-    most: float = 3.0
-
-
-SETTLING, RELAXATION = Settling(), OverRelaxation()
-# pseudo-observations that a level of the Imu is as its prior has it. Judgement: a few seconds'
-# worth
-PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
-# levels of rows that slips and jumps are factors on
-SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
-# sigmas of a prior beyond which it gives way to the data. Statistical: one sound prior in 22
-PRIOR_GIVES_WAY = 2.0
-# of the logarithm of a size. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
-# (docs/decisions/0016)
-SIZE_SPREAD = 1.0
-# most receivers have no odometer, the others one that is up to 2 % off. Tuned: at 1 the sigma of
-# the scale is up to 2.8 times as large in drives without one, at 3 1.7 times (docs/decisions/0019)
-SIZE_SPREADS = {'size_fix_error_by_motion': 3.0}
+SETTLING = Settling()
 # share of the last step from which on a step that turns back is shortened. Judgement: those that
 # turn back by less are halved with each pass by themselves
 TURNS_BACK = -0.5
@@ -207,7 +174,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             if tail:
                 spread = slips(weighted, near, spread, before_levels, levels)
             if tail:
-                priors = widened(first, priors, state, solved, near)
+                priors = relaxed(first, priors, state, solved, near)
             del near
         del sums, weighted, solved      # the most that a long leg takes
     creeping = not settled and bool(max(still, change) < SETTLING.creeping)
@@ -228,47 +195,6 @@ def damped(solved: Solved, taken: Floats) -> Solved:
     back = along / before if before > 0 else 0.0
     by = 1 / (1 - back) if back < TURNS_BACK else 1.0
     return replace(solved, step=by * solved.step, step_border=by * solved.step_border)
-
-
-def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
-           pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
-    """
-    Return levels one step on to the maximum of the restricted likelihood: docs/method.md (S27).
-
-    pace : power and last step of each level, kept up to date.
-    """
-    new, found = {}, weighted.components(neighbours)
-    if 'slow' in weighted.parts:
-        for name, by in long_run(weighted[Fixes], levels, found).items():
-            found[name] = by * found[name][0], found[name][1]
-    for name, (quadratic, expected) in found.items():
-        level = levels[name]
-        if name in SIZES:
-            if not fitted:      # what multiplies noise waits until residuals are noise
-                continue
-            step = _size_step(level, quadratic, expected, SIZE_SPREADS.get(name, SIZE_SPREAD))
-            new[name] = max(level * step, problem.least[name])
-            continue
-        # the others have one that a level is as it is: more end the way to a small noise too early
-        pseudo = PRIOR_ROWS.get(name, 1.0)
-        pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
-        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
-                                    0.03, 30.0)))
-        first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
-        power, last = pace.get(name, (first, 0.0))
-        power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
-        pace[name] = min(power, RELAXATION.most), step
-        move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
-        new[name] = max(level * float(np.exp(move)), problem.least[name])
-    return levels.but(**new)
-
-
-def _size_step(level: float, quadratic: float, expected: float, spread: float) -> float:
-    """Return the factor on a size, log-normal about the usual one: a safeguarded Newton step."""
-    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / spread**2
-    ratio = gradient / (max(expected, quadratic) / 2 + spread**-2)
-    step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio
-    return float(np.exp(min(step, 2.0)))
 
 
 def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Levels,
@@ -293,38 +219,3 @@ def slips(weighted: Weighted, neighbours: Neighbours, spread: Floats, levels: Le
     wanted[:, :JUMP] = np.sqrt(spread * wanted)[:, :JUMP]
     out: Floats = wanted
     return out
-
-
-def widened(first: Priors, now: Priors, state: State, solved: Solved,
-            neighbours: Neighbours) -> Priors:
-    """
-    Return priors widened where the data are far from their centre, docs/method.md (S30).
-
-    Those of imperfections stay: their sizes are levels.
-    """
-    n = solved.step.shape[1]
-    P0 = np.diagonal(neighbours[0])[:n]
-    variance = np.diag(solved.covariance)
-    constants = _wider(first.constants, now.constants, state.constants - first.centre, variance)
-    constants[IMPERFECT] = now.constants[IMPERFECT]       # whose sizes are levels
-    # the grid holds that offset; times are of receivers as they are made
-    held = [SPEED_OFFSET, FIX_TIME]
-    constants[held] = now.constants[held]
-    return replace(
-        now,
-        gyro_bias=_wider(first.gyro_bias, now.gyro_bias, state.gyro_bias[0], P0[9:12]),
-        accel_bias=_wider(first.accel_bias, now.accel_bias, state.accel_bias[0], P0[12:15]),
-        constants=constants)
-
-
-def _wider(first: Floats, now: Floats, off: Floats, variance: Floats) -> Floats:
-    """
-    Return sigmas at which ``off`` is no more than PRIOR_GIVES_WAY, none below the first.
-
-    30 times the first is the most: a prior so far off is a setting that is wrong, and said.
-    """
-    held = np.isfinite(first)
-    first_, now_ = np.where(held, first, 1.0), np.where(held, now, 1.0)
-    z2 = off**2 / np.maximum(now_**2 - variance, 0.2 * now_**2)
-    wide = np.clip(now_ * np.sqrt(z2) / PRIOR_GIVES_WAY, first_, 30 * first_)
-    return np.where(held, wide, np.inf)

@@ -18,14 +18,14 @@ import numpy as np
 
 from odocal_ros.calib.smoother.fixes import Fixes
 from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.point_rows import TAIL_SIGMAS
 from odocal_ros.data.arrays import Floats
-from odocal_ros.settings.levels import NORMAL_MEDIAN
+from odocal_ros.settings.levels import NORMAL_MEDIAN, REMARK_SIGMAS
 
 # spans that the fixes must hold to be compared: statistical, their variance is then good to 35 %,
 # with two axes
 FEWEST_SPANS = 8
 COLUMNS = {'slow': slice(0, 2), 'slow_up': slice(2, 3)}     # of ENU
-TAIL = 3.0      # robust sigmas of a span from which on more counts as much. Statistical: 1 in 370
 
 
 def long_run(fixes: Fixes, levels: Levels,
@@ -34,7 +34,7 @@ def long_run(fixes: Fixes, levels: Levels,
     Return the factors, 1 or more, by which slow errors exceed what their steps say.
 
     Of spans of 1, 2, 4, ... s the largest ratio of the mean square of what errors change by to
-    what is expected, less two of its standard deviations.
+    what is expected, less REMARK_SIGMAS of its standard deviations.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def long_run(fixes: Fixes, levels: Levels,
     levels : Levels
         Of the pass.
     found : dict
-        Quadratic sum and expectation of the levels slow and slow_up: what their steps say.
+        Quadratic sum and expectation of each level: what rows and steps say.
 
     """
     t, error = fixes.state.t[fixes.k] + fixes.points.tau, fixes.errors()
@@ -57,11 +57,11 @@ def long_run(fixes: Fixes, levels: Levels,
         grown = float((1 - np.exp(-(t[b] - t[a]) / time)).mean())
         spans = (t[-1] - t[0]) / span
         for (name, columns), white in zip(COLUMNS.items(), Fixes.levels_of, strict=True):
-            quadratic, expected = found[name]
-            power = levels[name] * quadratic / max(expected, 1e-9) * time / 2
-            want = 2 * levels[white] * float(stated[a, columns].mean()) + 2 * power * grown
+            power, noise = (levels[level] * found[level][0] / max(found[level][1], 1e-9)
+                            for level in (name, white))
+            want = 2 * noise * float(stated[a, columns].mean()) + power * time * grown
             change = error[b, columns] - error[a, columns]
-            chance = 1 + 2 * np.sqrt(2 / (spans * change.shape[1]))
+            chance = 1 + REMARK_SIGMAS * np.sqrt(2 / (spans * change.shape[1]))
             out[name] = max(out[name], _mean_square(change) / want / chance)
         span *= 2
     return out
@@ -70,4 +70,5 @@ def long_run(fixes: Fixes, levels: Levels,
 def _mean_square(change: Floats) -> float:
     """Return the mean square of changes (k, c) with their tails cut."""
     size = np.abs(change)
-    return float((np.minimum(size, TAIL * np.median(size, axis=0) / NORMAL_MEDIAN)**2).mean())
+    most = TAIL_SIGMAS * np.median(size, axis=0) / NORMAL_MEDIAN
+    return float((np.minimum(size, most)**2).mean())

@@ -29,7 +29,8 @@ from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.mismatch import mismatch
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.remarks import beside, IMU_SCALES, level_pitch, MODEL_FLOOR, remarks
+from odocal_ros.calib.smoother.refusal import OPTIONAL, UNITS, unknown
+from odocal_ros.calib.smoother.remarks import beside, level_pitch, MODEL_FLOOR, remarks
 from odocal_ros.calib.smoother.shares import shares
 from odocal_ros.calib.smoother.slide import assumed
 from odocal_ros.calib.smoother.slip import (
@@ -53,7 +54,7 @@ from odocal_ros.calib.smoother.state import (
     VELOCITY,
     YAW,
 )
-from odocal_ros.calib.smoother.wheel_result import unknown_wheels, wheel_details, wheel_estimates
+from odocal_ros.calib.smoother.wheel_result import wheel_details, wheel_estimates
 from odocal_ros.calib.smoother.wheels import wheels_beside
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.angles import wrap
@@ -63,36 +64,7 @@ from odocal_ros.settings.levels import INFORMED_SHARE
 
 SCALE_LIMIT = 0.05      # relative sigma: a scale no better is not known. Judgement
 AXES = {'x': 'forward', 'y': 'left', 'z': 'up'}
-UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
-                                         'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
-                                         'gnss_delay': 's'}
 SCALES = range(GYRO.start, VELOCITY.start)    # errors of Imu, receiver, tyres, body
-# estimates where the drive determines them: lever arms and delays
-OPTIONAL = range(ODO_ARM.start, HEADING)
-
-
-def refused(reasons: Iterable[Reason], scale_unit: str, two_wheels: bool) -> MethodResult:
-    """Return the result of a leg that the method refuses: every value unknown."""
-    found = _unknown(scale_unit) | (unknown_wheels(scale_unit) if two_wheels else {})
-    return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
-
-
-def no_imu(fit: Fit) -> list[Reason]:
-    """Return why a fit is implausible whose Imu no maker would sell, empty else."""
-    c = fit.state.constants
-    worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
-    if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off
-        return []
-    return [Reason(Code.NOT_CONVERGED, 'the fit settled where the '
-                   f'{CONSTANTS[worst].replace("_", " ")} is {100 * c[worst]:+.0f} % off, as no '
-                   'Imu is: a false minimum, or its units, axes or times are not as set')]
-
-
-def _unknown(scale_unit: str) -> dict[str, Estimate]:
-    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
-             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
-    units |= {CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
-    return {name: Estimate(None, None, unit) for name, unit in units.items()}
 
 
 def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> MethodResult:
@@ -183,7 +155,7 @@ def determined(value: Floats, sigma: Floats, ratio: Floats, scale_unit: str, nom
 
     """
     K, yaw, pitch = float(np.exp(value[LN_K])), float(wrap(value[YAW])), float(value[PITCH])
-    found = _unknown(scale_unit)
+    found = unknown(scale_unit)
     if sigma[LN_K] <= SCALE_LIMIT:
         found['scale_factor'] = Estimate(K, float(K * sigma[LN_K]), scale_unit)
         if nominal:

@@ -42,6 +42,11 @@ if TYPE_CHECKING:
 # sizes of imperfections, by the square of the usual one: names of the levels, and their median.
 # Judgement: usual sizes are those of data sheets, which most sensors keep
 SIZES, SIZE = tuple(f'size_{kind}' for kind in KIND_SIZES), 0.5
+# of the logarithms of sizes. Tuned: at 2 pitch is up to 5.2 sigma off in 113 drives, at 1 2.8
+# (docs/decisions/0016). Most receivers have no odometer, others one that is up to 2 % off, 6 of
+# the logarithm apart: at 1 the sigma of the scale is up to 2.8 times as large in drives without
+# one, at 3 1.7 times (docs/decisions/0019)
+SIZE_SPREADS = dict.fromkeys(SIZES, 1.0) | {'size_fix_error_by_motion': 3.0}
 # where a leg begins, which nothing has to hold but the data: m, m/s, rad about east, north, up.
 # Judgement, far wider than any data
 START_SIGMAS: dict[str, tuple[slice, Floats | float]] = {
@@ -75,7 +80,7 @@ class PriorRows(Part):
         self.state, self.base = here.state, here.priors
         absent = {'heading', 'velocity'} - {*problem.outside}
         coarse = problem.leg.travel.coarse
-        absent |= set() if coarse and coarse.truncates else {'speed_truncation'}
+        absent |= set() if coarse and coarse.truncation else {'speed_truncation'}
         self.level = not problem.leg.felt
         self.shared = {name: where for name, where in SHARED.items() if name not in absent}
 

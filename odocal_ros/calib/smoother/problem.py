@@ -280,4 +280,5 @@ def nominal_yaw(config: Config) -> float:
 
 def _offset(coarse: CoarseSpeed | None) -> tuple[float, float]:
     """Return what a speed in steps lacks, and its sigma: none of a step to half of it."""
-    return (coarse.step / 4, coarse.step / 4) if coarse and coarse.truncates else (0.0, NO_ERROR)
+    half = coarse.truncation / 2 if coarse else 0.0
+    return half, half or NO_ERROR

@@ -19,8 +19,9 @@ from odocal_ros.calib.smoother.equations import Equations
 from odocal_ros.calib.smoother.estimate import Fit, fit, Trace
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
-from odocal_ros.calib.smoother.outcome import no_imu, outcome, refused
+from odocal_ros.calib.smoother.outcome import outcome
 from odocal_ros.calib.smoother.problem import nominal_yaw, Problem, with_imperfect
+from odocal_ros.calib.smoother.refusal import no_imu, refused
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.start import first_state, Start

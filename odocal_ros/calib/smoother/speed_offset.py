@@ -31,12 +31,12 @@ def judge_offset(problem: Problem, now: Fit, trace: Trace | None = None) -> Fit:
     from the nearer, one sound drive in 2000.
     """
     coarse = problem.leg.travel.coarse
-    if coarse is None or not coarse.truncates:
+    if coarse is None or not coarse.truncation:
         return now
     sigma = float(np.sqrt(now.solved.covariance[SPEED_OFFSET, SPEED_OFFSET]))
     found = float(now.state.constants[SPEED_OFFSET])
-    known = coarse.step / 2 if found > coarse.step / 4 else 0.0
-    off, other = (abs(found - x) / sigma for x in (known, coarse.step / 2 - known))
+    known = coarse.truncation if found > coarse.truncation / 2 else 0.0
+    off, other = (abs(found - x) / sigma for x in (known, coarse.truncation - known))
     if off > 3.5 or other**2 - off**2 < 2 * np.log(1e3):
         return now
     constants = now.state.constants.copy()

@@ -1,0 +1,81 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""One step of the noise levels and sizes to the maximum of the restricted likelihood."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from odocal_ros.calib.smoother.chain import Neighbours
+from odocal_ros.calib.smoother.equations import Weighted
+from odocal_ros.calib.smoother.fixes import Fixes
+from odocal_ros.calib.smoother.long_run import long_run
+from odocal_ros.calib.smoother.noise import Levels
+from odocal_ros.calib.smoother.priors import SIZE, SIZE_SPREADS, SIZES
+from odocal_ros.calib.smoother.problem import Problem
+
+
+@dataclass(frozen=True)
+class OverRelaxation:
+    """Powers on the steps of a level: the fixed point is slow where a noise is small."""
+
+    first: float = 1.6          # from 2 on a level by itself goes to and fro: its steps overshoot
+    faster: float = 1.25        # times, with each step the same way
+    slower: float = 0.5         # times, with each that turns back
+    most: float = 3.0
+
+
+RELAXATION = OverRelaxation()
+# pseudo-observations that a level of the IMU is as its prior has it. Judgement: a few seconds'
+# worth
+PRIOR_ROWS = {'gyro': 5.0, 'accel': 5.0, 'gyro_walk': 3.0, 'accel_walk': 3.0}
+# levels of rows that slips and jumps are factors on
+SLIPPING = ('along', 'along_hard', 'side', 'side_turn', 'up')
+
+
+def update(weighted: Weighted, neighbours: Neighbours, levels: Levels, problem: Problem,
+           pace: dict[str, tuple[float, float]], fitted: bool = True) -> Levels:
+    """
+    Return levels one step on to the maximum of the restricted likelihood: docs/method.md (S27).
+
+    pace : power and last step of each level, kept up to date.
+    """
+    new, found = {}, weighted.components(neighbours)
+    if 'slow' in found and 'fix' in found:
+        for name, by in long_run(weighted[Fixes], levels, found).items():
+            found[name] = by * found[name][0], found[name][1]
+    for name, (quadratic, expected) in found.items():
+        level = levels[name]
+        if name in SIZES:
+            if not fitted:      # what multiplies noise waits until residuals are noise
+                continue
+            step = _size_step(level, quadratic, expected, SIZE_SPREADS[name])
+            new[name] = max(level * step, problem.least[name])
+            continue
+        # the others have one that a level is as it is: more end the way to a small noise too early
+        pseudo = PRIOR_ROWS.get(name, 1.0)
+        pull = pseudo * (problem.first_levels[name] / level if name in PRIOR_ROWS else 1.0)
+        step = float(np.log(np.clip((quadratic + pull) / (max(expected, 0.0) + pseudo),
+                                    0.03, 30.0)))
+        first = RELAXATION.first if name in SLIPPING or name in PRIOR_ROWS else 1.0
+        power, last = pace.get(name, (first, 0.0))
+        power *= RELAXATION.slower if step * last < 0 else RELAXATION.faster if last else 1.0
+        pace[name] = min(power, RELAXATION.most), step
+        move = np.clip(pace[name][0] * step, np.log(0.03), np.log(30.0))
+        new[name] = max(level * float(np.exp(move)), problem.least[name])
+    return levels.but(**new)
+
+
+def _size_step(level: float, quadratic: float, expected: float, spread: float) -> float:
+    """Return the factor on a size, log-normal about the usual one: a safeguarded Newton step."""
+    gradient = (quadratic - expected) / 2 - np.log(level / SIZE) / spread**2
+    ratio = gradient / (max(expected, quadratic) / 2 + spread**-2)
+    step = np.log1p(max(ratio, -0.9)) if ratio < 0 else ratio
+    return float(np.exp(min(step, 2.0)))

@@ -1,0 +1,51 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The result of a leg that is refused: estimates without values, and why."""
+
+from collections.abc import Iterable
+
+from odocal_ros.calib.budget import PARAMETERS
+from odocal_ros.calib.result import Estimate, MethodResult
+from odocal_ros.calib.smoother.estimate import Fit
+from odocal_ros.calib.smoother.remarks import IMU_SCALES
+from odocal_ros.calib.smoother.state import CONSTANTS, HEADING, ODO_ARM
+from odocal_ros.calib.smoother.wheel_result import unknown_wheels
+from odocal_ros.reasons import Code, Reason
+
+UNITS = dict.fromkeys(CONSTANTS, 'm') | {'yaw_mounting_angle': 'rad',
+                                         'pitch_mounting_angle': 'rad', 'odometer_delay': 's',
+                                         'gnss_delay': 's'}
+# estimates where the drive determines them: lever arms and delays
+OPTIONAL = range(ODO_ARM.start, HEADING)
+
+
+def refused(reasons: Iterable[Reason], scale_unit: str, two_wheels: bool) -> MethodResult:
+    """Return the result of a leg that the method refuses: every value unknown."""
+    found = unknown(scale_unit) | (unknown_wheels(scale_unit) if two_wheels else {})
+    return MethodResult('smoother', tuple(reasons), found, PARAMETERS)
+
+
+def no_imu(fit: Fit) -> list[Reason]:
+    """Return why a fit is implausible whose Imu no maker would sell, empty else."""
+    c = fit.state.constants
+    worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
+    if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off
+        return []
+    return [Reason(Code.NOT_CONVERGED, 'the fit settled where the '
+                   f'{CONSTANTS[worst].replace("_", " ")} is {100 * c[worst]:+.0f} % off, as no '
+                   'Imu is: a false minimum, or its units, axes or times are not as set')]
+
+
+def unknown(scale_unit: str) -> dict[str, Estimate]:
+    """Return the estimates of a leg, each without a value."""
+    units = {'scale_factor': scale_unit, 'scale_ratio': '1', 'yaw_mounting_angle': 'rad',
+             'pitch_mounting_angle': 'rad'} | {f'gyro_bias_{axis}': 'rad/s' for axis in 'xyz'}
+    units |= {CONSTANTS[i]: UNITS[CONSTANTS[i]] for i in OPTIONAL}
+    return {name: Estimate(None, None, unit) for name, unit in units.items()}
