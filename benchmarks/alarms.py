@@ -72,7 +72,7 @@ def right(leg, wheel):
 
 
 def of_imu(**signals):
-    """Return a change of the Imu's signals, each by a function."""
+    """Return a change of the IMU's signals, each by a function."""
     return lambda leg, rng: replace(leg, imu=replace(leg.imu, **{
         name: change(getattr(leg.imu, name)) for name, change in signals.items()}))
 
@@ -88,7 +88,7 @@ FAULTS: dict = {
                    {}, {}, None),
     'REVERSING_UNSIGNED': ('a fifth backwards, no sign', 'yard', {'duration': 600.0}, {}, {},
                            unsigned),
-    'IMU_WORSE_THAN_GRADE': ('consumer Imu, told tactical', 'town', {'imu_grade': 'consumer'},
+    'IMU_WORSE_THAN_GRADE': ('consumer IMU, told tactical', 'town', {'imu_grade': 'consumer'},
                              {}, {'imu.grade': 'tactical'}, None),
     'IMU_AXES_SKEW': ('industrial, accelerometer x 1 deg off', 'town',
                       {'imu_grade': 'industrial'}, {'accel_matrix': matrix(DEG)}, {}, None),
@@ -112,7 +112,7 @@ FAULTS: dict = {
     'CLOCKS_DIFFER': ('fixes in GPS time, 18 s', 'town', {}, {}, {},
                       lambda leg, rng: replace(leg, fix=shifted(leg.fix, 18.0))),
     'IMU_UNITS': ('force in g', 'town', {}, {}, {}, of_imu(f_i=lambda f: f / 9.81)),
-    'IMU_AXES': ('Imu turned by 90 deg', 'town', {}, {}, {}, of_imu(
+    'IMU_AXES': ('IMU turned by 90 deg', 'town', {}, {}, {}, of_imu(
         w_i=lambda w: w[:, [1, 0, 2]] * [1, -1, 1], f_i=lambda f: f[:, [1, 0, 2]] * [1, -1, 1])),
     'GYRO_SIGN': ('gyro counts clockwise', 'town', {}, {}, {}, of_imu(w_i=lambda w: -w)),
     'ODOMETER_REVERSED': ('counts backwards', 'town', {}, {}, {}, lambda leg, rng: replace(

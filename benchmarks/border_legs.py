@@ -13,7 +13,7 @@ Legs of a vehicle combined on their border: what is stated, and how far it is of
     python benchmarks/border_legs.py [--vehicles 4] [--legs 6] [--grade consumer]
                                      [--fixes correlated|white|rtk] [--file F]
 
-A vehicle has one scale, one mounting and one Imu, whose scale errors are drawn as its grade has
+A vehicle has one scale, one mounting and one IMU, whose scale errors are drawn as its grade has
 them (accelerometer by grades.GRADES, gyro by a third of that); biases, road, wheels and fixes are
 each leg's own. The accelerometer's scale error is alike on all axes; the upward one turns the
 pitch by itself times the pitch, and no constant holds that. Legs are town drives of 10 minutes, a

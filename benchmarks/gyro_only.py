@@ -8,7 +8,7 @@
 # the License.
 
 """
-Monte Carlo of legs whose Imu has no accelerometer: does the stated sigma of the scale hold.
+Monte Carlo of legs whose IMU has no accelerometer: does the stated sigma of the scale hold.
 
     python benchmarks/gyro_only.py [--drives 30]
 

@@ -13,10 +13,10 @@ What the node costs while it records: beside a bare typed subscriber of the same
     python benchmarks/live_load.py [--seconds 60] [--imu 400] [--odometer 50] [--fix 5]
                                     [--no-journal]
 
-A publisher process sends Imu, speed and fixes of a simulated town drive; the calibrator and a bare
+A publisher process sends IMU, speed and fixes of a simulated town drive; the calibrator and a bare
 rclpy node that subscribes to the same topics, typed, with an empty callback, run beside it, all at
 once. Printed, each figure beside its goal where there is one: CPU of one core of the node before
-anything comes (status and diagnostics, which a listener hears, and looking for messages) and in a
+anything comes (status and diagnostics, which a hearer hears, and looking for messages) and in a
 leg; that of the bare subscriber in the same seconds; messages lost in the leg and while its result
 is computed; how often there was a new running estimate; the latency of service calls after these
 seconds, ten a second for CALLS_S. No loss is to be seen at --imu 4000 --odometer 250 --fix 25.
@@ -169,7 +169,7 @@ def report(args, client, sent, used, latencies) -> None:
     """Print the figures; ``used`` by the node idle and in a leg, and by the bare subscriber, %."""
     time.sleep(2.5)   # the last /diagnostics comes within its period of 1 s
     health = [client.health[f'calibrator: {name}'] for name in ('imu', 'odometer', 'gnss')]
-    print(f'{args.imu:g} / {args.odometer:g} / {args.fix:g} Hz (Imu, speed, fixes), '
+    print(f'{args.imu:g} / {args.odometer:g} / {args.fix:g} Hz (IMU, speed, fixes), '
           f'{args.seconds:g} s in a leg; sent {sent}, received '
           f'{[int(h["messages"]) for h in health]}')
     told('messages lost, by sequence numbers', sum(int(h['dropped']) for h in health), '',

@@ -63,14 +63,14 @@ def show(leg, config, seconds):
     before_ns, now_ns, pauses, total, shown = 0, leg.start_ns + LOOK_PERIOD_NS, [], 0.0, -1.0
     early = 0.0
     while before_ns < leg.stop_ns:
-        seen, cost, once = look(leg, config, state, before_ns, now_ns)
+        seen, cost, unique_paths = look(leg, config, state, before_ns, now_ns)
         total += cost
-        pauses.append(max(LOOK_PERIOD_NS * 1e-9, cost + (cost - once) / LOOK_SHARE))
+        pauses.append(max(LOOK_PERIOD_NS * 1e-9, cost + (cost - unique_paths) / LOOK_SHARE))
         t = (now_ns - leg.start_ns) * 1e-9
         early = total if t <= EARLY_S else early
         if seen is not None and (t > shown + seconds / LINES or now_ns >= leg.stop_ns):
             shown = t
-            print(f'{t:8.0f} {cost:12.2f} {once:14.2f} {pauses[-1]:14.1f} '
+            print(f'{t:8.0f} {cost:12.2f} {unique_paths:14.2f} {pauses[-1]:14.1f} '
                   f'{seen.scale.sigma * 1e6:17.1f} {math.degrees(seen.yaw.sigma or 0.0):15.4f}')
         next_ns = now_ns + round(pauses[-1] * 1e9)
         before_ns, now_ns = now_ns, leg.stop_ns if now_ns < leg.stop_ns < next_ns else next_ns

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test' / 'live'))
 
 BEFORE_S, AFTER_S = 15.0, 3.0      # s, sent before the start mark and after the stop mark
 BLOCK_S = 10.0                     # s of the drive sent at once
-MOST_AHEAD = 4000                  # Imu messages that the node has not taken yet
+MOST_AHEAD = 4000                  # IMU messages that the node has not taken yet
 GOAL_S, LONGEST_S = 5.0, 3600.0    # s, of the answer; of the final result, given up then
 
 
@@ -48,7 +48,7 @@ class Sender:
         self._client, self._sent = client, 0
         self._first_ns = int(drive.imu.stamp_ns[0])
 
-    def heard(self) -> bool:
+    def received(self) -> bool:
         """Return whether the node hears every topic."""
         return self._player.matched()
 
@@ -80,7 +80,7 @@ def measure(client, node, drive, seconds: float) -> None:
     from bench import wait_for
     from live_load import cpu_s
     sender = Sender(client, drive)
-    wait_for(sender.heard, 'subscriptions of the node')
+    wait_for(sender.received, 'subscriptions of the node')
     sender.send(0.0, BEFORE_S)
     client.start()
     sender.send(BEFORE_S, seconds)

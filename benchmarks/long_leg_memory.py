@@ -12,13 +12,13 @@ What a long leg takes of memory: peak RSS beside its goal, for replay and for th
 
     python benchmarks/long_leg_memory.py [--hours 3 2] [--imu 1000] [--looks 3] [--bag BAG]
 
-Writes a simulated town drive (200 Hz Imu, 50 Hz counts, 2 Hz fixes; kept with --bag) and runs, one
+Writes a simulated town drive (200 Hz IMU, 50 Hz counts, 2 Hz fixes; kept with --bag) and runs, one
 after the other,
 
 replay   ``odocal replay`` of the whole drive
 node     with all of the node's modules, what the node does with each message between the wire and
          the result, at once and not in real time: recorder, thinned, --looks running estimates
-         evenly through the leg, and then the computing. Imu rows are laid between those of the bag
+         evenly through the leg, and then the computing. IMU rows are laid between those of the bag
          until they come at --imu Hz. What DDS and the journal hold (the journal: seconds) is left
          out.
 """
@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 BASE_HZ = 200.0
 REPLAY_GOAL, NODE_GOAL = 600, 300     # MiB
-POLL = 50                             # Imu rows in a block, as at 1 kHz
+POLL = 50                             # IMU rows in a block, as at 1 kHz
 
 
 def peak_mib() -> float:
@@ -47,7 +47,7 @@ def peak_mib() -> float:
 
 
 def finer(block, before, times):
-    """Return an Imu block with rows laid between those of it, and its last row."""
+    """Return an IMU block with rows laid between those of it, and its last row."""
     import numpy as np
 
     from odocal_ros.data.samples import join, take
@@ -135,7 +135,7 @@ def node(bag_path, hours, imu_hz, looks) -> None:
     result, = compute(recorder.snapshot(), begin[0], stop, [], config,
                       progress=lambda *_: give_back()).results
     scale = result.methods['smoother'].estimates['scale_factor']
-    print(f'node, computed ({result.imu_samples} Imu rows, {time.perf_counter() - began:.0f} s, '
+    print(f'node, computed ({result.imu_samples} IMU rows, {time.perf_counter() - began:.0f} s, '
           f'scale {scale.value} +- {scale.sigma}): {peak_mib():.0f} MiB (goal {NODE_GOAL})',
           flush=True)
 

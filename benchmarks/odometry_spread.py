@@ -101,7 +101,7 @@ def main():
         errors.append(error)
         sigmas.append(np.sqrt(np.diag(cov)))
     errors, sigmas = np.array(errors), np.array(sigmas)
-    print(f'{args.drives} drives of {args.minutes:g} min, {args.scenario}, {args.grade} Imu')
+    print(f'{args.drives} drives of {args.minutes:g} min, {args.scenario}, {args.grade} IMU')
     print(f'{"":18}{"error, rms":>12}{"sigma, rms":>12}{"error/sigma":>13}{"beyond 2":>10}')
     for k, name in enumerate(ROWS):
         ratio = errors[:, k] / sigmas[:, k]

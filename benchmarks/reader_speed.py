@@ -13,7 +13,7 @@ Reading and replaying an hour's bag beside plain reading: each ratio beside its 
     python benchmarks/reader_speed.py [--minutes 60] [--repeat 5] [--camera] [--wall] [--growth]
                                       [--only WORD ...] [--folder DIR]
 
-Writes simulated bags of a town drive (200 Hz Imu, 50 Hz counts, 5 Hz fixes; --camera adds 1 GB of
+Writes simulated bags of a town drive (200 Hz IMU, 50 Hz counts, 5 Hz fixes; --camera adds 1 GB of
 pictures), each read once before it is timed. Every figure is the median of processes of their own,
 in processor seconds (--wall: on the clock), taken in turn, so that a busy machine hurts all alike.
 ``read`` are the file's bytes, unpacked where they are packed; ``raw`` is rosbags' iteration over

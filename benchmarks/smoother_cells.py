@@ -14,7 +14,7 @@ Monte Carlo of the smoother: does the stated sigma hold, and how far is it from 
     python benchmarks/smoother_cells.py --stress [--drives 100]
     python benchmarks/smoother_cells.py --special [--cells dull] [--cells starts]
 
-A cell is a kind of drive: scenario town, 600 s, one Imu grade, white fixes of 1.5 m or RTK ones of
+A cell is a kind of drive: scenario town, 600 s, one IMU grade, white fixes of 1.5 m or RTK ones of
 2 cm at 5 Hz; the heading is drawn and not told. Drive k of cell c has seed 50_000_000 + 100_000 c
 + k, fixed before the first run. Cells named ``sway`` have what method.md section 3 has: 0.05 m/s
 of sideways and vertical velocity, white at 10 Hz, and a speed odometer at 10 Hz with 0.05 m/s of

@@ -95,7 +95,7 @@ def _dull(simulated, true_levels, seeds, options, promise):
 
 def _starts(simulated, seed, grade, noise, worst):
     drive, config = simulated(seed, scenario='town', imu_grade=grade, fix_noise=noise)
-    # scale errors of the accelerometer are believed by its axes: a turned Imu is another one
+    # scale errors of the accelerometer are believed by its axes: a turned IMU is another one
     config = with_settings(config, {'imu.accel_scale_sigma': 0.0})
     leg = leg_of(drive.leg(), config)
     usual = smooth(leg, config)
@@ -106,7 +106,7 @@ def _starts(simulated, seed, grade, noise, worst):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])       # old b by the new
         turned = smooth(replace(leg, w_b=leg.w_b @ turn, f_b=leg.f_b @ turn), config)
-        _note(worst, f'Imu turned by {angle:g} deg, {grade} {noise}', usual, turned, turn)
+        _note(worst, f'IMU turned by {angle:g} deg, {grade} {noise}', usual, turned, turn)
     moving, state = _in_motion(drive, config)
     late = smooth(moving, config)
     problem = Problem.of(moving, config)
@@ -146,7 +146,7 @@ def _cut(leg, start):
 
 
 def _note(worst, what, usual, other, turn=None):
-    """Keep the change from one result to another, of an Imu turned by C (old b by the new)."""
+    """Keep the change from one result to another, of an IMU turned by C (old b by the new)."""
     if other.estimates[NAMES[1]].value is None:
         _keep(worst, what, np.full(3, np.inf))
         return

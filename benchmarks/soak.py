@@ -74,7 +74,7 @@ class Day:
         self._round, self._period_s, self._client, self._sent_imu = 0, period_s, client, 0
         self.now_s, self._due = 0.0, time.monotonic()
 
-    def heard(self) -> bool:
+    def received(self) -> bool:
         """Return whether the node hears the topics, and the clock some time ago."""
         self.tell_time()
         time.sleep(0.5)
@@ -96,7 +96,7 @@ class Day:
         self._let_it_hear(0)
 
     def _let_it_hear(self, ahead: int) -> None:
-        """Wait until the node has not more messages of the Imu before it."""
+        """Wait until the node has not more messages of the IMU before it."""
         from bench import wait_for
 
         def near():
@@ -207,8 +207,8 @@ def main() -> int:
         try:
             every_s = max(DRIVE_S + 10, 3600 * args.hours / args.legs)
             day = Day(client, drives, args.speedup, every_s)
-            wait_for(day.heard, 'subscriptions')
-            wait_for(day.heard, 'the time')
+            wait_for(day.received, 'subscriptions')
+            wait_for(day.received, 'the time')
             for leg in range(1, args.legs + 1):
                 looks.append(one_leg(day, client, node, Path(folder), leg, drives[0].truth.scale))
                 print(', '.join(f'{k} {v:.4g}' if isinstance(v, float) else f'{k} {v}'

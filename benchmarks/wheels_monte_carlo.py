@@ -13,7 +13,7 @@ Monte Carlo of drives with two wheels, to see whether the stated sigmas hold.
     python benchmarks/wheels_monte_carlo.py [--drives 200] [--processes 1] [--cell TEXT] [--file F]
 
 Each cell (scenario, IMU grade, fix noise, what is told) is driven N times for 300 s with two
-wheels (the Imu sends 50 Hz, the wheels 20, fixes 5), errors drawn anew from what the settings
+wheels (the IMU sends 50 Hz, the wheels 20, fixes 5), errors drawn anew from what the settings
 believe: gyro and accelerometer biases, walks and noise, the gyro's scale (by its grade), fixes,
 where the encoders' discs stand, latency of the fixes (50 ms), of the odometer (10 ms), the
 antenna's place (0.1 m), and the track width where one is given (2 %); routes of the town are drawn

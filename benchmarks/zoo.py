@@ -19,7 +19,7 @@ or one alone (``--only clean``: none), configured as its operator would. Drive k
 drive and grades take turns, so that 15 drives hold each pair once. Rows go to the file line by
 line: an interrupted run goes on where it stopped.
 
-Printed by effect, kind and grade, for scale, yaw and pitch by the Imu's own axes (and by its
+Printed by effect, kind and grade, for scale, yaw and pitch by the IMU's own axes (and by its
 housing, where the product states that): how many were given in drives that are not rejected, share
 within 1.96 sigma, RMS of error over sigma, median sigma, worst error over sigma. ``off``: not
 rejected though beyond 3.5 sigma; ``unnamed``: of these, without a reason that names a cause that
@@ -186,7 +186,7 @@ def main():
     parser.add_argument('--file', type=Path, default=Path('/tmp/zoo.jsonl'))
     args = parser.parse_args()
     if args.duration is not None and not math.isfinite(args.duration):
-        parser.error('--duration: want a finite number')
+        parser.error('--duration: required: a finite number')
     seeds = [seed for run in args.only or ['all']
              for seed in seeds_of(run, args.drives, args.kind, args.grade)]
     print_tables(_run(seeds, args))

@@ -8,14 +8,14 @@
 # the License.
 
 """
-What a GNSS velocity does to the results: drives of the zoo with it and without.
+Effect of a GNSS velocity on the results: drives of the zoo with and without it.
 
     python benchmarks/zoo_velocity.py --drives 40 [--kind white] [--file F]
 
-Drives are those of ``zoo.py`` with all effects, seeds from 70_000_000 on; drive k has the k-th
-kind of velocity error, in turns, unless ``--kind`` says one. Printed by kind, for scale, yaw and
-pitch, without and with: share within 1.96 sigma, RMS and worst of error over sigma; the median
-ratio of the sigmas, with over without; and the ratio of CPU time.
+The drives are those of ``zoo.py`` with all effects, seeds from 70_000_000 on. Drive k has the k-th
+type of velocity error, cyclically, unless ``--kind`` selects one. Output by type, for scale, yaw
+and pitch, without and with velocity: share within 1.96 sigma, rms and maximum of error over sigma;
+the median ratio of the sigmas, with over without; and the ratio of CPU time.
 """
 
 import argparse
@@ -65,7 +65,7 @@ def run_drive(k, error):
 
 
 def print_table(name, rows):
-    """Print the figures of some drives."""
+    """Print the statistics of some drives."""
     print(f'{name}: {len(rows)} drives')
     for key in ('scale', 'yaw', 'pitch'):
         text = f'  {key:6}'
@@ -83,7 +83,7 @@ def print_table(name, rows):
 
 
 def main():
-    """Run what the file does not hold yet, print the tables."""
+    """Run the drives that are missing in the file, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('--drives', type=int, default=40)
     parser.add_argument('--kind', choices=ERRORS)

@@ -19,7 +19,7 @@ class BadConfig(OdocalError):
 
 
 class BadData(OdocalError):
-    """Samples break their contract (shape, type): mend the source."""
+    """Samples break their contract (shape, type): correct the source."""
 
 
 class BadBag(OdocalError):

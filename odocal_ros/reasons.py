@@ -36,155 +36,169 @@ class Code(Enum):
     """A reason code: (gravity, remedy)."""
 
     # the data that came
-    NO_IMU = REJECT, 'Check the Imu topic and its QoS, or name it with --imu-topic.'
-    NO_ACCELEROMETER = CAUTION, ('For yaw and pitch take an Imu that sends its acceleration too; '
-                                 'drive level ground, hills lengthen the way unseen.')
+    NO_IMU = REJECT, 'Check the IMU topic and its QoS, or name the topic with --imu-topic.'
+    NO_ACCELEROMETER = CAUTION, ('Yaw and pitch need an IMU that publishes acceleration. Drive '
+                                 'on level ground: unmodelled slopes bias the scale.')
     NO_ODOMETER = REJECT, 'Check the odometer topic and odometer.type, or use --odometer-topic.'
     NO_FIX = REJECT, 'Drive under open sky and wait for a position before the start mark.'
-    FIXES_UNUSABLE = REJECT, ('Wait for a valid position; loosen gnss.min_status or '
-                              'gnss.max_sigma if these fixes are good.')
-    BAD_ROWS_DROPPED = NOTE, 'Mend the driver that sends them; the other rows were used.'
-    ROWS_DAMAGED = CAUTION, ('Copy the recording again from where it was made, or drive again; '
-                             'the rows about the damage were left out.')
-    STAMPS_NOT_RISING = NOTE, 'Mend the clock of the sender; the rows in order were used.'
-    IMU_GAP = REJECT, ('Mend the Imu stream (QoS depth, CPU load, cable), or mark a leg beside '
-                       'the gap; leg.max_gap is the limit.')
-    LEG_CUT = NOTE, ('Mend the Imu stream (QoS depth, CPU load, cable): a leg without a gap tells '
-                     'more; leg.max_gap is the limit.')
-    TOPIC_GAP = NOTE, 'Mend the stream; the gap lowers the weight, not the leg.'
+    FIXES_UNUSABLE = REJECT, ('Wait for a valid position. If these fixes are good, relax '
+                              'gnss.min_status or gnss.max_sigma.')
+    BAD_ROWS_DROPPED = NOTE, ('Check the driver that sends these messages. All other messages '
+                              'were used.')
+    ROWS_DAMAGED = CAUTION, ('Copy the recording again from its source, or record a new one. '
+                             'Messages near the damage were left out.')
+    STAMPS_NOT_RISING = NOTE, ('Check the clock of the sender. Messages with increasing stamps '
+                               'were used.')
+    IMU_GAP = REJECT, ('Fix the IMU stream (QoS depth, CPU load, cable), or mark a leg without '
+                       'the gap with --leg. The limit is leg.max_gap.')
+    LEG_CUT = NOTE, ('Fix the IMU stream (QoS depth, CPU load, cable). An uninterrupted leg '
+                     'gives smaller uncertainties. The limit is leg.max_gap.')
+    TOPIC_GAP = NOTE, 'Fix the data stream. This section is down-weighted; the leg stays valid.'
     CLOCKS_DIFFER = REJECT, ('Set odometer.time_offset, imu.time_offset or gnss.time_offset, or '
                              'stamp all sensors with one clock.')
-    DELAY_SEEN = NOTE, ('Set the time_offset as the sentence says, here and wherever else these '
-                        'sensors are used together; the two-point method gains most.')
-    ODOMETER_LATE = NOTE, ('Send the counter with a header stamped where it is read, or ease the '
-                           'line or machine that holds it up; the late messages were put back.')
-    COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg; the travel across the '
-                              'reset was bridged at the speed beside it.')
-    COUNTER_ROLLOVER = NOTE, 'Nothing to do: undone by odometer.wrap or the integer type.'
-    SPEED_COARSE = NOTE, ('Take wheel pulses or a finer speed signal of the same bus, if there is '
-                          'one; the smoother hears when the steps change and can do without.')
-    SPEED_ON_CHANGE = NOTE, ('Take wheel pulses or a speed that is sent at a fixed rate, if the '
-                             'vehicle has one.')
-    SPEED_FILTERED = CAUTION, ('Take wheel pulses or an unfiltered speed signal of the same bus; '
-                               'the smoother allows for a delay, not for a filter.')
-    COUNTER_COARSE = NOTE, ('Take a counter of more pulses a metre, if there is one; else drive '
-                            'farther: a count weighs less the longer the way.')
+    DELAY_SEEN = NOTE, ('Set the time_offset named above, here and in every other program that '
+                        'combines these sensors. The two-point method improves most.')
+    ODOMETER_LATE = NOTE, ('Publish the counter with a header stamped at the time of reading, or '
+                           'reduce bus or CPU load. The late messages were moved back to their '
+                           'estimated times.')
+    COUNTER_RESET = CAUTION, ('Keep the encoder powered during a leg. Travel across the reset '
+                              'was interpolated from the adjacent speed.')
+    COUNTER_ROLLOVER = NOTE, ('No action needed: the rollover was removed by odometer.wrap or '
+                              'the integer type.')
+    SPEED_COARSE = NOTE, ('If available, use wheel pulses or a finer speed signal of the same '
+                          'bus. The smoother needs neither: it uses the step transitions.')
+    SPEED_ON_CHANGE = NOTE, ('If available, use wheel pulses or a speed that is published at a '
+                             'fixed rate.')
+    SPEED_FILTERED = CAUTION, ('Use wheel pulses or an unfiltered speed signal of the same bus. '
+                               'The smoother models a delay, but no low-pass filter.')
+    COUNTER_COARSE = NOTE, ('If available, use a counter with more pulses per metre. Otherwise '
+                            'drive farther: quantisation averages out with distance.')
     REVERSING_UNSIGNED = CAUTION, ('Do not reverse during a leg, or use an odometer that counts '
-                                   'backwards (odometer.signed).')
-    ODOMETER_REVERSED = REJECT, ('Set odometer.reversed to true (or false if it is); if the Imu '
-                                 'faces backwards, set imu.mounting_rpy or imu.nominal_yaw.')
-    ODOMETER_STILL = REJECT, 'Check wheel sensor and topic: the fixes move, the counter does not.'
+                                   'down in reverse and set odometer.signed.')
+    ODOMETER_REVERSED = REJECT, ('Invert odometer.reversed. If the IMU x axis points backwards, '
+                                 'set imu.mounting_rpy or imu.nominal_yaw instead.')
+    ODOMETER_STILL = REJECT, ('Check the wheel sensor and the odometer topic: the fixes move, '
+                              'but the counter does not.')
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
                          'imu.gyro_scale.')
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '
                                  'axes are forward-right-down.')
-    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up; where '
-                        'the drive shows how the Imu sits, the values are named.')
-    IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the like, to what '
-                                     'the Imu is; a gyro that sends deg/s looks so too: '
-                                     'imu.gyro_scale.')
-    IMU_AXES_SKEW = NOTE, ('Nothing: the angles are those of the axes that the Imu measures in; '
-                           'set imu.misalignment_sigma to what the Imu has.')
-    LEVER_ARM_OFF = CAUTION, ('Measure that lever arm again and set it: from base_link, x '
-                              'forward, y left, z up; where both are off alike, it is '
-                              'imu.lever_arm. A vehicle that slides in turns (skid '
-                              'steering, tracks) looks so too: then leave it.')
-    GYRO_SIGN = REJECT, 'Check the axes of the Imu: set imu.mounting_rpy, or mend the driver.'
-    BAG_TRUNCATED = CAUTION, 'End recordings with Ctrl-C; what the file holds was used.'
-    STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg; what was driven '
-                                  'until the recording broke off was used.')
-    FRAME_REPLACED = NOTE, 'Set frames.imu to the frame that the Imu has in TF; mend its driver.'
-    COVARIANCE_UNKNOWN = NOTE, 'Set gnss.default_sigma to what the receiver really achieves.'
-    FIXES_NOISIER_THAN_SAID = NOTE, ('The sigmas were widened to what the residuals show; check '
-                                     'the receiver and the sky.')
-    VELOCITY_UNUSABLE = NOTE, ('Send east, north, up in m/s on fix_velocity, or set '
-                               'gnss.use_velocity to false; the leg is estimated without it.')
+    IMU_AXES = REJECT, ('Set imu.mounting_rpy so that the body frame is forward-left-up. If the '
+                        'drive determines the IMU orientation, the values are given.')
+    IMU_WORSE_THAN_GRADE = CAUTION, ('Set imu.grade, or imu.gyro_noise and the other noise '
+                                     'settings, to the values of this IMU. A gyro in deg/s also '
+                                     'looks like this: then set imu.gyro_scale.')
+    IMU_AXES_SKEW = NOTE, ('No action needed: the mounting angles refer to the measurement axes '
+                           'of the IMU. To silence this, set imu.misalignment_sigma to the value '
+                           'of this IMU.')
+    LEVER_ARM_OFF = CAUTION, ('Measure this lever arm again and set it (from base_link: x '
+                              'forward, y left, z up). If both lever arms differ by the same '
+                              'amount, check imu.lever_arm. A vehicle that slides in turns (skid '
+                              'steering, tracks) also looks like this: then change nothing.')
+    GYRO_SIGN = REJECT, ('Check the IMU axes: set imu.mounting_rpy, or correct the signs in the '
+                         'driver.')
+    BAG_TRUNCATED = CAUTION, 'Stop recordings with Ctrl-C. All readable messages were used.'
+    STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg. Data up to the '
+                                  'end of the recording was used.')
+    FRAME_REPLACED = NOTE, ('Set frames.imu to the TF frame of the IMU, or correct frame_id in '
+                            'its driver.')
+    COVARIANCE_UNKNOWN = NOTE, ('Set gnss.default_sigma to the real horizontal accuracy of the '
+                                'receiver.')
+    FIXES_NOISIER_THAN_SAID = NOTE, ('Uncertainties were increased to match the residuals. Check '
+                                     'the receiver and its sky view.')
+    VELOCITY_UNUSABLE = NOTE, ('Publish east, north, up in m/s on fix_velocity, or set '
+                               'gnss.use_velocity to false. The leg is estimated without it.')
     # the drive
-    NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark: level, gyro '
-                              'bias and heading then come from rest.')
-    LEG_TOO_SHORT = REJECT, 'Drive farther between the marks: leg.min_distance is the least.'
-    CHORD_TOO_SHORT = REJECT, ('End far from where you start: a straight stretch, or mark part '
-                               'of the drive with --leg; the two-point method sees only the line '
-                               'between start and end.')
-    SPEED_TOO_LOW = CAUTION, 'Drive faster than leg.min_speed for at least part of the leg.'
-    LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight stretch for the two-point method.'
-    TRACK_MISMATCH = REJECT, ('Look at the check: wheel slip, a wrong gyro axis or unit, or bad '
-                              'fixes; drive again on a firm straight road with open sky.')
-    CHECK_WORSE = CAUTION, ('Keep what you had; look in the report where the track leaves the '
-                            'fixes (slip, gaps, bad fixes), and drive again.')
-    WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or take a wheel that is not driven; '
-                           'the sigma was widened by the slip seen.')
-    SCALE_VARIES = NOTE, ('Nothing; for one number that holds longer, drive with warm tyres at '
-                          'the speeds that matter, and combine legs.')
-    FIXES_SMOOTHED = NOTE, ("Switch off the receiver's smoothing (position filter, static hold) "
-                            'if you can: accelerations then tell more.')
-    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use the fixes of the receiver alone: choose the topic '
-                                      'before fusion, or switch off its odometer (dead reckoning '
-                                      'mode), and drive again.')
+    NO_STANDSTILL = CAUTION, ('Stand still for 10 s or more before the start mark. Level, gyro '
+                              'bias and heading are then measured at rest.')
+    LEG_TOO_SHORT = REJECT, 'Drive farther between the marks. The limit is leg.min_distance.'
+    CHORD_TOO_SHORT = REJECT, ('End the leg far from its start, or mark a straight section with '
+                               '--leg. The two-point method only uses the line from start to end.')
+    SPEED_TOO_LOW = CAUTION, ('Drive faster than leg.min_speed in part of the leg. For a slow '
+                              'vehicle, lower leg.min_speed.')
+    LEG_NOT_STRAIGHT = NOTE, 'Prefer a straight section for the two-point method.'
+    TRACK_MISMATCH = REJECT, ('Likely causes: wheel slip, a wrong gyro axis or unit, or bad '
+                              'fixes. Check them with odocal inspect, then drive again on a firm '
+                              'road under open sky.')
+    CHECK_WORSE = CAUTION, ('Keep the previous calibration. Find in the report where the track '
+                            'deviates from the fixes (slip, gaps, bad fixes), then drive again.')
+    WHEEL_SLIP = CAUTION, ('Drive gently on a firm, dry road, or use a wheel that is not driven. '
+                           'The uncertainty was increased by the slip found.')
+    SCALE_VARIES = NOTE, ('No action needed. For a value that stays valid longer, drive with '
+                          'warm tyres at typical speeds, and combine several legs.')
+    FIXES_SMOOTHED = NOTE, ('If possible, switch off smoothing in the receiver (position filter, '
+                            'static hold): accelerations then determine more.')
+    FIXES_FOLLOW_ODOMETER = CAUTION, ('Use fixes of the receiver alone: select the topic before '
+                                      'fusion, or switch off dead reckoning in the receiver. Then '
+                                      'drive again.')
     # the estimate
-    YAW_NOT_SEPARABLE = CAUTION, ('Give a heading that knows nothing of the odometer: '
-                                  'alignment.heading with its sigma, a dual-antenna heading '
-                                  'topic, or a gyro good enough to gyrocompass.')
+    YAW_NOT_SEPARABLE = CAUTION, ('Provide a heading that is independent of the odometer: '
+                                  'alignment.heading with alignment.heading_sigma, a '
+                                  'dual-antenna heading topic, or a gyrocompass-grade gyro.')
     GYROCOMPASS_REFUSED = CAUTION, ('Use a gyro with less bias (imu.grade, imu.gyro_bias), a '
                                     'longer standstill, or another heading source.')
     HEADING_UNAVAILABLE = CAUTION, 'Check the heading source, or set alignment.heading_source.'
-    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that gives ellipsoidal height.'
+    PITCH_NOT_DETERMINED = NOTE, 'Use a receiver that publishes ellipsoidal height.'
     SCALE_FAR_FROM_NOMINAL = CAUTION, ('Check odometer.nominal_scale and the unit of the '
-                                       'odometer; odometer.max_scale_deviation is the limit.')
+                                       'odometer. The limit is odometer.max_scale_deviation.')
     YAW_FAR_FROM_NOMINAL = CAUTION, ('Check imu.mounting_rpy, imu.nominal_yaw and the heading '
                                      'source.')
     SCALE_SIGMA_TOO_LARGE = CAUTION, ('Drive a longer leg, use better fixes (RTK, longer stops '
-                                      'at both marks), or combine more legs; '
-                                      'verdict.max_scale_sigma is the limit.')
-    YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, give a better '
-                                    'heading, or combine legs; verdict.max_yaw_sigma is the '
-                                    'limit.')
+                                      'at both marks), or combine more legs. The limit is '
+                                      'verdict.max_scale_sigma.')
+    YAW_SIGMA_TOO_LARGE = CAUTION, ('Drive with more stops, starts and turns, provide a better '
+                                    'heading, or combine legs. The limit is '
+                                    'verdict.max_yaw_sigma.')
     PLANES_DISAGREE = CAUTION, 'Check the fixes and heights at the marks.'
     # left and right wheel
-    ODOMETER_CHOSEN = NOTE, ('Nothing, if that is right; else name them: odometer.left and '
-                             'odometer.right, or one value by odometer.field.')
-    WHEELS_NOT_SEPARABLE = CAUTION, ('Use the gyro: give odometer.track_width, or drive straight '
-                                     'stretches at speed; the mean of both wheels is not touched.')
-    TRACK_WIDTH_NOT_DETERMINED = NOTE, ('Drive turns with a net change of heading (a loop, a '
-                                        'round about), or give odometer.track_width.')
-    TRACK_WIDTH_FAR_FROM_GIVEN = CAUTION, ('Measure the distance between the wheels again and set '
-                                           'odometer.track_width, or leave it 0.')
-    WHEELS_SWAPPED = REJECT, 'Exchange odometer.left and odometer.right.'
-    WHEEL_DEAD = REJECT, ('Check the sensor and the wiring of that wheel, or calibrate the other '
-                          'alone: name one joint or index in odometer.field.')
-    WHEEL_REVERSED = REJECT, ('Make that wheel count forwards in its driver; odometer.reversed '
-                              'turns both.')
-    WHEEL_COUNTERS_DIFFER = CAUTION, ('Set odometer.wrap to the span of the counters, and let '
-                                      'both wheels send the same one.')
-    SEARCH_WIDENED = NOTE, ('Nothing, if the values are believable; else check '
-                            'odometer.nominal_scale and the heading: wheels.radius_range and '
-                            'wheels.heading_range set where the search begins.')
-    SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or give '
+    ODOMETER_CHOSEN = NOTE, ('If correct, ignore. Otherwise set odometer.left and '
+                             'odometer.right, or select one value with odometer.field.')
+    WHEELS_NOT_SEPARABLE = CAUTION, ('Set odometer.track_width, or drive straight sections at '
+                                     'higher speed. The mean of both wheels is not affected.')
+    TRACK_WIDTH_NOT_DETERMINED = NOTE, ('Drive turns with a net change of heading (a loop or a '
+                                        'roundabout), or set odometer.track_width.')
+    TRACK_WIDTH_FAR_FROM_GIVEN = CAUTION, ('Measure the distance between the wheels again and '
+                                           'set odometer.track_width, or set it to 0 (unknown).')
+    WHEELS_SWAPPED = REJECT, 'Swap odometer.left and odometer.right.'
+    WHEEL_DEAD = REJECT, ('Check the sensor and wiring of this wheel, or calibrate the other '
+                          'wheel alone: set odometer.field to its joint or index.')
+    WHEEL_REVERSED = REJECT, ('Invert the sign of this wheel in its driver. odometer.reversed '
+                              'inverts both wheels.')
+    WHEEL_COUNTERS_DIFFER = CAUTION, ('Set odometer.wrap to the modulus of the counters. Both '
+                                      'wheels must use the same modulus.')
+    SEARCH_WIDENED = NOTE, ('If the values are plausible, ignore. Otherwise check '
+                            'odometer.nominal_scale and the heading; wheels.radius_range and '
+                            'wheels.heading_range set the initial search range.')
+    SEARCH_NOT_SETTLED = CAUTION, ('Widen wheels.radius_range and wheels.heading_range, or set '
                                    'better start values.')
     # all the samples at once
-    NOT_CONVERGED = REJECT, ('See what the other methods say; check units, axes and clocks with '
-                             'odocal inspect, and drive a leg with stops and turns.')
+    NOT_CONVERGED = REJECT, ('Check units, axes and clocks with odocal inspect, then drive a leg '
+                             'with stops and turns. The other methods may still have a result.')
     SCALE_NOT_DETERMINED = REJECT, 'Drive farther, faster, or with better fixes.'
-    YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: acceleration is what '
-                                   'tells the heading, and so the yaw.')
-    PARAMETER_NOT_DETERMINED = NOTE, 'Drive with turns both ways, stops and starts.'
-    MODEL_MISMATCH = CAUTION, ('The residuals are not what the noise model says; the sigmas were '
-                               'widened. Check slip, lever arms, delays and the sky.')
-    METHOD_REJECTED = CAUTION, ('Look up in docs/reasons.md what to do about the code named; the '
-                                'values are by another method, which may not see it.')
-    METHOD_FAILED = REJECT, 'Report it with the trace file; the other methods are not touched.'
-    METHODS_DISAGREE = CAUTION, ('See the values side by side; the likely cause is named. Drive '
-                                 'again with stops at both marks and turns in between.')
+    YAW_NOT_DETERMINED = CAUTION, ('Drive with stops, starts and turns: the yaw is estimated '
+                                   'from accelerations.')
+    PARAMETER_NOT_DETERMINED = NOTE, 'Drive with left and right turns, stops and starts.'
+    MODEL_MISMATCH = CAUTION, ('The residuals are larger than the noise model predicts; '
+                               'uncertainties were increased. Check slip, lever arms, delays and '
+                               'sky view.')
+    METHOD_REJECTED = CAUTION, ('See docs/reasons.md for the code named. The values come from '
+                                'another method, which may not detect this problem.')
+    METHOD_FAILED = REJECT, ('Please report this with the trace file. The other methods are not '
+                             'affected.')
+    METHODS_DISAGREE = CAUTION, ('Check the likely cause named above. Drive again with stops at '
+                                 'both marks and turns in between.')
     # several legs, several calibrations
-    LEGS_DISAGREE = CAUTION, ('Look for the odd leg: tyre pressure, load, slip or bad fixes; '
-                              'the combined sigma was widened.')
-    SCALE_CHANGED = CAUTION, ('Look at tyre pressure, load and tyres; the scale given is that '
-                              'since the change.')
-    LEGS_UNLIKE = REJECT, ('Combine legs of one vehicle, one mounting and one set of topics and '
-                           'settings; calibrate the others by themselves.')
-    LEGS_OVERLAP = CAUTION, 'Give each drive once; legs that share time are no second opinion.'
-    LEG_REJECTED = CAUTION, 'See the reasons of that leg; drive it again or leave it out.'
-    MORE_LEGS_NEEDED = CAUTION, 'Drive more legs: verdict.min_legs.'
+    LEGS_DISAGREE = CAUTION, ('Find the leg that differs. Likely causes: tyre pressure, load or '
+                              'slip (scale), a moved IMU (angles), driver timing (delays), bad '
+                              'fixes. The combined uncertainty was increased.')
+    SCALE_CHANGED = CAUTION, ('Check tyre pressure, load and tyres. The scale stated is valid '
+                              'from the change on.')
+    LEGS_UNLIKE = REJECT, ('Combine only legs of one vehicle, one mounting, and the same topics '
+                           'and settings. Calibrate the other legs separately.')
+    LEGS_OVERLAP = CAUTION, ('Give each recording once. Legs that overlap in time are not '
+                             'independent.')
+    LEG_REJECTED = CAUTION, 'See the reasons of this leg. Drive it again or leave it out.'
+    MORE_LEGS_NEEDED = CAUTION, 'Drive more legs. The required number is verdict.min_legs.'
     NO_METHOD = REJECT, 'See the reasons of the legs.'
 
     def __init__(self, gravity: Verdict, remedy: str) -> None:
@@ -200,7 +214,7 @@ class Code(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A code with what was seen: one sentence with the figures; ``do`` where that tells more."""
+    """A code, a text with numbers, and a specific remedy ``do`` if there is one."""
 
     code: Code
     text: str
@@ -208,7 +222,7 @@ class Reason:
 
     @property
     def remedy(self) -> str:
-        """Return what the reader can do about it."""
+        """Return the remedy."""
         return self.do or self.code.remedy
 
     def as_dict(self) -> dict[str, Any]:

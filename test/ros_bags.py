@@ -43,7 +43,7 @@ def write(path, rows, storage='mcap', compression='none', types=None):
 
 
 def drive(seconds=10.0, start_ns=T0):
-    """Return rows of a short straight drive: Imu 100 Hz, counter 50 Hz, fixes 5 Hz."""
+    """Return rows of a short straight drive: IMU 100 Hz, counter 50 Hz, fixes 5 Hz."""
     rows = []
     noise = np.random.default_rng(3).normal(size=(round(seconds * 100), 6))
     for i in range(round(seconds * 100)):

@@ -85,7 +85,7 @@ def sound(result, truth, sigmas=5.0):
 
 
 @pytest.mark.parametrize(('slot', 'columns', 'code', 'text'), [
-    ('imu', ('w_i',), Code.NO_IMU, 'none of the 10001 Imu messages is usable'),
+    ('imu', ('w_i',), Code.NO_IMU, 'none of the 10001 IMU messages is usable'),
     ('fix', ('latitude',), Code.FIXES_UNUSABLE, 'none of the 1000 fix messages is usable')])
 def test_a_topic_of_nothing_but_nan(made, leg, slot, columns, code, text):
     bad = changed(getattr(leg, slot), **{c: lambda a: a * np.nan for c in columns})
@@ -128,7 +128,7 @@ def test_all_fixes_status_none(made, leg):
 def test_ten_seconds_without_imu(made, leg):
     t = seconds(leg, leg.imu)
     result, said = run(replace(leg, imu=take(leg.imu, (t < 40) | (t > 50))), settings(made))
-    assert said[Code.IMU_GAP].endswith('for 10.04 s at t = 39.98 s (1 gap above 0.5 s)')
+    assert said[Code.IMU_GAP].endswith('for 10.04 s at t = 39.98 s (1 gap; the limit is 0.5 s)')
     # straight on, nothing was lost: the values are kept and hold
     assert max(map(abs, errors_in_sigmas(result, made.truth).values())) < 5
     # a gap long before the leg is none of its business
@@ -144,7 +144,7 @@ def test_an_imu_that_ends_early(made, leg):
     result, said = run(replace(leg, imu=take(leg.imu, t < -10.0)), settings(made))
     assert Code.IMU_GAP in rejecting(result)
     result, said = run(replace(leg, imu=take(leg.imu, t > 20.0)), settings(made))
-    assert 'missing for 20.0' in said[Code.IMU_GAP]
+    assert 'no IMU data for 20.0' in said[Code.IMU_GAP]
 
 
 def test_an_odometer_that_starts_late_or_ends_early_shortens_the_leg(made, leg):
@@ -297,7 +297,7 @@ def test_an_imu_that_sends_no_turn_rate_is_refused_before_anything_is_divided(le
     with np.errstate(all='raise'):
         result, said = run(none, settings(made, method='auto'))
     assert rejecting(result) == {Code.NO_IMU}
-    assert 'every turn rate is zero' in said[Code.NO_IMU]
+    assert 'all turn rates are zero' in said[Code.NO_IMU]
 
 
 def test_one_that_sends_no_acceleration_gives_the_scale_and_divides_nothing(leg, made):
@@ -318,7 +318,7 @@ def test_degrees_instead_of_radians(made, town, scenario):
         assert Code.IMU_UNITS in rejecting(result)
         assert 'set imu.gyro_scale to 0.017453292519943295' in said[Code.IMU_UNITS]
     else:      # a straight road turns nothing to tell it by, but at rest the noise does
-        assert 'as one that sends deg/s would be' in said[Code.IMU_WORSE_THAN_GRADE]
+        assert 'so its unit is probably deg/s' in said[Code.IMU_WORSE_THAN_GRADE]
         assert 'imu.gyro_scale' in Code.IMU_WORSE_THAN_GRADE.remedy
         assert result.verdict.value == 'caution'
         # the bias read at rest is believed, not that of a grade so clearly wrong: 50 sigmas else
@@ -331,7 +331,7 @@ def test_a_z_down_imu_is_read_as_what_it_is(town):
     leg = replace(town.leg(), imu=changed(town.imu, w_i=lambda a: a * [1.0, -1.0, -1.0],
                                           f_i=lambda a: a * [1.0, -1.0, -1.0]))
     result, said = run(leg, settings(town))
-    assert 'taken as forward-right-down' in said[Code.IMU_LOOKS_Z_DOWN]
+    assert 'forward-right-down is assumed' in said[Code.IMU_LOOKS_Z_DOWN]
     assert result.verdict.value == 'caution'
     sound(result, town.truth)
     clean, _ = run(town.leg(), settings(town))
@@ -349,7 +349,7 @@ def test_a_sideways_imu_is_refused_and_told_so(made, leg):
                      f_i=lambda a: a[:, [2, 1, 0]] * [1, 1, -1])
     result, said = run(replace(leg, imu=turned), settings(made))
     assert rejecting(result) == {Code.IMU_AXES}
-    assert 'gravity shows on +x (up should be +z)' in said[Code.IMU_AXES]
+    assert 'gravity is on +x (up should be +z)' in said[Code.IMU_AXES]
 
 
 def test_a_gyro_with_the_wrong_sign_is_named(town):
@@ -388,7 +388,7 @@ def test_a_stray_fix_is_no_way_of_a_leg_that_is_refused(town):
 def test_a_leg_too_short(made, leg):
     short = replace(leg, stop_ns=leg.start_ns + 14 * 10**9)
     result, said = run(short, settings(made))
-    assert 'm between the marks, 100 m are the least' in said[Code.LEG_TOO_SHORT]
+    assert 'm between the marks; the limit is 100 m' in said[Code.LEG_TOO_SHORT]
 
 
 def test_a_vehicle_that_never_moves(made, leg):
@@ -404,7 +404,7 @@ def test_a_vehicle_that_never_moves(made, leg):
 def test_an_odometer_that_does_not_count(made, leg, nominal):
     result, said = run(replace(leg, odometer=changed(leg.odometer, value=lambda a: a * 0 + 7)),
                        settings(made, odometer__nominal_scale=nominal))
-    assert said[Code.ODOMETER_STILL] == 'the fixes move, the odometer does not count'
+    assert said[Code.ODOMETER_STILL] == 'the fixes move, but the odometer does not'
 
 
 def test_an_odometer_that_stops_counting_on_the_way(made, leg):
@@ -418,7 +418,7 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
         return run(replace(leg, odometer=changed(leg.odometer, value=value)), settings(made))
     result, said = stands(40.0, np.inf)
     assert rejecting(result) == {Code.ODOMETER_STILL}
-    assert re.fullmatch(r'the fixes move on by \d+ m from t = 40 s to \d+ s, the odometer does '
+    assert re.fullmatch(r'the fixes move by \d+ m from t = 40 s to \d+ s, but the odometer does '
                         'not count', said[Code.ODOMETER_STILL])
     assert Code.ODOMETER_STILL in stands(40.0, 65.0)[1]
     assert Code.ODOMETER_STILL not in stands(40.0, 41.0)[1]
@@ -433,7 +433,7 @@ def test_an_odometer_that_stops_counting_on_the_way(made, leg):
 def test_fixes_that_do_not_move(made, leg):
     stuck = changed(leg.fix, latitude=lambda a: a * 0 + a[0], longitude=lambda a: a * 0 + a[0])
     result, said = run(replace(leg, fix=stuck), settings(made))
-    assert said[Code.LEG_TOO_SHORT] == 'the fixes stay in one place while the odometer counts'
+    assert said[Code.LEG_TOO_SHORT] == 'the odometer counts, but the fixes do not move'
 
 
 def test_no_standstill_before_the_start(made, leg):
@@ -483,7 +483,7 @@ def test_a_wheel_that_slips_strays_from_the_fixes(made, leg):
     spun = 0.1 * 12.0 / made.options.scale * np.clip(t - 25, 0, 40)
     slipped = changed(leg.odometer, value=lambda a: a + spun.astype(int))
     result, said = run(replace(leg, odometer=slipped), settings(made))
-    assert rejecting(result) == {Code.TRACK_MISMATCH} or 'stray from the track' in said[
+    assert rejecting(result) == {Code.TRACK_MISMATCH} or 'deviate from the track' in said[
         Code.FIXES_NOISIER_THAN_SAID]
 
 
@@ -497,7 +497,7 @@ def test_one_wild_fix_costs_nothing(made, leg):
 
 def test_a_nominal_scale_of_another_world_is_a_caution(made, leg):
     result, said = run(leg, settings(made, odometer__nominal_scale=1.0))
-    assert '-97.9 % from the nominal 1' in said[Code.SCALE_FAR_FROM_NOMINAL]
+    assert '-97.9 % from the nominal value 1' in said[Code.SCALE_FAR_FROM_NOMINAL]
     assert result.verdict.value == 'caution'
     sound(result, made.truth)
 

@@ -54,7 +54,7 @@ def put_frames(folder, utc, boot, x, v):
 
 @pytest.fixture(scope='module')
 def drive():
-    """Return a car's drive of two minutes: a phone's Imu, forward-right-down, speed, fixes."""
+    """Return a car's drive of two minutes: a phone's IMU, forward-right-down, speed, fixes."""
     return simulate('town', odometer='speed', duration=120.0, imu_rate=50.0, odometer_rate=40.0,
                     scale=SCALE, nominal_scale=1.0, yaw=YAW, mounting_rpy=(np.pi, 0.0, 0.0),
                     imu_grade='industrial', fix_sigma=0.5)

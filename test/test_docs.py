@@ -22,6 +22,7 @@ import yaml
 from odocal_ros.bagio.encode import counter, fix, imu
 from odocal_ros.bagio.write import write_bag
 from odocal_ros.offline import cli
+from odocal_ros.output.budget_table import source_label
 from odocal_ros.pipeline.calibrate import calibrate
 from odocal_ros.settings.config_file import read_config_file
 
@@ -109,7 +110,7 @@ def test_odocal_commands_do_what_the_page_says(page, line, tmp_path, monkeypatch
         scale = content['result']['scale_factor']
         truth = drive(**STRAIGHT).truth.scale
         assert abs(scale['value'] - truth) < 4 * scale['sigma']
-        told = page_of('docs/report.md').partition('holds all of it')[2].partition('The other')[0]
+        told = page_of('docs/report.md').partition('contains everything')[2].split('[files.md]')[0]
         assert set(re.findall(r'`(\w+)`', told)) <= set(content)
     elif words[0] == 'simulate':
         assert {p.name for p in tmp_path.iterdir()} >= {'drive', 'truth.yaml'}
@@ -166,15 +167,15 @@ def test_the_figures_of_the_page_are_those_that_are_drawn():
 
 def test_each_source_of_a_budget_is_explained():
     page = page_of('docs/report.md')
-    cells = re.findall(r'^\| ([\w, ]+) \|', page, re.MULTILINE)
+    cells = re.findall(r'^\| ([\w, -]+) \|', page, re.MULTILINE)
     told = {name for cell in cells for name in cell.split(', ')} | {'gyro bias y', 'gyro bias z'}
-    assert "*The legs' own errors*" in page
+    assert '*Errors of single legs*' in page
     made = drive(scenario='town', duration=200.0, two_wheels=True, imu_grade='industrial')
     more = {'method': 'all', 'odometer.left': 'topic', 'odometer.right': 'topic'}
     leg = calibrate(made.leg(), settings(made, **more))
     budgets = {name: method.details.get('budget') for name, method in leg.methods.items()}
     assert all(budgets.values()), budgets
-    found = {source.replace('_', ' ') for budget in budgets.values() for source in budget}
+    found = {source_label(source) for budget in budgets.values() for source in budget}
     assert found <= told, f'say in docs/report.md what they are: {found - told}'
 
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""An Imu that sends turn rates only: the scale comes by gyro, counter and fixes, and no angle."""
+"""An IMU that sends turn rates only: the scale comes by gyro, counter and fixes, and no angle."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ ANGLES = ('yaw_mounting_angle', 'pitch_mounting_angle')
 
 
 def without_force(made, value=0.0, planar=False):
-    """Return the leg of a drive whose Imu sends no force, and about one axis only if planar."""
+    """Return the leg of a drive whose IMU sends no force, and about one axis only if planar."""
     leg = made.leg()
     w_i = leg.imu.w_i * ([0.0, 0.0, 1.0] if planar else 1.0)
     return replace(leg, imu=replace(leg.imu, w_i=w_i, f_i=np.full_like(leg.imu.f_i, value)))

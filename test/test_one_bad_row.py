@@ -63,7 +63,8 @@ def test_a_fault_in_a_method_costs_that_method(made, config, whole, monkeypatch,
     monkeypatch.setitem(leg_methods.METHODS, broken, breaks)
     result = calibrate(made.leg(), config)
     reason, = (r for r in result.methods[broken].reasons if r.code is Code.METHOD_FAILED)
-    assert f'method {broken} broke: LinAlgError (Singular matrix) in breaks' in reason.text
+    assert (f'method {broken} failed with an internal error: LinAlgError (Singular matrix) in '
+            'breaks') in reason.text
     (name, trace), = traces([result])
     assert name == broken
     assert 'Traceback' in trace

@@ -116,7 +116,7 @@ def test_experiments_9_and_10_compass_and_yaw():
 
 
 def test_experiment_10_the_offset_is_added_to_the_topic():
-    # a topic that points a quarter turn to the left of the Imu's x axis needs that taken off
+    # a topic that points a quarter turn to the left of the IMU's x axis needs that taken off
     made = drive(**STRAIGHT, heading_sigma=1e-4)
     q = made.heading.q_ni
     turned = np.stack([q[:, 0] - q[:, 1], q[:, 0] + q[:, 1], q[:, 2] + q[:, 3],

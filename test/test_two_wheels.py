@@ -46,7 +46,7 @@ def test_a_span_that_the_type_does_not_tell_is_found_and_undone_to_the_count(mad
     clean, none = screened(made.leg(), made)
     assert not none
     text = said[Code.WHEEL_COUNTERS_DIFFER]
-    assert f"right wheel's count rolls over at {span}," in text
+    assert f'right wheel counter rolls over at {span},' in text
     # bridging would lose counts; here none is
     assert np.array_equal(inputs.travel_right.s, clean.travel_right.s)
     assert not len(inputs.doubt_t)
@@ -58,7 +58,7 @@ def test_the_wheel_and_the_first_time_are_named(made):
     leg = replace(made.leg(), odometer=left)
     _, said = screened(leg, made)
     text = said[Code.WHEEL_COUNTERS_DIFFER]
-    assert text.startswith("the left wheel's")
+    assert text.startswith('the left wheel counter')
     assert f't = {seconds(leg, left)[rolled[0] + 1]:.2f} s' in text
     assert f'{len(rolled)} jump' in text
 
@@ -121,7 +121,7 @@ def test_a_right_wheel_that_never_speaks_is_dead(made):
     silent = take(made.odometer_right, slice(0, 0))
     _, said = screened(replace(made.leg(), odometer_right=silent), made,
                        odometer__left='topic', odometer__right='topic')
-    assert 'right wheel sends no message' in said[Code.WHEEL_DEAD]
+    assert 'right wheel has no message' in said[Code.WHEEL_DEAD]
     _, said = screened(replace(made.leg(), odometer_right=silent), made)     # one odometer
     assert not said
 
@@ -129,7 +129,7 @@ def test_a_right_wheel_that_never_speaks_is_dead(made):
 def test_a_right_wheel_that_sends_no_number_is_dead(made):
     right = replace(made.odometer_right, value=np.full(len(made.odometer_right.value), np.nan))
     inputs, said = screened(replace(made.leg(), odometer_right=right), made)
-    assert 'right wheel sends no usable value' in said[Code.WHEEL_DEAD]
+    assert 'right wheel has no usable value' in said[Code.WHEEL_DEAD]
     assert inputs.travel_right is None
     assert len(inputs.travel.t)
 

@@ -101,7 +101,7 @@ class Clock:
 
 
 def imu_topics(segment, clock):
-    """Yield the phone's Imu as it is, turned to forward-left-up, and with the chip's own bias."""
+    """Yield the phone's IMU as it is, turned to forward-left-up, and with the chip's own bias."""
     t_force, force = log(segment, 'IMU/accelerometer', 3)
     for topic, name, axes, frame in (
             ('/imu/data', 'gyro', 1.0, 'imu_link'), ('/imu/data_flu', 'gyro', FLU, 'imu_flu'),
@@ -153,7 +153,7 @@ def scale_by_pose(segment, clock):
     pose, said = (np.diff(np.interp(edges, at, way_of(at, v))) for at, v in (
         (clock.boot, v), (t, speed)))
     if not said.sum() > 0 or not np.isfinite(pose).all():
-        raise BadUsage(f'{segment}: a pose or a speed is no number, or the car does not move')
+        raise BadUsage(f'{segment}: a pose or a speed is not a number, or the car does not move')
     scale = pose.sum() / said.sum()
     off = np.sqrt(((pose - scale * said)**2).sum() * PIECES / (PIECES - 1)) / said.sum()
     return scale, max(off, LEAST_SIGMA)

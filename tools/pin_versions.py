@@ -8,9 +8,9 @@
 # the License.
 
 """
-Write .ci/constraints.txt: the versions of all that odocal_ros needs, as installed here.
+Write .ci/constraints.txt: the installed versions of all dependencies of odocal_ros.
 
-``python -m tools.pin_versions``, in the environment that the tests ran in.
+Run ``python -m tools.pin_versions`` in the environment of the tests.
 """
 
 from importlib.metadata import distribution, PackageNotFoundError
@@ -24,7 +24,7 @@ EXTRAS = ('', 'fleet', 'ros', 'tables', 'watch')
 
 
 def needed(name: str, extras: tuple[str, ...], found: dict[str, str]) -> None:
-    """Add name -> version of a package's requirements, and of theirs."""
+    """Add name -> version of the requirements of a package, recursively."""
     for line in distribution(name).requires or ():
         wanted = Requirement(line)
         if wanted.marker and not any(wanted.marker.evaluate({'extra': extra}) for extra in extras):
@@ -34,7 +34,7 @@ def needed(name: str, extras: tuple[str, ...], found: dict[str, str]) -> None:
             continue
         try:
             found[key] = distribution(wanted.name).version
-        except PackageNotFoundError:      # of another platform, or left out
+        except PackageNotFoundError:      # of another platform, or not installed
             continue
         needed(wanted.name, ('', *wanted.extras), found)
 

@@ -8,11 +8,11 @@
 # the License.
 
 """
-Make the table of docs/recordings.md: each real drive, calibrated, beside its reference.
+Generate the table of docs/recordings.md: the result of each real drive and its reference.
 
-``python -m tools.real_drives`` prints the table, ``--write`` puts it into the page. Drives are the
-folders of ``$ODOCAL_DATA`` (else ``../shared/data``) that hold ``bag`` and ``truth.yaml``; each is
-calibrated as ``odocal try`` does, once for each odometer topic that the truth names.
+``python -m tools.real_drives`` prints the table, ``--write`` updates the page. Drives are the
+folders of ``$ODOCAL_DATA`` (else ``../shared/data``) with ``bag`` and ``truth.yaml``; each is
+calibrated by ``odocal try``, once for each odometer topic in the truth.
 """
 
 import argparse
@@ -86,7 +86,7 @@ def _stated(reference: dict[str, float]) -> str:
 
 
 def main() -> None:
-    """Print the table, or write it into the page."""
+    """Print the table, or update the page."""
     parser = argparse.ArgumentParser(description='real drives against their references')
     parser.add_argument('--write', action='store_true', help='into docs/recordings.md')
     args = parser.parse_args()

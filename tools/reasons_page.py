@@ -10,8 +10,8 @@
 """
 ``docs/reasons.md``: what each reason code means and what to do about it, made from the enum.
 
-Gravity and remedy stand in ``reasons.py``; what a code means at length stands here and nowhere
-else. Written by ``python -m tools.settings_page --write`` with the other pages.
+Severity and remedy are in ``reasons.py``; the explanation of each code is here
+only. ``python -m tools.settings_page --write`` writes this page with the others.
 """
 
 import textwrap
@@ -23,228 +23,236 @@ HEAD = """\
 
 Made from `odocal_ros/reasons.py` by `python -m tools.settings_page --write`.
 
-A result, a leg and the live status name what was seen by a code, a sentence with the figures, and
-a remedy. How grave a code is:
+A result, a leg and the live status list their findings. Each has a code, a text with numbers and
+limits, and a remedy. There are three severities:
 
-* **rejects**: nothing should use the values, though they are shown and kept;
-* **caution**: read the sentence, then use the values or drive again;
-* **note**: worth knowing, changes nothing.
+* **rejects**: the values must not be used; they are shown and stored only for diagnosis;
+* **caution**: read the text, then use the values or drive again;
+* **note**: for information; the verdict does not change.
 
-*odocal inspect* finds many of them before anything is calibrated. Times in the sentences are
-seconds since the start mark.
+*odocal inspect* finds many of these before a calibration. Times in the texts are seconds since the
+start mark.
 """
 WEIGHTS = {Verdict.REJECTED: 'rejects', Verdict.CAUTION: 'caution', Verdict.ACCEPTED: 'note'}
 # section: code: when it appears and what it means
 MEANINGS: dict[str, dict[Code, str]] = {
-    'The data that came': {
-        Code.NO_IMU: 'No usable Imu message lies between the marks, or all its turn rates are '
-        'zero. Without them there is no track.',
-        Code.NO_ACCELEROMETER: 'Every acceleration of the Imu is zero, NaN, or said to be none '
-        '(`linear_acceleration_covariance[0]` of -1), as of a yaw rate on a bus. The scale comes '
-        'from gyro, counter and fixes, with 0.05 % in its sigma for slopes, which are not '
-        'observed. Accelerations are not measured, so yaw and pitch mounting angle, slips and '
-        'reversing are not determined.',
-        Code.NO_ODOMETER: 'No usable odometer message lies between the marks: a wrong topic, a '
-        'type that is read differently, or a driver that is not running.',
-        Code.NO_FIX: 'No position lies between the marks, or none near one of the two marks.',
-        Code.FIXES_UNUSABLE: 'There are fixes, but each one is without a position, of a status '
-        'below `gnss.min_status`, or worse than `gnss.max_sigma`.',
-        Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or a value that no sensor '
-        'gives, stand alone far from their neighbours, or are fixes far from all others. They '
-        'were left out.',
-        Code.ROWS_DAMAGED: 'Several messages of a topic hold values beyond any sensor, or, near '
-        'such ones, far from those beside them: the recording itself is damaged. Others there '
-        'may be wrong without showing it, so the rows about each clump were left out too.',
-        Code.STAMPS_NOT_RISING: 'Stamps of one topic repeat or step back. The fewest messages '
-        'were left out that leave the rest in order.',
-        Code.IMU_GAP: 'The Imu is silent, or repeats one value, for longer than `leg.max_gap`. '
-        'How the vehicle turned meanwhile is lost, and with it the track.',
-        Code.LEG_CUT: 'The Imu was silent for longer than `leg.max_gap`: the leg is cut there, '
-        'and its parts are calibrated as legs and combined. A part that does not carry, as one of '
-        'a few seconds, is left out; where none does, the leg is rejected (`IMU_GAP`).',
+    'Input data': {
+        Code.NO_IMU: 'There is no usable IMU message between the marks, or all turn rates are '
+        'zero. Without turn rates there is no track.',
+        Code.NO_ACCELEROMETER: 'Every acceleration of the IMU is zero, NaN, or marked as missing '
+        '(`linear_acceleration_covariance[0]` of -1), as for a yaw rate from a bus. The scale is '
+        'estimated from gyro, odometer and fixes, with 0.05 % in its sigma for unmodelled '
+        'slopes. Yaw and pitch mounting angle, slips and reversing are not determined without '
+        'accelerations.',
+        Code.NO_ODOMETER: 'There is no usable odometer message between the marks: a wrong topic, '
+        'a wrong type, or a driver that is not running.',
+        Code.NO_FIX: 'There is no position between the marks, or none near one of the two marks.',
+        Code.FIXES_UNUSABLE: 'There are fixes, but each one has no position, a status below '
+        '`gnss.min_status`, or a sigma above `gnss.max_sigma`.',
+        Code.BAD_ROWS_DROPPED: 'Some messages have no stamp, hold NaN or an impossible value, '
+        'are isolated outliers, or are fixes far from all others. They were left out.',
+        Code.ROWS_DAMAGED: 'Several messages of a topic hold impossible values, or are outliers '
+        'next to such messages: the recording itself is damaged. Other messages may be damaged '
+        'without a visible sign, so messages near each group were left out too.',
+        Code.STAMPS_NOT_RISING: 'Stamps of one topic repeat or step back. The smallest number of '
+        'messages was left out so that the stamps of the others increase.',
+        Code.IMU_GAP: 'The IMU is silent, or repeats one value, for longer than `leg.max_gap`. '
+        'The turns of the vehicle in this time are unknown, so the track is lost.',
+        Code.LEG_CUT: 'The IMU was silent for longer than `leg.max_gap`. The leg is cut there; '
+        'its sections are calibrated as legs and combined. A section too short to calibrate is '
+        'left out. If no section is long enough, the leg is rejected (`IMU_GAP`).',
         Code.TOPIC_GAP: 'Odometer or fixes are silent for more than five of their usual '
-        'intervals, or the odometer begins late or ends early. Travel across the gap is bridged '
-        'and its doubt is in the sigma.',
-        Code.CLOCKS_DIFFER: 'The stamps of a topic are more than 0.5 s from those of the Imu that '
-        'came at the same moment, or a clock was set during the leg. Positions and travel would '
-        'be joined at the wrong times.',
-        Code.DELAY_SEEN: 'Where the vehicle speeds up and slows down, the stamps of one sensor '
-        'were found late or early against the others, by more than three sigmas and by enough to '
-        'matter at the speed driven. The smoother estimates the delay and allows for '
-        'it; other software that joins these sensors does not. Where no method estimates it, an '
-        'odometer is named that would look like a slipping wheel only because it is late, or '
-        'because its speed is low-pass filtered.',
-        Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then came in a burst that '
-        'made up for it: they were held up on the way, and their stamps, taken on arrival, are '
-        'late. They were put where the rhythm of the sender has them, or where the travel before '
-        'and after the burst does, and it is no wheel slip.',
-        Code.COUNTER_RESET: 'The counter jumps in a way that no rollover explains: it was reset '
-        'or lost power. What was driven in that moment is guessed, with a sigma.',
-        Code.COUNTER_ROLLOVER: 'The counter reached its largest number and began anew. That is '
-        'undone exactly.',
-        Code.SPEED_COARSE: 'All speeds sent are multiples of one step, such as 1 km/h. Truncated, '
-        'they are half a step too low on the mean, rounded they are not, and the steps do not say '
-        'which. The smoother uses the moments at which the speed passes from one step to the '
-        'next, and finds which; the sigma of the other methods holds half a step.',
+        'intervals, or the odometer starts late or ends early. Travel across the gap is '
+        'interpolated; its uncertainty is part of the sigma.',
+        Code.CLOCKS_DIFFER: 'The stamps of a topic differ by more than 0.5 s from the stamps of '
+        'IMU messages that arrived at the same time, or a clock was set during the leg. '
+        'Positions and travel would be combined at wrong times.',
+        Code.DELAY_SEEN: 'While the vehicle accelerates and brakes, the stamps of one sensor are '
+        'late or early relative to the others, by more than three sigmas and by enough to matter '
+        'at this speed. The smoother estimates the delay and accounts for it; other software '
+        'that combines these sensors does not. Without an estimated delay, this reason names an '
+        'odometer that would look like a slipping wheel only because it is late or low-pass '
+        'filtered.',
+        Code.ODOMETER_LATE: 'Odometer messages stopped for a moment and then arrived in a burst '
+        'with the missing travel: they were delayed in transport, and their stamps, taken at '
+        "arrival, are late. They were moved to the sender's rhythm, or to the times that match "
+        'the travel before and after the burst. This is not wheel slip.',
+        Code.COUNTER_RESET: 'The counter has a jump that no rollover explains: it was reset or '
+        'lost power. The travel at this moment is interpolated, with a sigma.',
+        Code.COUNTER_ROLLOVER: 'The counter reached its largest number and started again. This '
+        'is corrected exactly.',
+        Code.SPEED_COARSE: 'All published speeds are multiples of one step, such as 1 km/h. If '
+        'truncated, they are half a step too low on average; if rounded, they are not. The '
+        'values alone do not show which. The smoother uses the times of the step transitions and '
+        'estimates which; the sigma of the other methods includes half a step.',
         Code.SPEED_ON_CHANGE: 'The speed repeats one value until it has changed by a step: it '
-        'lags while the vehicle speeds up or brakes. At least 30 % of the moving rows repeat the '
-        'one before, and the least change is more than 0.6 of the tenth percentile of all.',
-        Code.SPEED_FILTERED: 'Over intervals of a second the odometer departs from the vehicle as '
-        'its acceleration changes, which a low-pass filter of the speed does and wheel slip does '
-        'not. Many speed signals of cars are filtered over 0.2 to 0.5 s. Slip is what is left.',
-        Code.COUNTER_COARSE: 'There are few counts a metre, so that the way is known to a count '
-        'at each moment. Over a long drive that is little, and the sigma holds it; what happens '
-        'within a few metres, such as a short slip, does not show.',
-        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter went on counting up. '
-        'Where the Imu shows it, off a stop, that stretch was counted backwards.',
-        Code.ODOMETER_REVERSED: 'The track runs against the fixes by half a turn: positive counts '
-        'mean backwards, or the Imu faces backwards. Or speeding up pushes the Imu backwards.',
-        Code.ODOMETER_STILL: 'The fixes move on, the counter stays: from the start, or for 100 m '
-        'and more of the drive.',
-        Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro turns much farther or faster than '
-        'a vehicle does: g, deg/s or another unit.',
-        Code.IMU_LOOKS_Z_DOWN: 'Gravity shows on -z, as on an Imu whose axes are '
-        'forward-right-down. It was turned over for this result.',
-        Code.IMU_AXES: 'Gravity shows on another axis than z, or speeding up pushes the Imu to a '
-        'side: the body frame is not forward-left-up.',
-        Code.IMU_WORSE_THAN_GRADE: 'The Imu errs more than its grade. The smoother takes what the '
-        'drive shows instead; what rests on the grade alone, as the sigmas of the other methods, '
-        'is too small.',
-        Code.IMU_AXES_SKEW: 'Axes of the Imu are farther from right angles than its grade has '
-        'it. The fit holds that; a drawing of the housing is worth the less.',
-        Code.LEVER_ARM_OFF: 'Where the vehicle turns and leans, a sensor moves as if it sat '
-        'decimetres from where the settings have it. Sliding in turns is not modelled: of a '
-        'vehicle that steers by it the point found is where it slides least, not where the wheel '
-        'is.',
-        Code.GYRO_SIGN: 'Where the fixes turn left the gyro turns right.',
-        Code.BAG_TRUNCATED: 'A recording was not ended properly. What the file holds was read.',
+        'lags while the vehicle accelerates and brakes. Limits: at least 30 % of the moving '
+        'messages repeat the one before, and the smallest change exceeds 0.6 of the tenth '
+        'percentile of all changes.',
+        Code.SPEED_FILTERED: 'Over intervals of a second the odometer deviates from the vehicle '
+        'whenever the acceleration changes. A low-pass filter of the speed does this, wheel slip '
+        'does not. Many speed signals of cars are filtered over 0.2 to 0.5 s. Only the remaining '
+        'deviation is reported as slip.',
+        Code.COUNTER_COARSE: 'There are few counts per metre, so the distance has the resolution '
+        'of one count at each time. Over a long drive this error is small and part of the sigma. '
+        'Events within a few metres, such as a short slip, cannot be detected.',
+        Code.REVERSING_UNSIGNED: 'The vehicle reversed, but the counter counted up. Where the '
+        'IMU shows the reversing, after a stop, this section was counted backwards.',
+        Code.ODOMETER_REVERSED: 'The track runs opposite to the fixes: positive counts mean '
+        'backwards, or the IMU x axis points backwards. Accelerations then point backwards in '
+        'the IMU frame.',
+        Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
+        '100 m or more of the drive.',
+        Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro shows much larger turns than the '
+        'vehicle can make: the unit is g, deg/s or another one.',
+        Code.IMU_LOOKS_Z_DOWN: 'Gravity is on -z, as for an IMU with forward-right-down axes. '
+        'For this result the IMU was rotated by 180 deg about x.',
+        Code.IMU_AXES: 'Gravity is on another axis than z, or accelerations point sideways in '
+        'the IMU frame: the body frame is not forward-left-up.',
+        Code.IMU_WORSE_THAN_GRADE: 'IMU errors are larger than its grade. The smoother uses the '
+        'noise estimated from the drive instead. Sigmas that only rest on the grade, such as '
+        'those of the other methods, are too small.',
+        Code.IMU_AXES_SKEW: 'The axes of the IMU deviate more from perpendicular than its grade. '
+        'The fit accounts for it; mounting angles measured on the housing differ accordingly.',
+        Code.LEVER_ARM_OFF: 'In turns and while leaning, a sensor moves as if it were decimetres '
+        'from its configured position. Sliding in turns is not modelled: for a vehicle with skid '
+        'steering the estimated point is where it slides least, not the position of the wheel.',
+        Code.GYRO_SIGN: 'The gyro turns opposite to the course of the fixes.',
+        Code.BAG_TRUNCATED: 'A recording was not closed properly. All readable messages were '
+        'used.',
         Code.STOP_MARK_MISSING: 'The node marked the start of the leg, but the recording ends '
-        'before its stop mark: a node or a computer that was killed, or a bag stopped too early. '
-        'The leg was taken to end at the last sample that all topics have, where the vehicle need '
-        'not stand.',
-        Code.FRAME_REPLACED: 'The header of the Imu names a frame that TF does not take (TF takes '
-        'letters, digits and `_ . / -`, and no `/` at the beginning). The files for TF name '
-        'another one, as the sentence says.',
-        Code.COVARIANCE_UNKNOWN: 'Fixes come without a covariance, or with zero or NaN in it; '
-        '`gnss.default_sigma` was taken.',
-        Code.FIXES_NOISIER_THAN_SAID: 'The fixes stray from the track farther than the covariance '
-        'that they claim. The sigma was made to match what is seen.',
-        Code.VELOCITY_UNUSABLE: 'Displacements by the velocity were compared with those between '
-        'fixes, 10 s apart. They differ by more than 10 % in size or direction. Usual causes are '
-        'north and east swapped, axes of the vehicle, a speed without direction, and km/h.',
+        'before its stop mark: the node or the computer stopped, or the bag was stopped too '
+        'early. The leg ends at the last sample that all topics have; the vehicle may be moving '
+        'there.',
+        Code.FRAME_REPLACED: 'The frame in the IMU header is not valid in TF (valid: letters, '
+        'digits and `_ . / -`, without a leading `/`). The files for TF contain the frame named '
+        'in the text.',
+        Code.COVARIANCE_UNKNOWN: 'Fixes have no covariance, or zero or NaN in it; '
+        '`gnss.default_sigma` is used.',
+        Code.FIXES_NOISIER_THAN_SAID: 'The fixes deviate from the track more than their '
+        'covariance states. Their sigma was increased to match the residuals.',
+        Code.VELOCITY_UNUSABLE: 'Displacements from the GNSS velocity were compared with the '
+        'displacements between fixes, 10 s apart. They differ by more than 10 % in size or '
+        'direction. Usual causes: north and east swapped, vehicle axes, a speed without '
+        'direction, or km/h.',
     },
     'The drive': {
-        Code.NO_STANDSTILL: 'There is no rest before the start mark. Level and gyro bias then '
-        'come from the first half minute of driving and from the grade, with larger sigmas.',
-        Code.LEG_TOO_SHORT: 'Less than `leg.min_distance` was driven, the fixes stay in one '
-        'place, or the fixes are too coarse for so short a way.',
-        Code.CHORD_TOO_SHORT: 'The straight line between start and end is less than a fifth of '
-        'the way driven: a loop, or there and back. End points say nothing about such a way.',
-        Code.SPEED_TOO_LOW: 'The vehicle never reached `leg.min_speed`. At a crawl, latency and '
-        'coarse counts weigh most and the tyre rolls otherwise than on the road.',
-        Code.LEG_NOT_STRAIGHT: 'More than a tenth of the way was driven in turns '
-        '(`leg.max_yaw_rate`), where wheels run ways of their own.',
-        Code.TRACK_MISMATCH: 'Even with the calibrated values the track is farther from the fixes '
-        'than noise, drift and 0.2 % of the distance explain. Something else is wrong. Or the '
-        'direction of travel flips by half a turn from one piece of the drive to the next, and '
-        'the fixes stay back: the vehicle reversed, and the odometer counted upwards.',
-        Code.CHECK_WORSE: 'Of pieces of 100 m, 500 m or 1 km, each begun anew at a fix, the track '
-        'with the calibrated values ends farther from the fixes than the one without, beyond '
-        'chance. Both have the same attitude, so the values are to blame: slip, bad fixes or a '
-        'delay went into them.',
-        Code.WHEEL_SLIP: 'Over a few seconds the wheel turned farther, or less far, than the '
-        'vehicle accelerated, or the two wheels do not fit the turn.',
-        Code.SCALE_VARIES: 'Tyres grow with speed and as they warm: the scale is not one number '
-        'in this leg. What is given is its mean over the way driven; `scale_by_speed` and '
+        Code.NO_STANDSTILL: 'There is no standstill before the start mark. Level and gyro bias '
+        'are then estimated from the first half minute of driving and from the grade, with '
+        'larger sigmas.',
+        Code.LEG_TOO_SHORT: 'The distance is below `leg.min_distance`, the fixes do not move, or '
+        'the fixes are too coarse for this distance.',
+        Code.CHORD_TOO_SHORT: 'The straight line from start to end is less than a fifth of the '
+        'path length: a loop, or there and back. The end points then do not constrain the '
+        'calibration.',
+        Code.SPEED_TOO_LOW: 'The vehicle never reached `leg.min_speed`. At very low speed, '
+        'latency and count resolution have the largest effect, and the rolling radius of the '
+        'tyre differs.',
+        Code.LEG_NOT_STRAIGHT: 'More than a tenth of the path is in turns (`leg.max_yaw_rate`), '
+        'where each wheel has its own path length.',
+        Code.TRACK_MISMATCH: 'Even with the calibrated values the track deviates from the fixes '
+        'by more than noise, drift and 0.2 % of the distance. There is another error. Or the '
+        'direction of travel changes by 180 deg between two sections while the fixes move '
+        'backwards: the vehicle reversed, and the odometer counted up.',
+        Code.CHECK_WORSE: 'In sections of 100 m, 500 m or 1 km, each started at a fix, the '
+        'calibrated track ends significantly farther from the fixes than the uncalibrated one. '
+        'Both use the same attitude, so the calibrated values are wrong: they include slip, bad '
+        'fixes or a delay.',
+        Code.WHEEL_SLIP: 'Within a few seconds the wheel travelled more or less than the vehicle '
+        'accelerated, or the wheel difference does not match the turn.',
+        Code.SCALE_VARIES: 'The tyre radius grows with speed and temperature: the scale is not '
+        'constant in this leg. The stated value is its mean over the path; `scale_by_speed` and '
         '`scale_by_time` are its slopes.',
-        Code.FIXES_SMOOTHED: 'Positions follow accelerations as a filter does, later and rounder '
-        'than a delay alone would have them, or overshoot as a filter of position and velocity '
-        'does.',
-        Code.FIXES_FOLLOW_ODOMETER: 'Over seconds the fixes travel by another scale than over '
-        'minutes, as those of a receiver do that is fused with a wheel speed of its own. Limits: '
-        '5 of its sigmas and 0.05 %.',
+        Code.FIXES_SMOOTHED: 'Positions follow accelerations like a filter output: later and '
+        'smoother than with a delay alone. Or they overshoot, like a filter of position and '
+        'velocity.',
+        Code.FIXES_FOLLOW_ODOMETER: 'The scale of the fixes over seconds differs from their '
+        'scale over minutes. This happens if the receiver fuses the fixes with a wheel speed of '
+        'its own. Limits: 5 sigmas of this difference and 0.05 %.',
     },
     'The estimate': {
-        Code.YAW_NOT_SEPARABLE: 'End points see the sum of initial heading and yaw mounting '
-        'angle. The only heading here is the course over ground, or one less certain than the '
-        'yaw is asked to be. The scale is not touched by it.',
-        Code.GYROCOMPASS_REFUSED: 'The heading was to come from the turning of the Earth, but the '
-        'gyro bias is too large or the rest too short for it, or what the gyro shows at rest is '
-        'not that turning: its grade is set too good.',
-        Code.HEADING_UNAVAILABLE: 'The heading source that was asked for gave nothing usable; the '
-        'course over ground was taken.',
-        Code.PITCH_NOT_DETERMINED: 'The fixes give no height, or none good enough: the pitch is '
-        'not given.',
-        Code.SCALE_FAR_FROM_NOMINAL: 'The scale is farther from the nominal one than '
+        Code.YAW_NOT_SEPARABLE: 'The end points only constrain the sum of initial heading and '
+        'yaw mounting angle. The only heading is the course over ground, or one with an '
+        'uncertainty above the yaw limit. The scale is not affected.',
+        Code.GYROCOMPASS_REFUSED: 'The heading should come from the Earth rate, but the gyro '
+        'bias is too large or the standstill too short for it. Or the turn rate at rest does not '
+        'match the Earth rate: the gyro is worse than its grade.',
+        Code.HEADING_UNAVAILABLE: 'The configured heading source has no usable data; the course '
+        'over ground is used.',
+        Code.PITCH_NOT_DETERMINED: 'The fixes have no height, or heights that are too '
+        'inaccurate: the pitch is not stated.',
+        Code.SCALE_FAR_FROM_NOMINAL: 'The scale differs from its nominal value by more than '
         '`odometer.max_scale_deviation`: a unit, a gear or a wheel size is not as configured.',
-        Code.YAW_FAR_FROM_NOMINAL: 'The yaw mounting angle is more than 20 deg from the nominal '
-        'one: the Imu sits otherwise than configured, or the heading is wrong.',
-        Code.SCALE_SIGMA_TOO_LARGE: 'The sigma of the scale is larger than '
-        '`verdict.max_scale_sigma`. The value is right within it. The error budget names what '
-        'makes it so large.',
-        Code.YAW_SIGMA_TOO_LARGE: 'The sigma of the yaw is larger than `verdict.max_yaw_sigma`. '
-        'The value is right within it.',
-        Code.PLANES_DISAGREE: 'The scale by the textbook ratio of chords, in a map plane or on '
-        'the ellipsoid, is not the one that was solved for: a check of the computation.',
+        Code.YAW_FAR_FROM_NOMINAL: 'The yaw mounting angle differs by more than 20 deg from its '
+        'nominal value: the IMU orientation is not as configured, or the heading is wrong.',
+        Code.SCALE_SIGMA_TOO_LARGE: 'The uncertainty of the scale is above '
+        '`verdict.max_scale_sigma`. The value is correct within its uncertainty. The error '
+        'budget lists the largest sources.',
+        Code.YAW_SIGMA_TOO_LARGE: 'The uncertainty of the yaw is above `verdict.max_yaw_sigma`. '
+        'The value is correct within its uncertainty.',
+        Code.PLANES_DISAGREE: 'The scale as ratio of chords, in a map plane or on the ellipsoid, '
+        'differs from the estimated scale: a check of the computation.',
     },
     'Left and right wheel': {
         Code.ODOMETER_CHOSEN: 'A message holds several values (joints, or an array) and no '
-        'setting says which are the wheels. Joints were chosen by their names; of two values '
-        'of unknown sides the mean is taken, and left and right are not estimated.',
-        Code.WHEELS_NOT_SEPARABLE: 'What was driven does not tell the left wheel from the right; '
-        'on a straight line only their mean is seen.',
-        Code.TRACK_WIDTH_NOT_DETERMINED: 'The distance between the wheels shows in turns only, '
-        'and the heading at the end is about that at the start.',
-        Code.TRACK_WIDTH_FAR_FROM_GIVEN: 'The turns of the wheels against the gyro make a track '
-        'width that is more than 6 % from the one given: one of the two is wrong, and what a '
-        'controller makes of turns with it.',
-        Code.WHEELS_SWAPPED: 'In left turns the wheel named left goes farther. It is the outer '
-        'one, the right one.',
-        Code.WHEEL_DEAD: 'One wheel does not count, or sends nothing, while the other turns.',
+        'setting selects the wheels. Joints were selected by name. For two values with unknown '
+        'sides the mean is used, and left and right are not estimated.',
+        Code.WHEELS_NOT_SEPARABLE: 'Left and right wheel are not separately observable on this '
+        'drive; on a straight line only their mean is observable.',
+        Code.TRACK_WIDTH_NOT_DETERMINED: 'The track width is only observable in turns, and the '
+        'heading at the end is nearly that at the start.',
+        Code.TRACK_WIDTH_FAR_FROM_GIVEN: 'The track width estimated from wheel difference and '
+        'gyro differs by more than 6 % from the configured one. One of the two is wrong, and so '
+        'are turns that a controller computes from it.',
+        Code.WHEELS_SWAPPED: 'The wheel configured as left travels farther in left turns. It is '
+        'the outer wheel, the right one.',
+        Code.WHEEL_DEAD: 'One wheel does not count, or has no messages, while the other turns.',
         Code.WHEEL_REVERSED: 'One wheel counts down while the other counts up.',
-        Code.WHEEL_COUNTERS_DIFFER: 'The two counters are not alike: another span, another kind, '
-        'or one counts much more than the other.',
-        Code.SEARCH_WIDENED: 'The best values lay on the edge of the range that was searched, '
-        'which was then widened about them.',
-        Code.SEARCH_NOT_SETTLED: 'The search ended before its values stood still, or away from '
-        'what least squares find.',
+        Code.WHEEL_COUNTERS_DIFFER: 'The two counters differ: another modulus, another kind, or '
+        'one counts much more than the other.',
+        Code.SEARCH_WIDENED: 'The best values were on the edge of the search range, which was '
+        'then widened around them.',
+        Code.SEARCH_NOT_SETTLED: 'The search ended before its values converged, or away from the '
+        'least-squares solution.',
     },
-    'All the samples at once': {
-        Code.NOT_CONVERGED: 'The equations of the drive could not be solved, or their solution is '
-        'one that no IMU can have. There are no values.',
-        Code.SCALE_NOT_DETERMINED: 'The drive says too little about the scale to state one.',
-        Code.YAW_NOT_DETERMINED: 'The drive says too little about the yaw to state one.',
-        Code.PARAMETER_NOT_DETERMINED: 'A further value, such as a lever arm or a delay, cannot '
-        'be told from this drive; it stays as configured.',
-        Code.MODEL_MISMATCH: 'What is left over after the fit is larger, or more regular, than '
-        'the noise that was assumed. Of the two-point method: between its ends the track bends '
-        "away from the fixes, by more than the gyro's grade and slow errors of the fixes would "
-        'have it.',
-        Code.METHOD_REJECTED: 'A method that goes before another, or alone tells left from right '
-        'wheel, found that its values are not to be used; its first reason is given. The result '
-        'is by the others.',
-        Code.METHOD_FAILED: 'A method came upon something that it was not written for and broke '
-        'off. Its values are unknown; the leg and the other methods go on. The command names a '
-        'file with the trace.',
-        Code.METHODS_DISAGREE: 'Two methods give values for the same leg that differ by more than '
-        'three sigmas of their difference.',
+    'Smoother': {
+        Code.NOT_CONVERGED: 'The equations of the drive could not be solved, or the solution is '
+        'impossible for an IMU. There are no values.',
+        Code.SCALE_NOT_DETERMINED: 'The uncertainty of the scale is too large to state a value.',
+        Code.YAW_NOT_DETERMINED: 'The uncertainty of the yaw mounting angle is too large to '
+        'state a value.',
+        Code.PARAMETER_NOT_DETERMINED: 'A further parameter, such as a lever arm or a delay, is '
+        'not observable on this drive; the configured value is used.',
+        Code.MODEL_MISMATCH: 'The residuals of the fit are larger, or more correlated, than the '
+        'noise model predicts. For the two-point method: between its end points the track '
+        'deviates from the fixes by more than the grade of the gyro and time-correlated fix '
+        'errors explain.',
+        Code.METHOD_REJECTED: 'A method that takes precedence, or the only one that separates '
+        'left and right wheel, rejected its own values; its first reason is given. The result '
+        'comes from the other methods.',
+        Code.METHOD_FAILED: 'A method stopped with an internal error. It has no values; the '
+        'other methods are not affected. The command prints the path of a file with the trace.',
+        Code.METHODS_DISAGREE: 'Two methods give values for the same leg that differ by more '
+        'than three sigmas of their difference.',
     },
     'Several legs': {
-        Code.LEGS_DISAGREE: 'The legs scatter more than their sigmas allow; in what, and of the '
-        'smoother which leg most, is said. The sigma of the combination holds that.',
-        Code.SCALE_CHANGED: 'With leg.automatic: a leg has another scale than those before, by '
-        'more than 3 sigma of the difference, the walk by verdict.scale_drift_per_day among it. '
-        'From that leg on the scale is another one; what legs share besides goes on.',
+        Code.LEGS_DISAGREE: 'The legs differ by more than their uncertainties. The text names '
+        'the parameter and, for the smoother, the leg that differs most. The sigma of the '
+        'combination includes this.',
+        Code.SCALE_CHANGED: 'With leg.automatic: the scale of a leg differs from that of the '
+        'earlier legs by more than 3 sigma of the difference, including the random walk of '
+        'verdict.scale_drift_per_day. A new scale starts at this leg; the other shared '
+        'parameters continue.',
         Code.LEGS_UNLIKE: 'Two legs differ by more than 5 % in scale or 5 deg in yaw mounting, '
-        'far beyond their sigmas, or their odometers are of different kinds (counts here, speeds '
-        'there). No tyre does that: they are of two vehicles, or a setting or the mounting was '
-        'changed in between. A mean of them would be of no vehicle.',
-        Code.LEGS_OVERLAP: 'Two legs share time, so that they are not two opinions; the later one '
-        'was not counted.',
+        'far more than their sigmas, or their odometers have different units (one in counts, one '
+        'in speeds). Tyres do not explain this: there are two vehicles, or a setting or the '
+        'mounting was changed in between. A mean would be valid for neither.',
+        Code.LEGS_OVERLAP: 'Two legs overlap in time, so they are not independent; the later one '
+        'is not used.',
         Code.LEG_REJECTED: 'A leg, or a method on it, was rejected and left out of the '
         'combination.',
         Code.MORE_LEGS_NEEDED: 'There are fewer good legs than `verdict.min_legs`.',
-        Code.NO_METHOD: 'No method could be run on any leg.',
+        Code.NO_METHOD: 'No method could run on any leg.',
     },
 }
 

@@ -8,10 +8,10 @@
 # the License.
 
 """
-Make an animated picture of ``odocal watch`` from a running node.
+Create an animated picture of ``odocal watch`` from a running node.
 
-``python -m tools.watch_svg --out docs/pictures/watch.svg``: start it before the leg; it ends when
-the result is there. Browsers and code hosts play the file without a script.
+``python -m tools.watch_svg --out docs/pictures/watch.svg``: start it before the leg; it ends with
+the result. Browsers and code hosts play the file without a script.
 """
 
 import argparse
@@ -25,9 +25,9 @@ from rich.console import Console
 from odocal_ros.live.panel import panel
 from odocal_ros.live.status_listener import StatusListener
 
-FRAME_S = 1.5       # judgement: s that a frame is shown
-COLUMNS = 88        # judgement: of the panel
-# of rich's export_svg: the lines of a terminal, without its window and its fonts from a server
+FRAME_S = 1.5       # judgement: s per frame
+COLUMNS = 88        # judgement: width of the panel
+# for export_svg of rich: terminal lines, without its window and its fonts from a server
 FORMAT = """<style>.{unique_id}-matrix {{ font: {char_height}px monospace;
 line-height: {line_height}px; }}
 {styles}</style>
@@ -42,7 +42,7 @@ aria-label="odocal watch during a drive">
 
 
 def animated(frames: list[Any]) -> str:
-    """Return an SVG that shows renderables of rich one after the other, again and again."""
+    """Return an SVG that shows renderables of rich in sequence, in a loop."""
     inside, most = [], 0
     for number, frame in enumerate(frames):
         console = Console(record=True, width=COLUMNS, file=io.StringIO())
@@ -51,21 +51,21 @@ def animated(frames: list[Any]) -> str:
         svg = console.export_svg(code_format=FORMAT, unique_id=f'f{number}')
         inside.append(f'<g class="frame" style="animation-delay: {number * FRAME_S}s">'
                       f'{svg}</g>\n')
-    height, line, column = 20, 24.4, 0.61      # rich's: of a character, a line; width over height
+    height, line, column = 20, 24.4, 0.61      # of rich; column: width over height
     head = HEAD.format(width=COLUMNS * height * column + 16, height=most * line + 16,
                        cycle=FRAME_S * len(frames), share=100 / len(frames))
     return head + ''.join(inside) + '</svg>\n'
 
 
 def watched(node: str, period: float) -> list[Any]:
-    """Return panels of a node from the begin of a leg to its result, every ``period`` s."""
+    """Return panels of a node from the start of a leg to its result, every ``period`` s."""
     frames: list[Any] = []
     last, state = 0.0, ''
     with StatusListener(node) as listener:
         for level, status, hint in listener:
             shown, now = panel(level, node, status, hint), time.monotonic()
             if status['state'] == state and state in ('calibrated', 'rejected'):
-                # the hint is a topic of its own: that of the second status is the result's
+                # the hint is a separate topic: the result has the hint of the second status
                 return [*frames[:-1], *[shown] * 4]
             if (status['state'] != state or now - last >= period) and (
                     frames or status['state'] == 'recording'):
@@ -75,7 +75,7 @@ def watched(node: str, period: float) -> list[Any]:
 
 
 def main() -> None:
-    """Watch and write."""
+    """Record the panels and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--out', type=Path, required=True)
     parser.add_argument('--node', default='/calibrator')

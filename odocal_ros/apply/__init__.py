@@ -7,4 +7,4 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A calibration at work: counter and Imu in, pose and twist with their covariance out."""
+"""A calibration at work: counter and IMU in, pose and twist with their covariance out."""

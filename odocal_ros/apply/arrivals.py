@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Which stamps of one topic odometry believes: those that rise, near their time of arrival."""
+"""Accepted stamps of one topic in odometry: increasing and close to their arrival."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ class Arrivals:
     """
     The stamps of one topic against their arrival.
 
-    Lag is arrival less stamp. Its least value so far, slowly forgotten, tells how early a stamp
+    Lag is arrival less stamp. Its least value so far, slowly forgotten, shows how early a stamp
     may be: one further ahead is false, or the clock was set. ``anew`` is True once ODD_ROWS in
     turn are odd; ``odd_from`` is then the first of them in the last block.
     """
@@ -42,7 +42,7 @@ class Arrivals:
         self.lag_ns: float | None = None      # the least, arrival less stamp
 
     def believed(self, stamp_ns: Ints, received_ns: Ints) -> Bools:
-        """Return which rows of the next block have a stamp that can be reckoned with: (n,)."""
+        """Return a mask of rows of the next block with a usable stamp: (n,)."""
         good = np.zeros(len(stamp_ns), bool)
         self.odd_from = self.dropped = 0
         for k, (stamp, received) in enumerate(zip(stamp_ns.tolist(), received_ns.tolist(),

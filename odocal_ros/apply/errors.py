@@ -11,7 +11,7 @@
 How dead reckoning errs: covariance of position, attitude, sensors and calibration.
 
 True attitude is exp(phi) the reckoned one, in n (the odom frame); true rate (reading - bias) less
-g times itself; true way (1 + k) along an axis turned by m in b. Position, scale, mounting and gyro
+g times itself; true path (1 + k) on an axis turned by m in b. Position, scale, mounting and gyro
 scale are considered, never corrected: the pose does not jump, the calibration stands.
 """
 
@@ -30,12 +30,12 @@ BY_GRAVITY = [3, 4, 6, 7, 9, 10]    # observable by it, of a body nearly level: 
 BY_REST = np.r_[3:9]
 # judgement: m/sqrt(m) along, left, up, slip and slide of any road
 ROAD_PER_METRE = np.array([0.005, 0.01, 0.01])
-# rad/s, s; judgement: of a turn that may hide in a gap of the Imu; a shorter gap hides its cube
+# rad/s, s; judgement: of a turn that may hide in a gap of the IMU; a shorter gap hides its cube
 HIDDEN_IN_GAP, HIDING_GAP = 0.1, 0.1
-# m/s^2; judgement: of driving, that a second of odometer, or more, does not tell
+# m/s^2; judgement: of driving, that a second of odometer, or more, does not show
 SHAKING = 0.4
 # physical: rad/sqrt(s) of tilt where the Earth's turn, left in the gyro bias, turns with the
-# vehicle: 11 deg/h that stay alike for half a minute or so
+# vehicle: 11 deg/h constant for about half a minute
 EARTH_LEFT = 6e-4
 GRAVITY = 9.81    # m/s^2; physical: its last digits tilt nothing
 
@@ -44,7 +44,7 @@ class Errors:
     """
     The errors' covariance, (16, 16), and what stops and gravity say of them.
 
-    grade : of the Imu.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
+    grade : of the IMU.   tilt, bias_sigma : rad, rad/s, sigmas at the start.   earth_left : the
     Earth's turn is in the gyro's bias.
     """
 
@@ -67,8 +67,8 @@ class Errors:
         Carry the errors over an interval.
 
         T : s.   C_nb : (3, 3) in its middle.   way_n, turn_n : (3,) m, rad.
-        axes_n : (3, 3) columns forward, left, up.   doubt : m^2 of the way that are not certain.
-        gaps : (k,) s, parts of the interval of which the Imu tells nothing.
+        axes_n : (3, 3) columns forward, left, up.   doubt : m^2, variance of uncertain travel.
+        gaps : (k,) s, parts of the interval without IMU data.
         """
         F = np.eye(N)
         cross = skew(way_n)
@@ -89,17 +89,17 @@ class Errors:
         self.cov = cov
 
     @staticmethod
-    def road(way: float) -> Floats:
-        """Return what slip and slide vary a way by, along, left and up, m^2."""
-        variance: Floats = ROAD_PER_METRE**2 * abs(way)
+    def road(path_length: float) -> Floats:
+        """Return the variance of travel by slip and sideslip along, left and up, m^2."""
+        variance: Floats = ROAD_PER_METRE**2 * abs(path_length)
         return variance
 
-    def lost(self, way: float) -> None:
-        """Take in a way, m, of which nobody knows where it led."""
-        self.cov[range(3), range(3)] += way**2
+    def lost(self, path_length: float) -> None:
+        """Add travel, m, of unknown direction."""
+        self.cov[range(3), range(3)] += path_length**2
 
     def turned(self, variance: Floats) -> None:
-        """Take in a turn, (3, 3) rad^2 in n, of which nobody knows how far it led."""
+        """Add the variance of an unknown turn, (3, 3) rad^2 in n."""
         self.cov[PHI, PHI] += variance / max(1.0, float(np.trace(variance)) / np.pi**2)
 
     def by_gravity(self, C_nb: Floats, off_n: Floats, T: float, sigma: float) -> Floats | None:

@@ -10,7 +10,7 @@
 """
 Odometry as the samples come: screened streams, a start, and the path from it on.
 
-Where the path cannot be gone on with, it begins anew, at its origin, and says so.
+If the path cannot be continued, it restarts at its origin, with a note.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import CLOCK_APART
 
-BEGINS_ANEW = 'odometry begins anew'      # so begins each sentence that says it
+BEGINS_ANEW = 'odometry restarts'      # so begins each sentence that says it
 
 
 class Odometry:
@@ -36,7 +36,7 @@ class Odometry:
     Turns samples into poses.
 
     ``feed`` blocks as they come, ``poses`` gives what they allow: up to the last time that the
-    odometer and the Imu but for its newest sample have reached.
+    odometer and the IMU but for its newest sample have reached.
     """
 
     def __init__(self, vehicle: Vehicle, config: ApplyConfig) -> None:
@@ -44,24 +44,24 @@ class Odometry:
         self.grade = grade_of(config.imu)
         self.restarts = 0
         self._first_ahead: float | None = None
-        self._told: list[str] = []
+        self._notes: list[str] = []
         self._anew()
 
-    def take_told(self) -> list[str]:
-        """Return what was found since the last call, in sentences."""
-        told = list(dict.fromkeys(self._told))
-        self._told.clear()
-        return told
+    def take_notes(self) -> list[str]:
+        """Return the findings since the last call, in sentences."""
+        notes = list(dict.fromkeys(self._notes))
+        self._notes.clear()
+        return notes
 
     def apart(self) -> float:
-        """Return by how many s an odometer's clock is ahead of the Imu's, 0 if it may be delay."""
+        """Return by how many s an odometer's clock is ahead of the IMU's, 0 if it may be delay."""
         # arrivals of a bag that is played fast are of a coarser time
         fast = max((one.rate for one in self._arrivals.values()), default=1.0)
         ahead = self._ahead()
         return ahead if abs(ahead) > CLOCK_APART * fast else 0.0
 
     def _ahead(self) -> float:
-        """Return by how many s an odometer's stamps are ahead of the Imu's, 0 unknown."""
+        """Return by how many s an odometer's stamps are ahead of the IMU's, 0 unknown."""
         lags = {slot: one.lag_ns for slot, one in self._arrivals.items() if one.lag_ns is not None}
         imu_ns = lags.pop('imu', None)
         ahead = [imu_ns - lag for lag in lags.values()] if imu_ns is not None else []
@@ -70,12 +70,12 @@ class Odometry:
     def _begin_anew(self, why: str) -> None:
         """Begin where a first message would."""
         self.restarts += 1
-        self._told.append(f'{BEGINS_ANEW}, at its origin: {why}')
+        self._notes.append(f'{BEGINS_ANEW}, from the origin: {why}')
         self._anew()
 
     def _anew(self) -> None:
-        self.wheels = Wheels(self.vehicle, self.config, self._told)
-        self.imu = ImuStream(self.config, self._told)
+        self.wheels = Wheels(self.vehicle, self.config, self._notes)
+        self.imu = ImuStream(self.config, self._notes)
         self._arrivals: dict[str, Arrivals] = {}
         self._path: Reckoning | None = None
 
@@ -90,8 +90,8 @@ class Odometry:
             arrivals = self._arrivals[slot] = Arrivals()
             believed = arrivals.believed(block.stamp_ns, block.received_ns)
         if arrivals.dropped:
-            self._told.append(f'{slot}: {arrivals.dropped} messages dropped, whose stamps are not '
-                              f'those of their arrival (off by {arrivals.off_s:+.3g} s)')
+            self._notes.append(f'{slot}: {arrivals.dropped} messages dropped: their stamps differ '
+                              f'from their arrival times by {arrivals.off_s:+.3g} s')
         block = take(block, believed)
         if isinstance(block, OdometerSamples):
             self.wheels.feed(slot, block, form or COUNTER)
@@ -103,7 +103,7 @@ class Odometry:
         """Return the poses that what was fed since the last call allows."""
         apart = self.apart()
         if apart and self._path is not None:
-            self._begin_anew(f"the stamps of the odometer are {apart:+.3g} s from the Imu's")
+            self._begin_anew(f'odometer stamps differ from IMU stamps by {apart:+.3g} s')
         if self._path is None and not apart:
             self._path = self._begin()
         if self._path is None:
@@ -124,5 +124,5 @@ class Odometry:
             self._first_ahead = ahead
         # a clock that was set alone is now apart from the other by what nobody has calibrated
         delay = float(np.hypot(self.config.odometer.time_sigma, ahead - self._first_ahead))
-        return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._told,
+        return Reckoning(start, self.imu, self.wheels, self.vehicle, self.config, self._notes,
                          delay)

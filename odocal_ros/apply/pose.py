@@ -24,7 +24,7 @@ class Pose:
     """
     Where the vehicle is, and how it moved since the pose before.
 
-    stamp_ns : of the Imu.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
+    stamp_ns : of the IMU.   position : (3,) m of base_link in odom.   q : (4,) x y z w of
     base_link in odom.   velocity, rate : (3,) m/s, rad/s in base_link, of base_link.
     pose_cov, twist_cov : (6, 6); of the pose position and rotation about the axes of odom.
     """
@@ -38,7 +38,7 @@ class Pose:
     twist_cov: Floats
 
     def sound(self) -> bool:
-        """Return whether all is finite, and no variance negative."""
+        """Return True if all values are finite and no variance is negative."""
         return all(bool(np.isfinite(x).all()) for x in (
             self.position, self.q, self.velocity, self.rate, self.pose_cov, self.twist_cov)) and (
             bool((np.diag(self.pose_cov) >= 0).all() and (np.diag(self.twist_cov) >= 0).all()))
@@ -50,7 +50,7 @@ def pose_covariance(vehicle: Vehicle, errors: Errors, C_nb: Floats, arm_n: Float
     Return the covariance of position and rotation: (6, 6).
 
     C_nb, arm_n : as ``Errors.pose`` takes them.   along : m^2, what a count and the odometer's
-    delay hide along the way, at the moment.
+    delay along the path, at this time.
     """
     cov = errors.pose(C_nb, arm_n)
     forward_n = C_nb @ vehicle.forward_b
@@ -63,7 +63,7 @@ def twist_covariance(vehicle: Vehicle, errors: Errors, speed: float, rate: Float
     """
     Return the covariance of a mean twist over T s, of base_link: (6, 6).
 
-    speed : m/s, of the odometer's point.   rate : (3,) rad/s.   variance : m^2, of the way in T
+    speed : m/s, of the odometer's point.   rate : (3,) rad/s.   variance : m^2, of travel in T
     beside that of scale and road.
     """
     C_vb, grade = vehicle.C_vb, errors.grade

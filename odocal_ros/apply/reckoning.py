@@ -10,7 +10,7 @@
 """
 Dead reckoning from a start on: the calibration's own strapdown and sum, corrected at stops.
 
-From one Imu sample to the next attitude is turned by the calibration's rotation increments
+From one IMU sample to the next attitude is turned by the calibration's rotation increments
 (``nav/strapdown.py``) and travel summed by the trapezoid rule along the calibrated forward axis,
 as ``nav/dead_reckoning.py`` has it: with ``levelling`` off the path of equal samples, start
 attitude and bias is that of a replay. With it, the accelerometer holds the tilt, and stops the
@@ -38,9 +38,9 @@ from odocal_ros.settings.apply_config import ApplyConfig
 from odocal_ros.settings.levels import FASTEST
 
 # judgement, all in s: between corrections; that a speed is taken over; without odometer, after
-# which attitude goes on alone; without Imu, that hide motion
+# which attitude continues alone; without IMU, that hide motion
 CORRECTION_PERIOD, SPEED_SPAN, ODOMETER_SILENCE, IMU_HOLE = 1.0, 0.2, 10.0, 0.1
-HOLE_INTERVALS = 2.5      # judgement: usual intervals of the Imu, a longer one hides a turn
+HOLE_INTERVALS = 2.5      # judgement: usual intervals of the IMU, a longer one hides a turn
 # judgement: corrections in turn that force and motion disagree at, after which the attitude is
 # false; m/s^2 that the force is then as long as gravity to
 MOST_APART, AS_GRAVITY = 10, 1.0
@@ -55,9 +55,9 @@ class Reckoning:
     """
 
     def __init__(self, start: Start, imu: ImuStream, wheels: Wheels, vehicle: Vehicle,
-                 config: ApplyConfig, told: list[str], delay_sigma: float) -> None:
+                 config: ApplyConfig, notes: list[str], delay_sigma: float) -> None:
         self.imu, self.wheels, self.vehicle, self.config = imu, wheels, vehicle, config
-        self._told, self._delay_sigma, self.failed = told, delay_sigma, ''
+        self._notes, self._delay_sigma, self.failed = notes, delay_sigma, ''
         self.q, self.bias, self.errors = start.q_nb, start.gyro_bias, start.errors
         self.accel_bias = np.zeros(3)
         self.position = np.zeros(3)      # of the odometer's point, from where it began
@@ -75,15 +75,15 @@ class Reckoning:
         """Return the poses that what has come since the last call allows."""
         out: list[Pose] = []
         while not self.failed and (last := self._next()) is not None:
-            heard = self.imu.t[last] <= self.wheels.newest()
+            received = self.imu.t[last] <= self.wheels.newest()
             self._advance(last)
             if self.failed:
                 break
-            if heard:
+            if received:
                 out.append(self._pose())
                 if not out[-1].sound():
                     del out[-1]
-                    self.failed = 'the pose was no number'
+                    self.failed = 'the pose was not finite'
                     break
             self._look()
             self._leave_behind(last)
@@ -102,7 +102,7 @@ class Reckoning:
         return last
 
     def _advance(self, last: int) -> None:
-        """Go to a row of the Imu."""
+        """Go to a row of the IMU."""
         imu, at = self.imu, self.imu.at
         low = max(at - 1, 0)
         t = imu.t[low:last + 2]
@@ -139,21 +139,21 @@ class Reckoning:
         imu.at = last
 
     def _doubt_turn(self, strange: Floats, gaps: Floats, C_nb: Floats) -> None:
-        """Doubt turns that no vehicle begins: (n, 3) rad/s over n gaps of s, in b."""
+        """Add variance for implausible turn rates: (n, 3) rad/s over n gaps of s, in b."""
         if not strange.any():
             self._strange_turn = np.zeros(3)
             return
         if not self._strange_turn.any():
-            self._told.append(f'the gyro jumps by {strange.max():.2g} rad/s as no vehicle turns: '
-                              'what it tells is doubted')
+            self._notes.append(f'the gyro jumps by {strange.max():.2g} rad/s, more than a vehicle '
+                              'can turn: the gyro is down-weighted')
         turn = self._strange_turn + gaps @ strange
         self.errors.turned(C_nb @ np.diag(turn**2 - self._strange_turn**2) @ C_nb.T)
         self._strange_turn = turn
         if np.sqrt(self.errors.cov[[3, 4], [3, 4]].max()) > TILT_LOST:
-            self.failed = 'the tilt is not known any more'
+            self.failed = 'the tilt is no longer known'
 
     def _velocity_n(self, t: float) -> Floats:
-        """Return the velocity of the Imu in n, by the odometer's last rows."""
+        """Return the velocity of the IMU in n, by the odometer's last rows."""
         v, C_nb = self.vehicle, matrix_from_quat(self.q)
         now, before = self.wheels.at(np.array([t, t - SPEED_SPAN]))
         arm_b = v.C_vb.T @ (np.asarray(self.config.imu.lever_arm) - v.lever_arm)
@@ -167,14 +167,14 @@ class Reckoning:
         T = self._t - self._t_look
         if T < CORRECTION_PERIOD - 1e-6:
             return
-        velocity, heard = self._velocity_n(self._t), self._t <= self.wheels.newest()
+        velocity, received = self._velocity_n(self._t), self._t <= self.wheels.newest()
         w = np.concatenate(self._w_look)
-        resting = heard and self.wheels.still(self._t_look, self._t) and bool(
+        resting = received and self.wheels.still(self._t_look, self._t) and bool(
             (w.std(axis=0) < REST_TURN).all()
             and (np.abs(w.mean(axis=0) - self.bias) < REST_TURN).all())
         # a rest that begins with this look may begin with the last of the braking
         standing = resting and self._rested
-        if self.config.levelling and heard and self._felt:
+        if self.config.levelling and received and self._felt:
             off_n = (self._felt_n - velocity + self._v_look) / T - [0.0, 0.0, GRAVITY]
             noise = 2 * self.wheels.quantum / SPEED_SPAN / T
             by = self.errors.by_gravity(
@@ -196,19 +196,20 @@ class Reckoning:
 
     def _take_apart(self, off_n: Floats, velocity: Floats, T: float, w: Floats) -> None:
         """
-        Doubt what the Imu or the odometer told of the last T s, where they are apart.
+        Increase the variance of the last T s if IMU and odometer disagree.
 
         off_n : (2,) m/s^2, force less acceleration.   velocity : (3,) m/s.   w : (n, 3) rad/s.
         """
         self._apart += 1
-        self._told.append('the force is not that of the motion: an Imu or an odometer is wrong; '
-                          f'not levelled by it ({np.linalg.norm(off_n):.3g} m/s^2)')
+        self._notes.append('specific force and odometer motion differ by '
+                          f'{np.linalg.norm(off_n):.3g} m/s^2: IMU or odometer is faulty; not '
+                          'used for levelling')
         self.errors.turned(np.eye(3) * np.sum((w.mean(axis=0) - self.bias)**2) * T**2)
         self.errors.lost(min(float(np.linalg.norm(off_n)) * T**2 / 2,
                              float(np.linalg.norm(velocity - self._v_look)) * T))
         length = float(np.linalg.norm(self._felt_n)) / T
         if self._apart >= MOST_APART and abs(length - GRAVITY) < AS_GRAVITY:
-            self.failed = f'force and attitude are apart for {self._apart} s'
+            self.failed = f'specific force and attitude have disagreed for {self._apart} s'
 
     def _correct(self, by: Floats) -> None:
         self.q = quat_multiply(quat_from_rotvec(by[PHI]), self.q)
@@ -225,7 +226,8 @@ class Reckoning:
         speed = (self._s - self._s_pose) / T
         velocity = np.array([speed, 0.0, 0.0]) + np.cross(rate, -v.lever_arm)
         if abs(speed) > FASTEST:
-            self._told.append(f'{speed:.0f} m/s: the calibration is of another odometer or unit')
+            self._notes.append(f'{speed:.0f} m/s is implausible: the calibration belongs to '
+                              'another odometer or unit')
         quantum, doubt = self.wheels.quantum, self.wheels.doubt(self._t - T, self._t)
         pose = Pose(int(self.imu.stamp_ns[self.imu.at]), self.position + arm_n + self._arm0_n,
                     quat_from_matrix(C_nb @ C_vb.T), velocity, rate,

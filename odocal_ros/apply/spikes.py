@@ -8,7 +8,7 @@
 # the License.
 
 """
-Rows of the Imu that no vehicle makes, found as they come.
+Rows of the IMU that no vehicle makes, found as they come.
 
 A leg is screened as a whole (``screening/glitches.py``); a stream has its past, and what follows
 within the time that a spike may take. The limits are those of the leg.
@@ -20,9 +20,9 @@ from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.pieces import across
 from odocal_ros.screening.glitches import (
     BACK_SHARE,
+    EQUAL_NEIGHBOURS,
     FORCE_STEP,
     GLITCH_TIME,
-    NEIGHBOURS_ALIKE,
     ROWS_BESIDE,
     SINGLE_FORCE,
     SINGLE_TIMES,
@@ -42,7 +42,7 @@ SINGLES = np.repeat([SINGLE_TURN, SINGLE_FORCE], 3)
 
 
 def beyond_sensor(w_b: Floats, f_b: Floats) -> Bools:
-    """Tell which rows no sensor sends: (n, 3) rad/s, (n, 3) m/s^2; a force of NaN is none."""
+    """Return a mask of impossible rows: (n, 3) rad/s, (n, 3) m/s^2; a force of NaN is missing."""
     with np.errstate(invalid='ignore'):
         turn = across(np.logical_and, np.abs(w_b) <= MOST_TURN)
         return ~turn | across(np.logical_or, np.abs(f_b) > MOST_FORCE)
@@ -60,15 +60,15 @@ class SpikeScreen:
         self._usual = np.zeros(2)           # of steps from row to row, in STEPS: gyro, force
         self._since = 0.0                   # s, since when the rows are equal
         self._strange = np.zeros(3)         # rad/s, step of the gyro that no vehicle makes
-        self._before = np.zeros(3)          # rad/s, what the gyro told before it
+        self._before = np.zeros(3)          # rad/s, rate before it
         self._until = 0.0                   # s
 
     def sift(self, t: Floats, x: Floats) -> tuple[Bools, Floats, int]:
         """
-        Return which rows to keep, what of their rates is strange, and which rows to hold.
+        Return masks of rows to keep and to hold, and the implausible part of their rates.
 
         t : (n,) s, the first row is the last one kept.   x : (n, 6) rad/s and m/s^2.
-        Returns (n,) bool, (n, 3) rad/s, 0 where the gyro tells what a vehicle may do, and the
+        Returns (n,) bool, (n, 3) rad/s, 0 where the rate is plausible, and the
         index of the first row to hold, n for none.
         """
         keep, strange = np.ones(len(t), bool), np.zeros((len(t), 3))
@@ -96,13 +96,13 @@ class SpikeScreen:
         return keep, strange, len(t)
 
     def _is_over(self, t: float, w: Floats) -> bool:
-        """Return whether the gyro is back where it was before a strange step."""
+        """Return True if the gyro is back at its value before an implausible step."""
         return bool(self._strange.any()) and (t > self._until or bool(
             (np.abs(w - self._before) <= BACK_SHARE * np.abs(self._strange)).all(
                 where=self._strange != 0)))
 
     def _strange_of(self, t: float, w: Floats, t_last: float, w_last: Floats) -> Floats:
-        """Return what of a rate no vehicle does, (3,) rad/s, from the step that began it on."""
+        """Return the implausible part of a rate, (3,) rad/s, from the step where it started."""
         if self._is_over(t, w):
             self._strange = np.zeros(3)
             return self._strange
@@ -114,7 +114,7 @@ class SpikeScreen:
         return self._strange
 
     def _calm(self, t: Floats, x: Floats) -> bool:
-        """Return whether no row of a block needs a second look."""
+        """Return True if no row of a block needs a closer check."""
         if len(x) < 2:
             return True
         sizes = _size(np.diff(x, axis=0))
@@ -131,7 +131,7 @@ class SpikeScreen:
         return allowed
 
     def _learn(self, steps: Floats) -> None:
-        most = 4 * self._usual + 1 / USUAL_STEPS       # one spike tells little of what is usual
+        most = 4 * self._usual + 1 / USUAL_STEPS       # one spike hardly changes the usual size
         share = 1 - (1 - 1 / USUAL_ROWS)**len(steps)
         self._usual = self._usual + (np.minimum(steps, most).mean(axis=0) - self._usual) * share
 
@@ -152,7 +152,7 @@ def _size(step: Floats) -> Floats:
 
 def single(x: Floats) -> Bools:
     """
-    Tell which rows are off alone: (n, 6) to (n,) bool, never the last row.
+    Return a mask of isolated outliers: (n, 6) to (n,) bool, never the last row.
 
     As ``screening.glitches.single`` has it, but by the rows before: those after are still to come.
     """
@@ -165,5 +165,5 @@ def single(x: Floats) -> Bools:
         beside = far[k - ROWS_BESIDE - 1:k - 1].max(axis=0)
         apart = np.abs(x[k + 2] - x[k])
         off[k + 1] = ((at > np.maximum(SINGLES, SINGLE_TIMES * beside))
-                      & (apart < NEIGHBOURS_ALIKE * at)).any()
+                      & (apart < EQUAL_NEIGHBOURS * at)).any()
     return off

@@ -36,7 +36,7 @@ BRAKING_SIGMA = 2.0        # m/s^2; physical: that a mean over START_SPAN may ho
 @dataclass(frozen=True, eq=False)
 class Start:
     """
-    Attitude and gyro bias at a row of the Imu.
+    Attitude and gyro bias at a row of the IMU.
 
     earth_n : (3,) rad/s that is taken out of the turn rates, zero where it is in the bias.
     """
@@ -63,19 +63,19 @@ def begin(imu: ImuStream, wheels: Wheels, vehicle: Vehicle, config: ApplyConfig,
     resting = wheels.still(t[0], t[-1]) and bool(
         (w.std(axis=0) < REST_TURN).all() and (np.abs(w.mean(axis=0)) < MOST_BIAS).all())
     if not resting and np.linalg.norm(_tilting(w.mean(axis=0), f.mean(axis=0))) > MOST_TILTING:
-        imu.drop(end)       # a gyro that tells nonsense: wait until it is over
+        imu.drop(end)       # implausible gyro data: wait for its end
         return None
     return _levelled(end, float(t[-1] - t[0]), w, f, resting, vehicle, grade)
 
 
 def _tilting(w: Floats, f: Floats) -> Floats:
-    """Return what of a mean turn rate, (3,) rad/s, is not about the vertical; 0 without force."""
+    """Return the part of a mean turn rate, (3,) rad/s, not about the vertical; 0 without force."""
     up = f / np.linalg.norm(f)
     return w - up * (w @ up) if np.isfinite(up).all() else np.zeros(3)
 
 
 def _given(row: int, vehicle: Vehicle, config: ApplyConfig, grade: Grade) -> Start:
-    """Return the start that the settings tell."""
+    """Return the start given by the settings."""
     start = config.start
     q = np.asarray(start.attitude)
     earth = np.zeros(3) if np.isnan(start.latitude) else earth_rate_n(np.deg2rad(start.latitude))

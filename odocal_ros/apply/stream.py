@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The Imu's samples that odometry has not left behind."""
+"""The IMU's samples that odometry has not left behind."""
 
 import numpy as np
 
@@ -18,25 +18,25 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.screening.glitches import ROWS_BESIDE
 from odocal_ros.settings.apply_config import ApplyConfig
 
-INTERVAL_ROWS = 64      # judgement: rows that tell the usual interval
+INTERVAL_ROWS = 64      # judgement: rows that determine the usual interval
 COLUMNS = ('stamp_ns', 't', 'w_b', 'f_b', 'strange')
 
 
 class ImuStream:
     """
-    Rows of the Imu, usable and rising.
+    Rows of the IMU, usable and rising.
 
     t : (n,) s since the first.   w_b, f_b : (n, 3) rad/s, m/s^2, NaN: no force is sent.
     stamp_ns : (n,).              at : the row that is reached.     zero_ns : stamp of t = 0.
-    strange : (n, 3) rad/s, what the gyro tells of a turn that no vehicle begins, sizes.
-    usual : s between rows.       ``told`` takes sentences of what is dropped.
+    strange : (n, 3) rad/s, sizes of implausible turn rates.
+    usual : s between rows.       ``notes`` receives sentences on dropped rows.
     """
 
-    def __init__(self, config: ApplyConfig, told: list[str]) -> None:
+    def __init__(self, config: ApplyConfig, notes: list[str]) -> None:
         self._C = matrix_from_rpy(config.imu.mounting_rpy)
         self._scales = config.imu.gyro_scale, config.imu.accel_scale
         self._offset_ns = round(config.imu.time_offset * 1e9)
-        self._told = told
+        self._notes = notes
         self._screen = SpikeScreen()
         self._held: list[tuple[Ints, Floats, Floats]] = []     # stamps, rates, forces
         self.zero_ns = 0
@@ -55,7 +55,7 @@ class ImuStream:
         with np.errstate(invalid='ignore', over='ignore'):
             w_b, f_b = gyro * block.w_i @ self._C.T, accel * f_i @ self._C.T
         good = ~beyond_sensor(w_b, f_b)
-        self._say_dropped(len(good) - int(good.sum()), 'hold NaN or what no sensor measures')
+        self._say_dropped(len(good) - int(good.sum()), 'hold NaN or impossible values')
         if good.any():
             self._held.append((block.stamp_ns[good] + self._offset_ns, w_b[good], f_b[good]))
             self._release(*(np.concatenate(column) for column in zip(*self._held, strict=True)))
@@ -71,8 +71,7 @@ class ImuStream:
         rows = np.flatnonzero(keep[n:hold])
         later = slice(hold - n, None)
         self._held = [(stamp_ns[later], w_b[later], f_b[later])] if hold < len(t) else []
-        self._say_dropped(hold - n - len(rows), 'leave those beside them and come back, or repeat '
-                          'one value')
+        self._say_dropped(hold - n - len(rows), 'jump away and back, or repeat one value')
         for name, column in (('stamp_ns', stamp_ns), ('t', t[n:]), ('w_b', w_b), ('f_b', f_b),
                              ('strange', strange[n:])):
             setattr(self, name, np.concatenate([getattr(self, name), column[rows]]))
@@ -85,13 +84,13 @@ class ImuStream:
         begin = max(len(self.t) - new - ROWS_BESIDE - 3, 0)
         off = np.flatnonzero(single(np.hstack([self.w_b[begin:], self.f_b[begin:]]))) + begin
         off = off[off > max(self.at, len(self.t) - new - 2)]
-        self._say_dropped(len(off), 'stand alone far from their neighbours')
+        self._say_dropped(len(off), 'are isolated outliers')
         for name in COLUMNS if len(off) else ():
             setattr(self, name, np.delete(getattr(self, name), off, axis=0))
 
     def _say_dropped(self, rows: int, why: str) -> None:
         if rows:
-            self._told.append(f'Imu messages {why}: {rows} dropped, and bridged')
+            self._notes.append(f'IMU messages {why}: {rows} dropped and interpolated')
 
     def forget(self, seconds: float) -> None:
         """Forget rows older than so much before the newest, while nothing is reached."""

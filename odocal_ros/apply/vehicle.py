@@ -81,12 +81,13 @@ def vehicle_of(estimates: dict[str, Estimate], config: ApplyConfig) -> Vehicle:
     scale, sigma = estimate_of('scale_factor', math.nan)
     left, right = (estimate_of(name, math.nan)[0] for name in SIDES)
     if math.isnan(scale):
-        raise BadConfig('the calibration holds no result.scale_factor: give the calibration.yaml '
-                        'that odocal replay or the calibrator wrote, --params-file FILE')
+        raise BadConfig('the calibration holds no result.scale_factor: start with --params-file '
+                        'FILE, where FILE is a calibration.yaml of odocal replay or the '
+                        'calibrator')
     nominal = config.imu.nominal_yaw
     yaw = estimate_of('yaw_mounting_angle', 0.0 if math.isnan(nominal) else nominal, UNKNOWN_YAW)
     pitch = estimate_of('pitch_mounting_angle', 0.0, UNKNOWN_PITCH)
-    guessed = tuple(f'{name} is not in the calibration: taken as {value:.4g} +- {sigma:.2g} rad'
+    guessed = tuple(f'{name} is not in the calibration: assumed {value:.4g} +- {sigma:.2g} rad'
                     for name, (value, sigma) in (('yaw_mounting_angle', yaw),
                                                  ('pitch_mounting_angle', pitch))
                     if name not in estimates or estimates[name].value is None)

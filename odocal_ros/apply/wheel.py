@@ -8,7 +8,7 @@
 # the License.
 
 """
-The travel of one wheel as its rows come: rollover undone, resets bridged, what is lost doubted.
+Travel of one wheel: rollovers corrected, resets interpolated, lost travel with its variance.
 
 A leg is judged as a whole (``nav/odometer.py``, ``screening/odometer_care.py``); a stream has
 only its past, and a scale that is known: what no vehicle does in the time is no travel.
@@ -29,13 +29,13 @@ LEAST_TIME, SPEED_TIME, SPEED_COUNTS = 0.1, 0.5, 10.0
 # m/s^2; physical: half of g is hard braking; what a wheel that locks or spins shows at most
 SPEED_CHANGE, WHEEL_CHANGE = 5.0, 15.0
 # judgement: s that a burst of stamps may hide; usual jitters of stamps that a row may be off by;
-# rows that tell them
+# rows that determine them
 STAMP_BURST, JITTERS, JITTER_ROWS = 0.25, 5.0, 50
-# judgement: rows before any is doubted; rows in turn, and s, that are refused at least before one
-# is believed
+# judgement: rows before any is tested; rows in turn, and s, that are refused at least before one
+# is accepted
 SURE_ROWS, MOST_REFUSED, REFUSED_TIME = 5, 2, 0.5
 STRANGE_TIME = 1.0    # s; judgement: after it motion may explain a jump of speed
-KEPT_TIME = 60.0    # s; judgement: of rows without a message of the Imu
+KEPT_TIME = 60.0    # s; judgement: of rows without a message of the IMU
 MISSING_TIME, GAP_FACTOR = 0.5, 2.5    # s, usual intervals; judgement: messages are missing
 
 
@@ -43,7 +43,7 @@ class Wheel:
     """
     Travel of a wheel, m, at the times of its rows.
 
-    scale : m per unit.   ``told`` takes sentences of what is found, until somebody takes them.
+    scale : m per unit.   ``notes`` collects sentences on the findings.
     """
 
     def __init__(self, form: OdometerForm, scale: float, reversed_counts: bool = False) -> None:
@@ -51,7 +51,7 @@ class Wheel:
         self.scale = -scale if reversed_counts else scale      # m per unit, signed
         self.speed = 0.0               # m/s, over the last rows
         self.usual = 0.0               # s between rows
-        self.told: list[str] = []
+        self.notes: list[str] = []
         self.t: deque[float] = deque()
         self.s: deque[float] = deque()
         self.doubts: deque[tuple[float, float]] = deque()   # (t, m^2) of uncertain travel
@@ -61,7 +61,7 @@ class Wheel:
         self._jitter = STAMP_BURST / JITTERS      # s, of the stamps, as the rows show it
         # after rows that were refused: m/s that nothing explains yet, m it may have misled by, for
         # s, m/s before it
-        self._strange = self._strange_way = self._strange_time = self._sure_speed = 0.0
+        self._strange = self._strange_travel = self._strange_time = self._sure_speed = 0.0
 
     @property
     def quantum(self) -> float:
@@ -90,7 +90,7 @@ class Wheel:
         return travel
 
     def doubt(self, t_from: float, t_to: float) -> float:
-        """Return the variance of the travel between two times, m^2, each doubt once."""
+        """Return the variance of the travel between two times, m^2, each uncertainty once."""
         return sum((variance for t, variance in self.doubts if t_from < t <= t_to), 0.0)
 
     def between(self, t: float) -> float:
@@ -123,8 +123,8 @@ class Wheel:
         shown = value * self.scale if self.form.quantity == 'rate' else step / dt     # m/s
         off = abs(shown - self.speed) * dt
         if self._is_false(t, dt, step, off):
-            self.told.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or a '
-                             f'false row, no motion; bridged at {self.speed:.1f} m/s')
+            self.notes.append(f'the counter jumps by {step:+.1f} m in {dt:.2f} s: a reset or an '
+                             f'invalid value, not motion; interpolated at {self.speed:.1f} m/s')
             step = self.speed * dt
             lost = (abs(self.speed) + SPEED_CHANGE * dt) * dt
             # a counter that hung for a moment catches up
@@ -139,9 +139,9 @@ class Wheel:
 
     def _is_false(self, t: float, dt: float, step: float, off: float) -> bool:
         """
-        Return whether a row is no motion: a step, m, that is off, m, from the speed before.
+        Return True if a row is not motion: a step, m, with this deviation, m, from the speed.
 
-        What stays for a while and is possible at all is believed.
+        What stays for a while and is possible at all is accepted.
         """
         possible = abs(step) <= FASTEST * max(dt, STAMP_BURST) + self.quantum
         usual = off <= self._limit(dt) or self._rows <= SURE_ROWS
@@ -153,7 +153,7 @@ class Wheel:
             t - self._refused_since < REFUSED_TIME)
 
     def _limit(self, dt: float, change: float = WHEEL_CHANGE) -> float:
-        """Return how far a row may be off the speed before, m, that changes by so many m/s^2."""
+        """Return the limit for the deviation of a row from the previous speed, m."""
         return (change * (dt + self._lag()) * dt + 3 * self.quantum
                 + JITTERS * self._jitter * abs(self.speed))
 
@@ -164,19 +164,19 @@ class Wheel:
         return min(SPEED_TIME, LEAST_TIME + coarse)
 
     def _follow(self, dt: float, step: float, shown: float, off: float) -> None:
-        """Take over the speed of a row that is believed; doubt what followed a jump of speed."""
+        """Use the speed of an accepted row; add variance after a jump of speed."""
         if self._refused:
             back = abs(shown - self._sure_speed) * dt <= self._limit(dt) and self._strange > 0
             self._strange = 0.0 if back else abs(shown - self.speed)
-            self._sure_speed, self._strange_way, self._strange_time = self.speed, 0.0, 0.0
+            self._sure_speed, self._strange_travel, self._strange_time = self.speed, 0.0, 0.0
             self.speed = shown if off > self._limit(dt) else self.speed
         elif off > self._limit(dt, SPEED_CHANGE):
             self._doubt(off**2)
         self._refused = 0
         if self._strange:
-            way = self._strange_way + self._strange * dt
-            self._doubt((way**2 - self._strange_way**2) / 3)
-            self._strange_way = way
+            path_length = self._strange_travel + self._strange * dt
+            self._doubt((path_length**2 - self._strange_travel**2) / 3)
+            self._strange_travel = path_length
             self._strange_time += dt
             if self._strange_time > STRANGE_TIME:      # motion itself may explain it
                 self._strange = max(self._strange - SPEED_CHANGE * dt, 0.0)
@@ -185,7 +185,7 @@ class Wheel:
         self.speed += (step / dt - self.speed) * min(1.0, dt / self._lag())
 
     def _doubt(self, variance: float) -> None:
-        """Doubt the travel, m^2, from the last row on."""
+        """Add variance of the travel, m^2, from the last row on."""
         self.doubts.append((self.t[-1] + 1e-6, variance))
 
     def _add(self, t: float, s: float) -> None:
@@ -204,15 +204,15 @@ class Wheel:
         return step
 
     def _bridged(self, dt: float, step: float) -> float:
-        """Return what to add to the travel of a gap, m; doubt that of speeds or increments."""
+        """Return the travel to add for a gap, m; increase the sigma of speeds or increments."""
         if self.form.quantity == 'cumulative':
-            self.told.append(f'no odometer message for {dt:.2f} s: what was counted meanwhile is '
-                             'spread evenly')
+            self.notes.append(f'no odometer message for {dt:.2f} s: the counts of this gap are '
+                             'distributed evenly')
             return 0.0
         missing = dt - self.usual
         lost = self.speed * missing if self.form.quantity == 'increment' else 0.0
         size = max(abs(self.speed), abs(step) / dt)
         self._doubt((min(missing / 50, 0.3) * size * missing) ** 2 / 3)
-        self.told.append(f'no odometer message for {dt:.2f} s: the travel is taken from the '
-                         'speeds beside')
+        self.notes.append(f'no odometer message for {dt:.2f} s: the travel is interpolated from '
+                         'the adjacent speeds')
         return lost

@@ -30,12 +30,12 @@ class Wheels:
     Of two wheels each has its own factor where the calibration gives both.
     """
 
-    def __init__(self, vehicle: Vehicle, config: ApplyConfig, told: list[str]) -> None:
-        self._vehicle, self._told = vehicle, told
+    def __init__(self, vehicle: Vehicle, config: ApplyConfig, notes: list[str]) -> None:
+        self._vehicle, self._notes = vehicle, notes
         self._reversed = config.odometer.reversed
         self._offset_ns = round(config.odometer.time_offset * 1e9)
         self._two = config.odometer.right == 'topic'
-        self._waiting: list[Rows] = []       # blocks from before the first Imu message
+        self._waiting: list[Rows] = []       # blocks from before the first IMU message
         self._wheels: dict[str, Wheel] = {}
         self.zero_ns = 0
 
@@ -56,8 +56,8 @@ class Wheels:
         wheel = self._wheels[slot]
         stamp = block.stamp_ns + self._offset_ns
         wheel.feed(np.asarray((stamp - self.zero_ns) * 1e-9, float), block.value)
-        self._told += wheel.told
-        wheel.told.clear()
+        self._notes += wheel.notes
+        wheel.notes.clear()
 
     def _scale(self, form: OdometerForm) -> None:
         """Give each of two wheels its own factor."""
@@ -67,7 +67,7 @@ class Wheels:
                 self._wheels[slot].rescale(scale)
 
     def ready(self) -> bool:
-        """Return whether every wheel has sent rows."""
+        """Return True if every wheel has sent rows."""
         return bool(self._wheels) and all(w.t for w in self._wheels.values()) and (
             not self._two or len(self._wheels) == 2)
 
@@ -101,7 +101,7 @@ class Wheels:
                      / len(self._wheels))
 
     def still(self, t_from: float, t_to: float) -> bool:
-        """Return whether no wheel turned between two times."""
+        """Return True if no wheel turned between two times."""
         return all(abs(w.at(t_to) - w.at(t_from)) <= REST_TRAVEL / 2 + STILL_COUNTS * w.quantum
                    for w in self._wheels.values())
 

@@ -49,7 +49,7 @@ class Recording:
     """
     A file of a bag: its channels by number, their counts, first and last time.
 
-    ``damage`` says what is wrong with it, empty if nothing is; found while reading, it is told
+    ``damage`` says what is wrong with it, empty if nothing is; found while reading, it is reported
     only after that.
     """
 
@@ -81,9 +81,9 @@ class Recording:
         for key, time_ns in self._scan():
             counts[key] += 1
             start_ns, end_ns = min(start_ns, time_ns), max(end_ns, time_ns)
-        self._tell(counts, start_ns, end_ns)
+        self._set_counts(counts, start_ns, end_ns)
 
-    def _tell(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
+    def _set_counts(self, counts: Mapping[int, int], start_ns: int, end_ns: int) -> None:
         self.start_ns, self.end_ns = start_ns, end_ns
         self._channels = {key: replace(channel, count=counts.get(key, 0))
                           for key, channel in self._channels.items()}
@@ -99,5 +99,5 @@ class Recording:
 
 
 def possible(time_ns: int) -> bool:
-    """Tell whether a bag time can be one."""
+    """Return True if a bag time is valid."""
     return isinstance(time_ns, int) and 0 <= time_ns < LATEST_NS

@@ -62,7 +62,7 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Return how many bytes of a file it takes."""
+        """Return its number of bytes in the file."""
         return len(self.record) + len(self.index)
 
 

@@ -25,7 +25,7 @@ TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|//[^\n]*|/\*.*?\*/|@\s*[\w:]+|[()]|[^"/
 
 def parsed(msgtype: str, form: str, text: str) -> dict[str, Any]:
     """Return the fields of a type and those it stands on; form is 'msg' or 'idl'."""
-    with rosbags_for('a message type that is no standard one'):
+    with rosbags_for('a non-standard message type'):
         from rosbags.typesys import get_types_from_idl, get_types_from_msg
     if form == 'msg':
         return get_types_from_msg(text, msgtype)

@@ -22,7 +22,7 @@ class FileBytes:
 
     def __init__(self, path: Path) -> None:
         # glibc gives a block of memory back to the system, and has all its pages made again for
-        # the next, unless it has seen a larger one let go before
+        # the next, unless a larger one was released earlier
         np.empty(LET_GO, np.uint8)
         self._path = path
         self._file = path.open('rb')

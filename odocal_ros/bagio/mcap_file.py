@@ -103,7 +103,7 @@ class McapFile(RecordWalk):
         if not 0 <= start_ns <= end_ns < LATEST_NS and count:
             raise Damaged(INDEX_DAMAGED)
         self._places = apart(self._places, start)
-        self._tell(counts, start_ns, end_ns)
+        self._set_counts(counts, start_ns, end_ns)
         return True
 
     # ---- messages --------------------------------------------------------------------------

@@ -60,11 +60,11 @@ def batches(places: Sequence[Place], wanted: Mapping[int, Channel], known: Colle
     Yield the messages of some channels by time, many at a time.
 
     places : chunks by the times they state.   known : all channels of the file.
-    walk   : gives the messages of a chunk one by one.   note : is told what damage costs.
+    walk   : gives the messages of a chunk one by one.   note : receives the loss by damage.
     """
     mine, all_known = _table(wanted), _table(known)
     late: Columns | None = None          # messages that one of a chunk to come may precede
-    at, size = 0, 1                      # the first block is one chunk: often no more is asked for
+    at, size = 0, 1                      # the first block is one chunk: often no more is needed
     while at < len(places):
         block, at = _block(places, at, size, read)
         found = _columns(block, all_known, walk, note)
@@ -159,7 +159,7 @@ def _in_one(chunks: Sequence[Chunk]) -> Sequence[Chunk]:
 
 
 def _starts(chunk: Chunk) -> Ints:
-    """Return where the records of a chunk begin, by its message index, in any order."""
+    """Return the offsets of the records of a chunk from its message index, in any order."""
     found, at, index = [np.empty(0, np.int64)], 0, chunk.begins
     while at + 15 <= len(index):
         op, size = RECORD.unpack_from(index, at)

@@ -17,7 +17,7 @@ from odocal_ros.errors import BadUsage
 
 @contextmanager
 def rosbags_for(what: str) -> Iterator[None]:
-    """Raise BadUsage where an import of rosbags fails; ``what`` needs it."""
+    """Raise BadUsage if an import of rosbags fails; ``what`` names the feature that needs it."""
     try:
         yield
     except ModuleNotFoundError:

@@ -32,7 +32,7 @@ ZSTD = b'\x28\xb5\x2f\xfd'
 
 
 class Part:
-    """A file of a bag; what is known of it is ``file``'s to tell."""
+    """A file of a bag; ``file`` has its metadata."""
 
     def __init__(self, path: Path, file: Path, kind: str, total: int,
                  convert: Callable[..., Any]) -> None:
@@ -41,7 +41,7 @@ class Part:
         try:
             self._file = self._opened(file, kind, convert)
         except (Damaged, ValueError) as error:
-            raise BadBag(f'{path}: nothing in it can be read ({error})') from None
+            raise BadBag(f'{path}: cannot be read ({error})') from None
 
     def _opened(self, file: Path, kind: str, convert: Callable[..., Any]) -> Recording:
         if kind == '.mcap':
@@ -49,7 +49,7 @@ class Part:
         return SqliteFile(file) if kind == '.db3' else Rosbag1File(file, self._allowance, convert)
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the file tells of itself: channels, damage, count, start_ns, end_ns."""
+        """Return the metadata of the file: channels, damage, count, start_ns, end_ns."""
         return getattr(self.__dict__['_file'], name)
 
     def batches(self, topics: Mapping[str, str]) -> Iterator[Batch]:
@@ -99,7 +99,7 @@ class Part:
 
 
 def _packed(raw: bytes) -> bool:
-    """Tell whether messages are compressed each for itself: CDR begins with a zero byte."""
+    """Return True if each message is compressed separately: CDR starts with a zero byte."""
     return raw[:4] == ZSTD
 
 

@@ -75,11 +75,11 @@ class Bag:
 
     @property
     def notes(self) -> tuple[Reason | str, ...]:
-        """Return what a user should know of this bag; all of it only after it was read."""
+        """Return the notes on this bag; complete only after it was read."""
         return (*self._sentences, *self._cut(), *self._reader_notes)
 
     def _cut(self) -> list[Reason | str]:
-        """Say what is missing, in seconds where metadata or the next file tell."""
+        """Return the note on missing data, in seconds if metadata or the next file give them."""
         found: list[Reason | str] = []
         whole = self._source.whole
         for part, after in zip(self._parts, [*self._parts[1:], None], strict=True):
@@ -87,22 +87,22 @@ class Bag:
                 continue
             span = dict(self._source.of_file).get(part.path.name) or (
                 whole if len(self._parts) == 1 else None)
-            told = f'{part.path.name} is damaged ({part.damage})'
+            note = f'{part.path.name} is damaged ({part.damage})'
             if span and part.count >= span.count:
-                found.append(f'{told}, but all its {span.count} messages were read')
+                found.append(f'{note}, but all {span.count} messages were read')
                 continue
             span = span or (whole if after is None else None)
             end_ns = span.end_ns if span else after.start_ns if after else None
             seconds = (part.end_ns - part.start_ns) * 1e-9
-            missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at its end are missing'
+            missing = (f'{max(end_ns - part.end_ns, 0) * 1e-9:.1f} s at the end are missing'
                        if end_ns is not None else
                        'how much is missing cannot be known without metadata.yaml')
-            found.append(Reason(Code.BAG_TRUNCATED, f'{told}: {part.count} messages of '
+            found.append(Reason(Code.BAG_TRUNCATED, f'{note}: {part.count} messages in '
                                 f'{seconds:.1f} s were read; {missing}'))
         if not found and whole and (whole.end_ns - self.end_ns) * 1e-9 > MISSING:
             found.append(Reason(Code.BAG_TRUNCATED, f'{self.name}: '
-                                f'{(whole.end_ns - self.end_ns) * 1e-9:.1f} s at its end that '
-                                'metadata.yaml tells of are missing'))
+                                f'{(whole.end_ns - self.end_ns) * 1e-9:.1f} s at the end, listed '
+                                'in metadata.yaml, are missing'))
         return found
 
     def read(self, readers: Mapping[str, RowReader], feed: Feed,
@@ -115,9 +115,9 @@ class Bag:
         readers : dict
             Topic -> reader of its messages.
         feed : callable
-            Told (slot, block) of samples, in order of bag time.
+            Called with (slot, block) of samples, in order of bag time.
         progress : callable, optional
-            Told the share done.
+            Called with the fraction done.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Bag:
 
         """
         for topic in readers.keys() - self.topics.keys():
-            raise BadUsage(f'{self.name}: has no topic {topic}; it has {", ".join(self.topics)}')
+            raise BadUsage(f'{self.name}: no topic {topic}; topics: {", ".join(self.topics)}')
         deserialize = {topic: self._types.deserializer(self.topics[topic].msgtype)
                        for topic in readers}
         used = dict.fromkeys(readers, 0)
@@ -139,9 +139,9 @@ class Bag:
                 newest = int(max(times[-1] for times, _ in batch.values()))
                 progress((newest - self.start_ns) / max(self.end_ns - self.start_ns, 1))
         for topic, reader in readers.items():
-            self._tell(topic, reader, used[topic])
+            self._add_notes(topic, reader, used[topic])
 
-    def _tell(self, topic: str, reader: RowReader, used: int) -> None:
+    def _add_notes(self, topic: str, reader: RowReader, used: int) -> None:
         """Note messages that gave no row; raise where none gave one."""
         if not reader.unreadable:
             return
@@ -149,8 +149,8 @@ class Bag:
         if not used:
             raise BadData(f'{topic}: none of its {count} messages can be used: {reader.trouble}')
         self._reader_notes.append(Reason(
-            Code.BAD_ROWS_DROPPED, f'{reader.unreadable} of {count} messages of {topic} were left '
-            f'out: {reader.trouble}'))
+            Code.BAD_ROWS_DROPPED, f'{reader.unreadable} of {count} messages of {topic} were '
+            f'skipped: {reader.trouble}'))
 
     def messages(self, topic: str) -> Iterator[tuple[int, object]]:
         """Yield (bag time ns, deserialised message) of a topic; empty if it is not there."""
@@ -163,8 +163,8 @@ class Bag:
         deserialize = self._types.deserializer(msgtype)
 
         def frame_of(raw: bytes) -> str:
-            told = cdr.frame_of(msgtype, raw)
-            return deserialize(raw).header.frame_id if told is None else told
+            note = cdr.frame_of(msgtype, raw)
+            return deserialize(raw).header.frame_id if note is None else note
         return next((frame for _, frame in self._each(topic, frame_of)), '')
 
     def _each(self, topic: str, read: Callable[[bytes], Any]) -> Iterator[tuple[int, Any]]:
@@ -236,8 +236,8 @@ class open_bag:
     def _open(self) -> Bag:
         source, types = find(self._path), Types()
         if source.foreign:
-            raise BadBag(f'{self._path}: its serialization format is {source.foreign!r}, only cdr '
-                         'can be read; convert it with ros2 bag convert')
+            raise BadBag(f'{self._path}: its serialization format is {source.foreign!r}, only '
+                         'cdr is supported; convert the bag with ros2 bag convert')
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix='odocal_')))
         parts, lost = [], []
         total = sum(path.stat().st_size for path in source.files if is_file(path))
@@ -254,8 +254,8 @@ class open_bag:
         bag_notes = tuple(f'{error}; the other files are read' for error in lost)
         formats = {c.serialization for part in parts for c in part.channels if c.count}
         if formats and not formats & {'cdr', 'ros1'}:
-            raise BadBag(f'{self._path}: its serialization format is {", ".join(formats)!r}, only '
-                         'cdr can be read; convert it with ros2 bag convert')
+            raise BadBag(f'{self._path}: its serialization format is {", ".join(formats)!r}, '
+                         'only cdr is supported; convert the bag with ros2 bag convert')
         if not any(part.count for part in parts):
             damage = ' or '.join({part.damage for part in parts if part.damage})
             topics = sum(len(part.channels) for part in parts)

@@ -46,7 +46,7 @@ class Rosbag1File(Recording):
         self.count = sum(c.msgcount for c in found)
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         if self.count and not 0 <= self.start_ns <= self.end_ns < LATEST_NS:
-            raise self._unreadable(ValueError('its times are none'))
+            raise self._unreadable(ValueError('invalid start or end time'))
 
     def _opened(self, path: Path) -> Any:
         reader = _reader(path)
@@ -129,5 +129,5 @@ def _reader(path: Path) -> Any:
             super().read_index_data(pos, indexes)
             self.left -= self.bio.tell() - begin
             if self.left < 0:
-                raise ValueError('its index runs in circles')
+                raise ValueError('its index contains a cycle')
     return Counted(File(path))

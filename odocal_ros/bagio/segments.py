@@ -12,7 +12,7 @@ A bag that grows by closed files, so that a kill at any moment leaves all but th
 
 While it grows it is a folder of numbered files without metadata.yaml; sixty of them are joined
 into one now and then, all of them at the end. A file that joins others is complete before they
-go, and its name tells which they are: a reader that finds both takes the joined one.
+go, and its name lists them: a reader that finds both takes the joined one.
 """
 
 from collections import Counter

@@ -101,7 +101,7 @@ def _folder(path: Path) -> Source:
             files = without_joined(files)
         if not files:
             raise BadBag(f'{path}: holds no .mcap, .db3 or .bag file{_hint(path)}')
-        what = 'names no file that is here' if wanted else 'is missing'
+        what = 'names no existing file' if wanted else 'is missing'
         if known is None or wanted:
             notes.append(f'{path}: metadata.yaml {what}; read {len(files)} file'
                          f'{"s" * (len(files) > 1)} in name order')
@@ -142,19 +142,19 @@ class Known:
 
 
 def _read_metadata(path: Path) -> Known:
-    """Return what a metadata.yaml says; all that a text can have wrong is found here."""
+    """Return the content of a metadata.yaml; raise an error for any invalid content."""
     import yaml
     if not is_file(path):
-        return Known(trouble=f'{path}: is a pipe, a device or a folder, so it is not used')
+        return Known(trouble=f'{path}: is not a regular file and is ignored')
     try:
         return _known(yaml.load(read_text(path), Loader=loader(aliases=True)))
     except (OSError, MemoryError):
         raise
     except LimitReached as error:
-        return Known(trouble=f'{error}; it is not used')
+        return Known(trouble=f'{error}; it is ignored')
     except Exception as error:      # of any kind: types, numbers, nesting, encoding
         why = ' '.join(str(error).split())[:100] or type(error).__name__
-        return Known(trouble=f'{path}: cannot be understood ({why}), so it is not used')
+        return Known(trouble=f'{path}: cannot be parsed ({why}) and is ignored')
 
 
 def _known(content: dict[str, dict[str, Any]]) -> Known:
@@ -164,7 +164,7 @@ def _known(content: dict[str, dict[str, Any]]) -> Known:
     formats = {topic['topic_metadata'].get('serialization_format', 'cdr')
                for topic in known.get('topics_with_message_count') or ()}
     if not all(isinstance(form, str) for form in formats):
-        raise ValueError('a serialization format that is no text')
+        raise ValueError('a serialization format that is not text')
     return Known(      # a file named twice is read once
         tuple(dict.fromkeys(Path(name).name for name in known.get('relative_file_paths') or ())),
         _span(known), tuple((name, span) for name, span in spans if span),
@@ -172,14 +172,14 @@ def _known(content: dict[str, dict[str, Any]]) -> Known:
 
 
 def _span(known: dict[str, Any]) -> Span | None:
-    """Return the end and the count that metadata tell, of a bag or one file."""
+    """Return the end and the count in the metadata of a bag or one file."""
     if not known.get('message_count') or 'starting_time' not in known:
         return None
     end_ns = (int(known['starting_time']['nanoseconds_since_epoch'])
               + int(known['duration']['nanoseconds']))
     count = int(known['message_count'])
     if not (possible(end_ns) and 0 <= count < LATEST_NS):
-        raise ValueError('times or counts that are none')
+        raise ValueError('invalid times or counts')
     return Span(end_ns, count)
 
 
@@ -205,9 +205,9 @@ def unpack(path: Path, folder: Path, total: int) -> tuple[Path, str]:
 
 
 def kind_of(path: Path) -> str:
-    """Return what a file is by its first bytes, or raise BadBag."""
+    """Return the format of a file from its first bytes, or raise BadBag."""
     if path.exists() and not is_file(path):
-        raise BadBag(f'{path}: is a pipe, a device or a folder, no file of a bag; give the file')
+        raise BadBag(f'{path}: is not a regular file; give a bag file')
     with path.open('rb') as file:
         head = file.read(16)
     for magic, kind in MAGIC.items():

@@ -82,10 +82,10 @@ class SqliteFile(Recording):
             for row in self._db.execute(sql, values):  # noqa: UP028 that would close the cursor
                 yield row
         except sqlite3.Error as error:
-            raise Damaged('pages of it are damaged' if left >= 0 else
-                          'its tables run in circles') from error
+            raise Damaged('damaged pages' if left >= 0 else
+                          'its tables contain a cycle') from error
         except (OverflowError, ValueError) as error:
-            raise Damaged('pages of it are damaged') from error
+            raise Damaged('damaged pages') from error
 
     def _open(self) -> None:
         """Learn the topics and count the messages."""
@@ -120,7 +120,7 @@ class SqliteFile(Recording):
         self._sorted = bool((np.diff(rows.time_ns) >= 0).all())
         counts = zip(*(column.tolist() for column in np.unique(rows.key, return_counts=True)),
                      strict=True)
-        self._tell(dict(counts), int(rows.time_ns.min(initial=2**63 - 1)),
+        self._set_counts(dict(counts), int(rows.time_ns.min(initial=2**63 - 1)),
                    int(rows.time_ns.max(initial=0)))
         return True
 
@@ -175,7 +175,7 @@ class SqliteFile(Recording):
         try:
             yield from sqlite_gather.batches(self._file, rows, wanted)
         except sqlite_gather.Odd:
-            raise BadBag(f'{self.path}: it changes while it is read; stop what writes it'
+            raise BadBag(f'{self.path}: the file changes while it is read; stop the recorder first'
                          ) from None
 
     def messages(self, topics: Mapping[str, str]) -> Iterator[Message]:

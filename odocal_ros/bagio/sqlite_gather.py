@@ -208,7 +208,7 @@ def _integer(data: Table, at: Ints, kind: Ints) -> tuple[Ints, Ints]:
 
 
 def plain(sql: str) -> bool:
-    """Tell whether a table is as rosbag2 makes it."""
+    """Return True if a table has the layout of rosbag2."""
     return isinstance(sql, str) and re.sub(r'\s|;', '', sql).lower() == SCHEMA
 
 

@@ -58,12 +58,12 @@ class Leaves:
         """
         Yield (topic_id, timestamp, data) of some topics in the order they were written.
 
-        keys : topics, None: of all, without their data.   last : rows up to it are not told.
+        keys : topics, None: of all, without their data.   last : rows up to it are skipped.
         """
         left = 2 * len(self._map)            # bytes: no two rows share a page for large ones
         for page in self._pages:
             for row, key, time_ns, payload in self._rows_of(page):
-                if row <= last:              # a stale copy of a page holds rows told already
+                if row <= last:              # a stale copy of a page holds rows seen already
                     continue
                 data = b''
                 if keys is not None and key in keys:

@@ -62,30 +62,31 @@ class Types:
     def _register(self, msgtype: str) -> None:
         form, text = self._definitions.get(msgtype, ('', ''))
         if not form:
-            raise BadData(f'{msgtype} is no standard message type and the bag holds no definition '
-                          'of it: record with a current rosbag2 (mcap), or use another topic')
-        check(len(text), DEFINITION, f"{msgtype}: the bag's definition of it", 'characters')
+            raise BadData(f'{msgtype} is not a standard message type and the bag holds no '
+                          'definition of it: record with a current rosbag2 (mcap), or use '
+                          'another topic')
+        check(len(text), DEFINITION, f'{msgtype}: its definition in the bag', 'characters')
         try:
             with within(SECONDS * factor()):
                 known = self._store.fielddefs
                 found = {name: fields for name, fields in parsed(msgtype, form, text).items()
                          if name not in known}
-                check(_elements(msgtype, known | found), ELEMENTS, f'{msgtype}: a message of it',
+                check(_elements(msgtype, known | found), ELEMENTS, f'{msgtype}: a message',
                       'values')
                 self._store.register(found)
         except (MemoryError, LimitReached):
             raise
         except Exception as error:   # a parser's errors
             why = ' '.join(str(error).split())[:100] or type(error).__name__
-            raise BadData(f"{msgtype}: the bag's definition of it cannot be understood ({why}); "
-                          'use another topic') from None
+            raise BadData(f'{msgtype}: its definition in the bag cannot be parsed ({why}); use '
+                          'another topic') from None
 
 
 def _elements(msgtype: str, fielddefs: dict[str, Any], depth: int = 0) -> int:
-    """Return how many values the fixed arrays of a message make, at least."""
+    """Return the minimum number of values in the fixed arrays of a message."""
     deepest = 50    # of messages in messages
     if depth > deepest:
-        raise ValueError('it holds itself')
+        raise ValueError('it contains itself')
 
     def of(field: tuple[Any, Any]) -> int:
         kind, what = field

@@ -57,7 +57,7 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
     """
     Write topics as one bag, messages in order of bag time; return its path.
 
-    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` is told the
+    ``storage`` mcap and sqlite3 give a rosbag2 folder, rosbag1 a file. ``progress`` receives the
     share written. The bag appears under its name only when it is complete; ``force`` replaces
     one that is there.
 
@@ -74,8 +74,8 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix='.odocal_', dir=path.parent))
     except OSError as error:
-        raise BadUsage(f'{path}: cannot write there ({error.strerror}); '
-                       'choose another --out') from None
+        raise BadUsage(f'{path}: cannot be written ({error.strerror}); choose another '
+                       '--out') from None
     try:
         part = work / path.name      # rosbag2 names its files after the folder
         (_write_rosbag1 if storage == 'rosbag1' else _write_rosbag2)(
@@ -93,20 +93,20 @@ def write_bag(path: Path, topics: Sequence[Topic], storage: str = 'mcap',
 def check_target(path: Path, storage: str, compression: str, force: bool) -> None:
     """Raise BadUsage where write_bag would, before any work is done."""
     if storage not in STORAGES:
-        raise BadUsage(f'--storage {storage}: want one of {", ".join(STORAGES)}')
+        raise BadUsage(f'--storage {storage}: required: one of {", ".join(STORAGES)}')
     if compression not in COMPRESSIONS:
-        raise BadUsage(f'--compression {compression}: want one of {", ".join(COMPRESSIONS)}')
+        raise BadUsage(f'--compression {compression}: required: one of {", ".join(COMPRESSIONS)}')
     lacking = {'sqlite3': ('storage',), 'mcap': (), 'rosbag1': ('message', 'file', 'storage')}
     if compression in lacking[storage]:
-        raise BadUsage(f'--compression {compression} is not there for --storage {storage}')
+        raise BadUsage(f'--compression {compression} is not available for --storage {storage}')
     if path.exists() and not force:
-        raise BadUsage(f'{path} is there already; give --force to replace it, or another --out')
+        raise BadUsage(f'{path} already exists; give --force to replace it, or another --out')
     if path.exists() and not _is_bag(path):
-        raise BadUsage(f'{path} is there and is no bag; choose another --out')
+        raise BadUsage(f'{path} is there and is not a bag; choose another --out')
 
 
 def _is_bag(path: Path) -> bool:
-    """Tell whether a path may be replaced: a bag file, or a folder of nothing but a bag."""
+    """Return True if a path can be replaced: a bag file, or a folder with nothing but a bag."""
     suffixes = {'.db3', '.mcap', '.bag', '.zstd', '.db3-wal', '.db3-shm'}
     if path.is_file():
         return path.suffix in suffixes

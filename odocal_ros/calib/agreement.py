@@ -25,10 +25,10 @@ CAUSES = {
     'scale_factor': {
         'two_point': 'slip or bad fixes at one of the marks'},
     'yaw_mounting_angle': {
-        'two_point': 'the heading it was given (alignment.heading_source) is wrong by about as '
-        'much'},
+        'two_point': 'an error of the configured heading (alignment.heading_source) of about '
+        'this size'},
     'pitch_mounting_angle': {
-        'two_point': 'heights at the marks, or an accelerometer bias'},
+        'two_point': 'heights at the marks, hills, or an accelerometer bias'},
 }
 
 
@@ -62,7 +62,7 @@ def disagreements(methods: dict[str, MethodResult]) -> list[Reason]:
                 off = (share(apart / a.value, '+') if name == 'scale_factor' else
                        f'{math.degrees(apart):+.3f} deg')
                 found.append(Reason(
-                    Code.METHODS_DISAGREE, f'{word} by {other.name} differs from that by '
-                    f'{better.name} by {off}, {abs(apart) / sigma:.1f} sigma; likely '
-                    f'cause: {CAUSES[name][other.name]}'))
+                    Code.METHODS_DISAGREE, f'{word}: {other.name} and {better.name} differ by '
+                    f'{off}, {abs(apart) / sigma:.1f} sigma; likely cause: '
+                    f'{CAUSES[name][other.name]}'))
     return found

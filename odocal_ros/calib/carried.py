@@ -84,5 +84,5 @@ def carried_from(content: dict[str, Any]) -> Carried:
 def _array(values: Any, shape: tuple[int, ...], nothing: float) -> Floats:
     found = np.array([nothing if x is None else float(x) for x in np.ravel(values)])
     if found.size != np.prod(shape) or np.isnan(found).any():
-        raise ValueError(f'{np.size(values)} numbers where {shape} are wanted, or null')
+        raise ValueError(f'{np.size(values)} numbers; required: {shape}, or null')
     return found.reshape(shape)

@@ -13,7 +13,7 @@ from odocal_ros.settings.levels import TYRE_SPREAD
 
 ANOTHER_SCALE = 2 * TYRE_SPREAD    # relative change of a scale beyond any tyres: physical
 TYRES = 'tyre pressure, wear, load or another tyre'
-OTHER = 'another vehicle, gear, counter or unit: no tyre changes so much'
+OTHER = 'another vehicle, gear, counter or unit: tyres do not change this much'
 
 
 def cause_of_change(relative: float) -> str:

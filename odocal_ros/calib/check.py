@@ -101,7 +101,7 @@ def mismatch(check: TrackCheck, fix_sigma: float, drift: float,
     if check.rms <= allowed:
         return ()
     return (Reason(Code.TRACK_MISMATCH, f'the corrected track is {check.rms:.1f} m rms from the '
-                   f'fixes, {allowed:.1f} m would be believable'),)
+                   f'fixes; the limit is {allowed:.1f} m'),)
 
 
 def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: float,
@@ -134,10 +134,11 @@ def bent(t: Floats, residual: Floats, chord_n: Floats, fix_sigma: float, drift: 
     allowed, most = _believable(sigma, distance), np.abs(across).max()
     if most <= allowed:
         return ()
-    return (Reason(Code.MODEL_MISMATCH, f'the track bends {most:.1f} m away from the fixes, '
-                   f'{allowed:.1f} m would be believable: a gyro that errs more than its grade, '
-                   'or rows of it that are wrong', 'Take the method smoother, which fits the gyro '
-                   'too; mend what drops or spoils rows, or copy the recording again.'),)
+    return (Reason(Code.MODEL_MISMATCH, f'the track deviates up to {most:.1f} m from the fixes; '
+                   f'the limit is {allowed:.1f} m. Likely cause: gyro errors larger than its '
+                   'grade, or invalid gyro values', 'Use method smoother, which also estimates '
+                   'the gyro errors. Check for lost or invalid IMU messages, or copy the '
+                   'recording again.'),)
 
 
 def steady(residual: Floats, fix_sigma: float) -> tuple[Bools, float]:

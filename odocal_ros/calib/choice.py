@@ -92,7 +92,7 @@ def passed_over(methods: Mapping[str, MethodResult], asked: str | tuple[str, ...
     why = [(m.name, next(r for r in m.reasons if r.code.gravity is Verdict.REJECTED))
            for m in found[:max(sound, default=0)] if m.verdict is Verdict.REJECTED]
     # one that lacks its data (a second wheel) had nothing to go by
-    return [Reason(Code.METHOD_REJECTED, f'{name} is left out, it says {r.code.name}: {r.text}')
+    return [Reason(Code.METHOD_REJECTED, f'{name} is not used, because of {r.code.name}: {r.text}')
             for name, r in why if r.code not in (Code.NO_METHOD, *said)]
 
 

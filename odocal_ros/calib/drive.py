@@ -63,14 +63,14 @@ def judge_way(track: Track, t_stop: float, metres_per_unit: float,
     distance = float(np.abs(np.diff(s)).sum())
     found: tuple[Reason, ...] = ()
     if distance < leg.min_distance:
-        found += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks, '
-                         f'{leg.min_distance:g} m are the least'),)
+        found += (Reason(Code.LEG_TOO_SHORT, f'{distance:.1f} m between the marks; the limit is '
+                         f'{leg.min_distance:g} m'),)
     if len(t) < 2:
         return distance, found
     top = float(np.abs(rate_over_second(t, s)).max())
     if top < leg.min_speed:
-        found += (Reason(Code.SPEED_TOO_LOW, f'the fastest second was {top:.2f} m/s, '
-                         f'{leg.min_speed:g} m/s are asked'),)
+        found += (Reason(Code.SPEED_TOO_LOW, f'highest speed (mean over 1 s) {top:.2f} m/s; the '
+                         f'limit is {leg.min_speed:g} m/s'),)
     return distance, found
 
 
@@ -92,8 +92,8 @@ def uncovered(travel: Travel, t_stop: float) -> tuple[Reason, ...]:
     what += [f'ends {early:.1f} s before the stop mark'] * (early > edge)
     if not what:
         return ()
-    return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is taken as far '
-                   'as it reaches'),)
+    return (Reason(Code.TOPIC_GAP, f'the odometer {" and ".join(what)}: the leg is limited to '
+                   'the odometer data'),)
 
 
 def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
@@ -117,8 +117,8 @@ def not_moving(travel: Travel, t_fix: Floats, fixes_n: Floats, fix_sigma: float,
         # m: physical, no wheel slides and no fix strays so far
         return _stopped(travel, t_here, here, max(100.0, 10 * fix_sigma))
     if fixes_move:
-        return (Reason(Code.ODOMETER_STILL, 'the fixes move, the odometer does not count'),)
-    return (Reason(Code.LEG_TOO_SHORT, 'the fixes stay in one place while the odometer counts'
+        return (Reason(Code.ODOMETER_STILL, 'the fixes move, but the odometer does not'),)
+    return (Reason(Code.LEG_TOO_SHORT, 'the odometer counts, but the fixes do not move'
                    if wheels_move else 'the vehicle did not move'),)
 
 
@@ -133,8 +133,8 @@ def _stopped(travel: Travel, t: Floats, fixes: Floats, least: float) -> tuple[Re
     # of the way: a counter that lacks less is within what tyres differ by, and seen elsewhere
     if far < least or far < TYRE_SPREAD * way_and_chord(t, fixes)[0]:
         return ()
-    return (Reason(Code.ODOMETER_STILL, f'the fixes move on by {far:.0f} m from t = {since:.0f} s '
-                   f'to {until:.0f} s, the odometer does not count'),)
+    return (Reason(Code.ODOMETER_STILL, f'the fixes move by {far:.0f} m from t = {since:.0f} s '
+                   f'to {until:.0f} s, but the odometer does not count'),)
 
 
 def _gone(fixes: Floats, least: float) -> float:

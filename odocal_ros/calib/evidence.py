@@ -122,9 +122,9 @@ def evidence(leg: Leg, inputs: Inputs, track: Track, fixes_n: Floats, kept: Bool
 
 def _gaps(inputs: Inputs, span: tuple[float, float],
           config: Config) -> tuple[tuple[str, float, float], ...]:
-    """Return where Imu or odometer pause while the vehicle moves: (which, begin, end)."""
+    """Return where IMU or odometer pause while the vehicle moves: (which, begin, end)."""
     travel = inputs.travel
-    found = [('Imu', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
+    found = [('IMU', a, b) for a, b in gaps_longer(inputs.t_imu, config.leg.max_gap)]
     found += [('odometer', a, b) for a, b in gaps_in_rhythm(travel.t)
               if travel.at(a) != travel.at(b)]      # some counters are silent where they stand
     return tuple((name, float(a), float(b)) for name, a, b in found
@@ -159,7 +159,7 @@ def _sent(leg: Leg, inputs: Inputs, kept: Bools, span: tuple[float, float],
         f'status below {gnss.min_status}' if fix.status[i] < gnss.min_status else
         f'sigma above {gnss.max_sigma:g} m' if 0 < gnss.max_sigma < sigma[i] else
         'far off the track' if usable[i] and row[t[i]] == i else
-        'stamp or position not believable' for i in out]
+        'implausible stamp or position' for i in out]
     status: Ints = fix.status[rows]
     return status, t[out], because
 

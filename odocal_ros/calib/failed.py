@@ -31,8 +31,9 @@ def failed(unknown: Callable[[Reason], MethodResult], name: str,
     """Return the result of a method that raised: what it gives where it refuses, and the trace."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     said = ' '.join(str(error).split())[:200]
-    reason = Reason(Code.METHOD_FAILED, f'method {name} broke: {type(error).__name__}'
-                    f'{f" ({said})" if said else ""} in {where.name}, line {where.lineno}')
+    reason = Reason(Code.METHOD_FAILED, f'method {name} failed with an internal error: '
+                    f'{type(error).__name__}{f" ({said})" if said else ""} in {where.name}, line '
+                    f'{where.lineno}')
     return replace(unknown(reason), details={TRACE: ''.join(traceback.format_exception(error))})
 
 

@@ -31,9 +31,9 @@ def _unit(ratio: float, unit: str, nominal: float) -> tuple[str, str]:
     """Return which unit a scale so far from its nominal looks like, and what to set then."""
     for known, what in MISTAKEN.get(unit, {}).items():
         if abs(ratio / known - 1) < 0.04:      # what tyres add: the ratios lie farther apart
-            return f', as {what} would be', (
-                f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or mend the sender; '
-                'else check the odometer: odometer.max_scale_deviation is the limit.')
+            return f', typical for {what}', (
+                f'If so, set odometer.nominal_scale to {known * nominal:.6g}, or correct the '
+                'sender. Otherwise check the odometer. The limit is odometer.max_scale_deviation.')
     return '', ''
 
 
@@ -45,14 +45,15 @@ def judge(estimates: Mapping[str, Estimate], nominal_scale: float,
     if scale.value is not None:
         relative = 0.0 if scale.sigma is None else scale.sigma / scale.value
         if relative > config.verdict.max_scale_sigma:
-            reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, f'scale sigma {share(relative)}, '
-                                  f'{share(config.verdict.max_scale_sigma)} asked'))
+            reasons.append(Reason(Code.SCALE_SIGMA_TOO_LARGE, 'scale uncertainty is '
+                                  f'{share(relative)}; the limit is '
+                                  f'{share(config.verdict.max_scale_sigma)}'))
         reasons += far_from_nominal(scale.value, scale.unit, nominal_scale, config)
     if yaw.value is not None and yaw.sigma is not None \
             and yaw.sigma > config.verdict.max_yaw_sigma:
         sigma, asked = np.rad2deg([yaw.sigma, config.verdict.max_yaw_sigma])
-        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw sigma {sigma:.3f} deg, {asked:.3f} '
-                              'deg asked'))
+        reasons.append(Reason(Code.YAW_SIGMA_TOO_LARGE, f'yaw uncertainty is {sigma:.3f} deg; '
+                              f'the limit is {asked:.3f} deg'))
     return tuple(reasons)
 
 
@@ -64,7 +65,7 @@ def far_from_nominal(scale: float, unit: str, nominal: float, config: Config) ->
     why, do = _unit(off + 1, unit, nominal)
     of = '' if unit == '1' else f' {unit}'
     return [Reason(Code.SCALE_FAR_FROM_NOMINAL, f'scale {scale:.6g}{of} is {100 * off:+.1f} % '
-                   f'from the nominal {nominal:.6g}{why}', do)]
+                   f'from the nominal value {nominal:.6g}{why}', do)]
 
 
 def share(relative: float, sign: str = '') -> str:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""How an Imu sits in the vehicle: up from gravity, forward from what driving does to it."""
+"""How an IMU sits in the vehicle: up from gravity, forward from what driving does to it."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ class Mounting:
     """
     The nominal rotation that a drive suggests.
 
-    C_bi : (3, 3) takes the Imu frame i to b (forward, left, up), quarter turns only; None where
+    C_bi : (3, 3) takes the IMU frame i to b (forward, left, up), quarter turns only; None where
         it cannot be told.
     forward_i : (3,) forward as measured, None if the drive does not show it.
     forward_sigma : rad.    assumed : forward was not measured but taken as x.
@@ -64,7 +64,7 @@ def remedy(found: Mounting) -> str:
         return ''
     rpy = ','.join(f'{x:.10g}' for x in found.rpy)
     return (f"Set imu.mounting_rpy: --set 'imu.mounting_rpy=[{rpy}]'"
-            + ", if the Imu's x axis points forward." * found.assumed + '.' * (not found.assumed))
+            + ", if the IMU's x axis points forward." * found.assumed + '.' * (not found.assumed))
 
 
 def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
@@ -79,7 +79,7 @@ def with_axes(reasons: Iterable[Reason], inputs: Inputs) -> list[Reason]:
 def mounting(t: Floats, w_i: Floats, f_i: Floats, travel: Travel,
              metres_per_unit: float) -> Mounting:
     """
-    Tell how an Imu sits.
+    Tell how an IMU sits.
 
     Parameters
     ----------

@@ -33,8 +33,8 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
     if len(units) > 1:
         which = '; '.join(f'{unit} in leg {_numbers(s.leg for s in scales if s.unit == unit)}'
                           for unit in units)
-        return (Reason(Code.LEGS_UNLIKE, f'the odometers are of different kinds, their scales '
-                       f'have no mean: {which}'),)
+        return (Reason(Code.LEGS_UNLIKE, 'the odometers have different units, so their scales '
+                       f'cannot be combined: {which}'),)
     far = _farthest(scales)
     if far and (more := far[1].value / far[0].value - 1) > TYRE_SPREAD:
         low, high = far
@@ -48,8 +48,8 @@ def unlike_legs(numbered: Sequence[tuple[int, LegResult]]) -> tuple[Reason, ...]
         low, high = far
         found.append(f'the yaw mounting of leg {high.leg} is {math.degrees(more):.1f} deg above '
                      f'that of leg {low.leg}')
-    return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: more than one vehicle with one '
-                   'mounting changes between drives'),) if found else ()
+    return (Reason(Code.LEGS_UNLIKE, f'{" and ".join(found)}: larger than changes of one vehicle '
+                   'with one mounting'),) if found else ()
 
 
 class _LegValue(NamedTuple):

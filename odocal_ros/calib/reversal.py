@@ -148,6 +148,6 @@ def against_travel(found: Pieces, signed: bool) -> tuple[Reason, ...]:
     if not back.any():
         return ()
     how = 'odometer.signed is false' if not signed else 'the counter does not count down'
-    return (Reason(Code.TRACK_MISMATCH, f'on {int(back.sum())} of {len(back)} pieces the '
-                   f'track runs against the fixes: the vehicle reversed and {how}',
+    return (Reason(Code.TRACK_MISMATCH, f'in {int(back.sum())} of {len(back)} sections the track '
+                   f'runs opposite to the fixes. Likely cause: the vehicle reversed and {how}',
                    Code.REVERSING_UNSIGNED.remedy),)

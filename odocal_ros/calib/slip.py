@@ -8,12 +8,12 @@
 # the License.
 
 """
-Wheel slip: where the odometer runs farther than the Imu's acceleration allows.
+Wheel slip: where the odometer runs farther than the IMU's acceleration allows.
 
 Over a few seconds the way is the integral of speed, and the speed that of the specific force along
 the forward axis less gravity. With the speed pinned to the odometer's at both ends of the window,
 a steady accelerometer bias and a tilt drop out; what a wheel spun in between does not. An odometer
-that is late, or whose speed is low-pass filtered, departs from the Imu at every change of
+that is late, or whose speed is low-pass filtered, departs from the IMU at every change of
 acceleration: the lateness at which the two agree best is estimated first.
 """
 
@@ -52,7 +52,7 @@ class Slips(NamedTuple):
     Where the wheels spun or slid.
 
     t : (k,) s, middle of each slip.   size : (k,) m, > 0 where the wheel spun, < 0 where it slid.
-    late : s by which the odometer is late against the Imu, where it would look like slip, else 0.
+    late : s by which the odometer is late against the IMU, where it would look like slip, else 0.
     """
 
     t: Floats
@@ -70,7 +70,7 @@ def rounding(travel: Travel) -> float:
 def find_slips(t_imu: Floats, f_b: Floats, track: Track, f: Floats, latitude: float,
                quantum: float) -> Slips:
     """
-    Return when and how far the odometer ran ahead of the Imu, its lateness taken out.
+    Return when and how far the odometer ran ahead of the IMU, its lateness taken out.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class _Windows:
     """
     The windows of a drive, from each of grid, (n,) s, on.
 
-    a : (n - 1,) m/s^2 along by the Imu.   turns : (m,) bool, windows that are not judged.
+    a : (n - 1,) m/s^2 along by the IMU.   turns : (m,) bool, windows that are not judged.
     track, K, quantum : Track, its scale, size of a count in scale units.
     """
 
@@ -121,7 +121,7 @@ class _Windows:
     quantum: float
 
     def excess(self, late: float) -> Floats:
-        """Return by how much the odometer exceeds the Imu in each window if so late, s: (m,) m."""
+        """Return by how much the odometer exceeds the IMU in each window if so late, s: (m,) m."""
         way = self.K * np.interp(self.grid + late, self.track.t, self.track.s)
         return np.where(self.turns, 0.0, excess_way(SPAN, self.a, way))
 
@@ -192,12 +192,12 @@ def slip_reasons(slips: Slips, time_offset: float) -> tuple[Reason, ...]:
     t, size, late = slips
     if late:
         found += (Reason(
-            Code.DELAY_SEEN, f'the stamps of the odometer are about {abs(late):.2f} s '
-            f'{"late" if late > 0 else "early"} against the Imu, or its speed is low-pass '
-            f'filtered; odometer.time_offset = {time_offset - late:.2f} would take a delay out'),)
+            Code.DELAY_SEEN, f'odometer stamps are about {abs(late):.2f} s '
+            f'{"late" if late > 0 else "early"} relative to the IMU, or the speed is low-pass '
+            f'filtered; odometer.time_offset = {time_offset - late:.2f} would remove a delay'),)
     if len(t):
         found += (Reason(
-            Code.WHEEL_SLIP, f'at {len(t)} place{"s" * (len(t) > 1)} the odometer and the '
-            f'Imu part by {np.abs(size).sum():.2f} m in all, first by {size[0]:+.2f} m at '
-            f't = {t[0]:.1f} s: the wheel spun or slid'),)
+            Code.WHEEL_SLIP, f'odometer and IMU disagree by {np.abs(size).sum():.2f} m in total '
+            f'at {len(t)} place{"s" * (len(t) > 1)}, first by {size[0]:+.2f} m at t = {t[0]:.1f} '
+            's: the wheel spun or slid'),)
     return found

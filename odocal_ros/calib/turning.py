@@ -65,14 +65,15 @@ def gyro_reasons(ratio: float | None, gyro_scale: float) -> tuple[Reason, ...]:
     if ratio is None or ONE_MOTION_RATIO[0] < ratio < ONE_MOTION_RATIO[1]:
         return ()
     if ratio < -ONE_MOTION_RATIO[0]:
-        return (Reason(Code.GYRO_SIGN, 'where the fixes turn left the gyro turns right (ratio '
-                       f'{ratio:.2f} instead of 1)'),)
+        return (Reason(Code.GYRO_SIGN, 'the gyro turns opposite to the course of the fixes '
+                       f'(ratio {ratio:.2f} instead of 1)'),)
     degrees = 40.0 < ratio < 80.0       # 180 / pi, within what scale errors and skid make of it
     if abs(ratio) < 0.01:       # no unit makes that of a turn: revolutions make 0.16
-        return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.2g} times as far as the course '
-                       'of the fixes, next to nothing', 'Mend the sender, or set '
-                       'imu.mounting_rpy: the axis that turns may be another.'),)
+        return (Reason(Code.IMU_UNITS, f'the gyro shows only {ratio:#.2g} times the turns of the '
+                       'fixes', 'Set imu.mounting_rpy if another IMU '
+                       'axis is vertical; otherwise correct the IMU driver.'),)
     wanted = gyro_scale * (np.pi / 180 if degrees else 1 / ratio)
-    return (Reason(Code.IMU_UNITS, f'the gyro turns {ratio:#.3g} times as far as the course of '
-                   'the fixes' + ', as deg/s would' * degrees,
-                   f'Mend the sender, or set imu.gyro_scale to {wanted:.10g}.'),)
+    return (Reason(Code.IMU_UNITS, f'the gyro shows {ratio:#.3g} times the turns of the '
+                   'fixes' + ', as deg/s would' * degrees,
+                   f'Set imu.gyro_scale to {wanted:.10g}, or correct the unit in the IMU '
+                   'driver.'),)

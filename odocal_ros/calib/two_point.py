@@ -122,7 +122,7 @@ def refusal(chord: Chord, scale_guess: float) -> tuple[Reason, ...]:
     for name, chord_length in (('', length), (' of the dead-reckoned track', reckoned)):
         if chord_length <= path / 5:
             return (Reason(Code.CHORD_TOO_SHORT, f'the line between start and end{name} is '
-                           f'{chord_length:.1f} m, under a fifth of the way driven, about '
+                           f'{chord_length:.1f} m, less than a fifth of the path length of about '
                            f'{path:.0f} m'),)
     return ()
 
@@ -243,24 +243,27 @@ def _judge_angles(alignment: Alignment, yaw: float, pitch: float, sources: tuple
     reasons: tuple[Reason, ...] = ()
     if not alignment.heading_separable:
         reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'the only heading is the course over ground, '
-                           'which holds the mounting angle: end points see but the sum of both'),)
+                           'which includes the mounting angle: the end points only constrain the '
+                           'sum'),)
     elif share > asked:
-        reasons += (Reason(Code.YAW_NOT_SEPARABLE, f'the heading ({alignment.heading_source}) is '
-                           f'known to {np.rad2deg(share):.3f} deg, the yaw is asked to '
-                           f'{np.rad2deg(asked):.3f} deg: end points see but their sum'),)
+        reasons += (Reason(Code.YAW_NOT_SEPARABLE, 'heading uncertainty '
+                           f'({alignment.heading_source}) is {np.rad2deg(share):.3f} deg, the '
+                           f'yaw limit is {np.rad2deg(asked):.3f} deg: the end points only '
+                           'constrain the sum of heading and yaw'),)
     nominal = config.imu.nominal_yaw
     far = abs(float(wrap(yaw - (0.0 if np.isnan(nominal) else nominal))))
     if alignment.heading_separable and far > BACKWARDS_YAW:
-        reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs against the fixes: positive '
-                           f'counts mean backwards, or the Imu faces backwards (yaw '
-                           f'{np.rad2deg(yaw):+.1f} deg)'),)
+        reasons += (Reason(Code.ODOMETER_REVERSED, 'the track runs opposite to the fixes: '
+                           'positive counts mean backwards, or the IMU x axis points backwards '
+                           f'(yaw {np.rad2deg(yaw):+.1f} deg)'),)
     elif alignment.heading_separable and far > FAR_YAW:
         reasons += (Reason(Code.YAW_FAR_FROM_NOMINAL, f'heading ({alignment.heading_source}) and '
-                           f'course make a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
-                           f'{np.rad2deg(far):.1f} deg from the nominal one'),)
+                           f'course give a yaw mounting of {np.rad2deg(yaw):+.1f} deg, '
+                           f'{np.rad2deg(far):.1f} deg from its nominal value'),)
     if not vertical_known:
-        reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height good enough for '
-                           f'the pitch; taken as 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg'),)
+        reasons += (Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too '
+                           f'inaccurate for the pitch; 0 +- {np.rad2deg(PITCH_PRIOR):.1f} deg is '
+                           'assumed'),)
     return reasons
 
 
@@ -294,6 +297,6 @@ def _planes_agree(check: dict[str, dict[str, float]], K: float,
     worst = max(abs(c['scale_factor'] / K - 1) for c in check.values())
     # relative: a plane about the leg keeps ratios of chords far better
     if worst > 3e-5 + 0.2 * sigma_relative:
-        return (Reason(Code.PLANES_DISAGREE, f'the scale by plane or geodesic differs by '
-                       f'{worst * 1e6:.0f} ppm from that in space'),)
+        return (Reason(Code.PLANES_DISAGREE, 'the scale in the plane or on the geodesic differs '
+                       f'by {worst * 1e6:.0f} ppm from the scale in space'),)
     return ()

@@ -106,8 +106,8 @@ class LegRecorder:
         """
         Return a recorder with the rows so far, which another thread may close.
 
-        This one goes on untouched: ``close`` joins the blocks of the copy, and joined blocks
-        could no longer be forgotten bit by bit.
+        This recorder continues unchanged: ``close`` joins the blocks of the copy, and joined
+        blocks can no longer be released one by one.
         """
         copy = LegRecorder()
         copy.form, copy.form_right = self.form, self.form_right
@@ -139,8 +139,8 @@ class LegRecorder:
         """
         days = (stop_ns - start_ns) / 86400e9
         if days > MOST_DAYS:
-            raise BadData(f'the leg lasts {days:.0f} days by the stamps of its rows: a clock was '
-                          'set while it was recorded, or they are damaged; mark a part of it by '
+            raise BadData(f'the leg lasts {days:.0f} days according to its stamps: a clock was '
+                          'set during recording, or the stamps are damaged; mark a section with '
                           '--leg A:B')
         first_ns = start_ns - round(preroll * 1e9)
         rows = {slot: _cut(self.rows(slot), first_ns, stop_ns) for slot in SLOTS}
@@ -149,8 +149,8 @@ class LegRecorder:
 
 
 def part_of(leg: Leg, start_ns: int, stop_ns: int, first_ns: int | None) -> Leg:
-    """Return what lies between two stamps of a leg; ``first_ns``: no Imu row before it is."""
-    lead_ns = 10**9    # of odometer and fixes, to interpolate at the first row of the Imu
+    """Return the part of a leg between two stamps; ``first_ns``: no IMU row before it."""
+    lead_ns = 10**9    # of odometer and fixes, to interpolate at the first row of the IMU
     rows = {slot: _cut(getattr(leg, slot), (first_ns or 0) - lead_ns, stop_ns) for slot in SLOTS}
     imu = rows['imu']
     rows['imu'] = take(imu, (imu.stamp_ns >= (first_ns or 0)) & (imu.stamp_ns <= stop_ns))
@@ -169,7 +169,7 @@ def _placed(stamp_ns: Ints, received_ns: Ints) -> Ints:
 
 def _cut(samples: SomeSamples, first_ns: int, stop_ns: int) -> SomeSamples:
     key = by_row(_placed, samples.stamp_ns, samples.received_ns)
-    after_ns = 600 * 10**9    # a first row later than that after a mark tells nothing of it
+    after_ns = 600 * 10**9    # a first row later than that after a mark has no information on it
     after = key[(key > stop_ns) & (key <= stop_ns + after_ns)]
     last_ns = after.min() if len(after) else stop_ns
     keep = (key >= first_ns) & (key <= last_ns)

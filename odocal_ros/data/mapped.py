@@ -10,8 +10,8 @@
 """
 Arrays that lie in files without a name: hours of samples, and what is worked in for so long.
 
-Whoever reads them sees arrays like any others. ``let_go`` gives back the memory of all of them
-once they are large: what is wanted again is read again. Where the disk takes no more, arrays are
+For readers they are normal arrays. ``let_go`` gives back the memory of all of them
+once they are large: released data is read again on access. If the disk takes no more, arrays are
 in memory.
 """
 
@@ -35,7 +35,7 @@ _lock = Lock()
 
 
 def nameless() -> BinaryIO:
-    """Return a file that goes with whoever holds it."""
+    """Return a file that is removed with its last reference."""
     return tempfile.TemporaryFile(prefix='odocal_')
 
 

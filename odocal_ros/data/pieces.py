@@ -10,7 +10,7 @@
 """
 Long columns some rows at a time: row by row, step by step, medians; to the last bit as if at once.
 
-The Imu of a long leg is most of the memory that a computation takes, and each column as long as it
+The IMU of a long leg is most of the memory that a computation takes, and each column as long as it
 is as much again.
 """
 
@@ -36,12 +36,12 @@ def chunks(n: int) -> Iterator[slice]:
 
 
 def by_row(function: Callable[..., Array], *columns: Array) -> Array:
-    """Return what a function makes of each row of arrays, (n, ...) to (n,)."""
+    """Return the result of a function for each row of arrays, (n, ...) to (n,)."""
     return by_step(function, *columns, steps=0)
 
 
 def by_step(function: Callable[..., Array], *columns: Array, steps: int = 1) -> Array:
-    """Return what a function of rows side by side, (m, ...) to (m - steps,), makes of them all."""
+    """Return the results of a function of adjacent rows, (m, ...) to (m - steps,)."""
     n = len(columns[0]) - steps
     if n <= PIECE_ROWS:
         return function(*columns)
@@ -65,7 +65,7 @@ def lengths(x: Floats) -> Floats:
 
 def median(x: Floats) -> float:
     """
-    Return what numpy has for the median of x, (n,), of many rows in a fourth of its time.
+    Return the median of x, (n,), like numpy but four times as fast for many rows.
 
     Only what lies about the median of some of them is put in order.
     """

@@ -68,7 +68,7 @@ class OdometerForm:
     ``quantity`` is ``cumulative`` (a counter or angle), ``increment`` (since the row before) or
     ``rate`` (m/s, or rad/s of a joint). ``modulus`` is the counter's span in counts, 0 for values
     that do not roll over. ``scale_unit`` is the unit of the scale factor: ``m/pulse``, ``m/rad``
-    or ``1``. ``sides`` is false where two values come and nothing tells which is the left wheel:
+    or ``1``. ``sides`` is false for two values with unknown sides (left or right wheel):
     only their mean has a meaning. ``chosen`` says what the reader took of a message, unasked.
     """
 
@@ -137,8 +137,8 @@ def freeze(owner: Samples, **rows: Any) -> None:
         given = np.asarray(getattr(owner, name))
         array = np.array(given, dtype=dtype, order='C')
         if array.shape != (n, *shape):
-            raise BadData(f'{type(owner).__name__}.{name}: want shape {(n, *shape)}, '
-                          f'got {array.shape}')
+            raise BadData(f'{type(owner).__name__}.{name}: required shape {(n, *shape)}, found '
+                          f'{array.shape}')
         array.setflags(write=False)
         object.__setattr__(owner, name, array)
 

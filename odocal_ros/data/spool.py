@@ -10,7 +10,7 @@
 """
 Rows of a topic: up to MEMORY_BYTES in memory, hours of them in a file without a name.
 
-Two hours of an Imu at 1 kHz are 0.8 GB. What lies in the file is mapped: whoever reads it sees
+Two hours of an IMU at 1 kHz are 0.8 GB. What lies in the file is mapped: a reader sees
 arrays like any others, and ``mapped.let_go`` gives their memory back. Where the disk takes no
 more, rows stay in memory.
 """

@@ -28,7 +28,7 @@ from odocal_ros.fleet.leg_text import leg_text
 from odocal_ros.fleet.rows import changed_settings, DONE, FAILED, key_of, Row, RowStore
 from odocal_ros.outside.names import said_by
 
-# what is said where there is no memory for a thread's stack, or for a library
+# error texts without memory for the stack of a thread, or for a library
 NO_MEMORY = ("can't start new thread", 'failed to map segment')
 
 
@@ -66,7 +66,7 @@ class BagJob:
 
 @dataclass(frozen=True)
 class Done:
-    """What the command is told of a bag; the rest is in its row."""
+    """The report on a bag to the command; the rest is in its row."""
 
     key: str
     status: str
@@ -94,8 +94,8 @@ def calibrate_bag(job: BagJob) -> Done:
         except Exception as error:     # noqa: BLE001 one bag stops nobody
             why = f'internal error ({type(error).__name__}: {said_by(error)}); please report it'
             if isinstance(error, MemoryError) or any(x in str(error) for x in NO_MEMORY):
-                why = f'needs more memory than --task-memory gives ({job.memory / 2**20:g} MiB)'
-    # where memory is not refused any more: the row needs some
+                why = f'exceeds the memory limit --task-memory ({job.memory / 2**20:g} MiB)'
+    # outside the memory limit: the row needs memory
     row = job.failed(why, seen=seen, seconds=time.monotonic() - began)
     store.put(row)
     return Done(row.key, FAILED, row.reason, row.seconds, True)
@@ -163,14 +163,14 @@ def _bounded(job: BagJob, give_up: Callable[[str], None]) -> Iterator[None]:
 
     def end() -> None:
         with suppress(Exception):
-            give_up(f'took longer than --task-timeout gives ({job.seconds:g} s)')
+            give_up(f'exceeded the time limit --task-timeout ({job.seconds:g} s)')
         os.kill(os.getpid(), signal.SIGKILL)
 
     clock = threading.Timer(job.seconds, end)
     clock.daemon = True
     if job.seconds:
         clock.start()
-        later = 10.0    # s after which what cannot even be told is ended
+        later = 10.0    # s after which a worker without an answer is ended
         faulthandler.dump_traceback_later(job.seconds + later, exit=True)   # needs no interpreter
     before = resource.getrlimit(resource.RLIMIT_DATA)
     if job.memory:

@@ -60,7 +60,7 @@ def find_bags(names: list[str], vehicle_from: str | None) -> list[FleetBag]:
     bags = [_named(bag, pattern) for name in names for bag in _bags_in(name)]
     unique = list(dict.fromkeys(bags))
     if not unique:
-        raise BadUsage(f'{", ".join(names)}: no bag is there; give a manifest, bags, or folders '
+        raise BadUsage(f'{", ".join(names)}: no bag found; give a manifest, bags, or folders '
                        'with bags')
     return unique
 
@@ -69,11 +69,11 @@ def _pattern(text: str) -> re.Pattern[str]:
     try:
         pattern = re.compile(text)
     except re.error as error:
-        raise BadUsage(f'--vehicle-from {text}: {error}; want a pattern with a group, as in '
-                       "'fleet/(?P<vehicle>[^/]+)/'") from None
+        raise BadUsage(f'--vehicle-from {text}: {error}; required: a pattern with a group, such '
+                       "as 'fleet/(?P<vehicle>[^/]+)/'") from None
     if not pattern.groups:
-        raise BadUsage(f"--vehicle-from {text}: it has no group; mark the vehicle's name, as in "
-                       "'fleet/(?P<vehicle>[^/]+)/'")
+        raise BadUsage(f"--vehicle-from {text}: it has no group; mark the vehicle's name, such "
+                       "as 'fleet/(?P<vehicle>[^/]+)/'")
     return pattern
 
 
@@ -82,7 +82,7 @@ def _named(bag: str, pattern: re.Pattern[str] | None) -> FleetBag:
         return FleetBag(PurePosixPath(bag).parent.name, bag)
     found = pattern.search(bag)
     if found is None:
-        raise BadUsage(f'--vehicle-from {pattern.pattern}: does not fit {bag}')
+        raise BadUsage(f'--vehicle-from {pattern.pattern}: does not match {bag}')
     more = found.groupdict()
     return FleetBag(more.get('vehicle') or found[1] or '', bag, more.get('model') or '',
                     _number(more.get('odometer_km'), bag))
@@ -94,7 +94,7 @@ def _number(value: Any, where: str) -> float | None:
     try:
         return float(value)
     except ValueError:
-        raise BadUsage(f'{where}: odometer_km {value!r} is no number') from None
+        raise BadUsage(f'{where}: odometer_km {value!r} is not a number') from None
 
 
 def _of_manifest(name: str) -> list[FleetBag]:
@@ -115,9 +115,9 @@ def _of_manifest(name: str) -> list[FleetBag]:
         raise BadUsage(f'{name}: cannot be read as a manifest ({said_by(error)})') from None
     lacking = {'vehicle', 'bag'} - set(table.column_names)
     if lacking or not table.num_rows:
-        raise BadUsage(f'{name}: {"no column " + " and ".join(sorted(lacking)) if lacking else ""}'
-                       f'{"" if lacking else "holds no bag"}; want vehicle, bag and, as wished, '
-                       f'{", ".join(COLUMNS[2:])}')
+        what = f'no column {" and ".join(sorted(lacking))}' if lacking else 'holds no bag'
+        raise BadUsage(f'{name}: {what}; '
+                       f'required columns: vehicle, bag; optional: {", ".join(COLUMNS[2:])}')
     known = [column for column in COLUMNS if column in table.column_names]
     root = name[:len(name) - len(PurePosixPath(name).name)]
     bags = []
@@ -172,7 +172,7 @@ def _url(name: str, fs: Any, path: str) -> str:
 
 
 def is_local(url: str) -> bool:
-    """Return whether a path or URL is of this machine; no server is asked."""
+    """Return True if a path or URL is on this machine; no server is contacted."""
     from fsspec.utils import get_protocol
     return get_protocol(url) in ('file', 'local')
 
@@ -191,7 +191,7 @@ def seen_as(url: str, settings: str) -> str:
         fs, path = file_system(url)
         files = fs.find(path, detail=True) if fs.isdir(path) else {path: fs.info(path)}
         if not files:
-            raise FileNotFoundError(f'{url}: there is nothing')
+            raise FileNotFoundError(f'{url}: not found')
     except Exception as error:     # noqa: BLE001 each kind of server has errors of its own
         raise BadBag(f'{url}: {said_by(error) or type(error).__name__}') from None
     dates = ('mtime', 'ETag', 'etag', 'LastModified', 'last_modified', 'updated', 'modify', 'CRC')
@@ -207,7 +207,7 @@ def _fits(url: str, fs: Any, path: str, folder: str) -> None:
     free = shutil.disk_usage(folder).free
     if size > free // 2:
         raise BadBag(f'{url}: its copy takes {size / 1e9:.1f} GB of {free / 1e9:.1f} GB free in '
-                     f'{Path(folder).parent}; make room, or give workers another '
+                     f'{Path(folder).parent}; free disk space, or give workers another '
                      '--local-directory')
 
 

@@ -8,7 +8,7 @@
 # the License.
 
 """
-When a vehicle changed: steps in a value over its legs (tyres, pressure, a moved Imu), and drift.
+When a vehicle changed: steps in a value over its legs (tyres, pressure, a moved IMU), and drift.
 
 The legs' values are one level, steps, a slope and errors of known covariance: what is each leg's
 own, what legs share, and the walk that a scale is known for. Of the slope, all steps and all
@@ -41,7 +41,7 @@ class History:
     What a value did.
 
     changes : in order.   odd : legs that stand alone.   slope, slope_sigma : per unit of ``t``;
-    None where nothing tells it.
+    None if not determined.
     """
 
     changes: tuple[Change, ...] = ()
@@ -90,35 +90,35 @@ def history(y: Floats, V: Floats, t: Floats | None = None) -> History:
     found = sorted(_selected(z, level[:, None], W, chance(n)))
     known = [k for k in found if k != slope]
     size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
-    told = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
-    if drifts and slope not in told and n > len(found) + 2:
+    ratio = {k: (float(size[i]), float(sigma[i])) for i, k in enumerate(found, 1)}
+    if drifts and slope not in ratio and n > len(found) + 2:
         X = np.column_stack([level, W[:, found], W[:, slope]])
         if np.linalg.matrix_rank(X) == X.shape[1]:
             size, sigma = _fit(z, X)
-            told[slope] = float(size[-1]), float(sigma[-1])
-    return History(tuple(Change(k + 1, *told[k]) for k in known if k < n - 1),
+            ratio[slope] = float(size[-1]), float(sigma[-1])
+    return History(tuple(Change(k + 1, *ratio[k]) for k in known if k < n - 1),
                    tuple(k - n + 2 for k in known if k >= n - 1),
-                   *told.get(slope, (None, None)))
+                   *ratio.get(slope, (None, None)))
 
 
 def _selected(z: Floats, level: Floats, W: Floats, least: float) -> list[int]:
-    """Return which columns of W explain z, beside the level, beyond chance."""
+    """Return the columns of W that explain z significantly, in addition to the level."""
     found: list[int] = []
     while len(found) < (len(z) - 1) // 2 or not found:
         rest, left = _without(np.column_stack([level, W[:, found]]), z, W)
         size = np.linalg.norm(left, axis=0)
-        told = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
+        ratio = np.where(size > 1e-6 * np.linalg.norm(W, axis=0), left.T @ rest
                         / np.maximum(size, 1e-300), 0.0)
-        best = int(np.argmax(np.abs(told)))
-        if abs(told[best]) <= least:
+        best = int(np.argmax(np.abs(ratio)))
+        if abs(ratio[best]) <= least:
             break
         found.append(best)
     while found:
         size, sigma = _fit(z, np.column_stack([level, W[:, found]]))
-        told = np.abs(size[1:] / sigma[1:])
-        if told.min() > least:
+        ratio = np.abs(size[1:] / sigma[1:])
+        if ratio.min() > least:
             break
-        del found[int(told.argmin())]
+        del found[int(ratio.argmin())]
     return found
 
 

@@ -29,7 +29,7 @@ GIB = 2**30    # definition: bytes
 def _bytes(text: str) -> int:
     found = re.fullmatch(r'(\d+(?:\.\d+)?) ?([KMG]?)(?:i?B)?', text)
     if not found or not float(found[1]):
-        raise argparse.ArgumentTypeError(f'{text}: want a size, as in 2G or 500M')
+        raise argparse.ArgumentTypeError(f'{text}: required: a size such as 2G or 500M')
     units = {'': 1, 'K': 2**10, 'M': 2**20, 'G': GIB}
     return int(float(found[1]) * units[found[2]])
 
@@ -40,7 +40,7 @@ def _positive(text: str) -> int:
     except ValueError:
         number = 0
     if number < 1:
-        raise argparse.ArgumentTypeError(f'{text}: want a whole number from 1 on')
+        raise argparse.ArgumentTypeError(f'{text}: required: a whole number, 1 or more')
     return number
 
 
@@ -50,25 +50,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('bags', nargs='+', metavar='BAG', help='a manifest (.csv or .parquet with columns vehicle '
         'and bag), or bags, folders of bags, globs, URLs')
     add('--output', required=True, metavar='DIR', help='folder for rows and results; all workers '
-        'must reach it')
+        'must have access')
     add('--vehicle-from', metavar='PATTERN', help='regular expression on the path of a bag whose '
         "group names the vehicle (default: the bag's folder)")
-    add('--scheduler', metavar='ADDRESS', help='Dask cluster, as tcp://host:8786 (default: local '
-        'processes)')
-    add('--workers', type=_positive, metavar='N', help='local processes (default: as many as '
-        'cores and memory allow)')
-    add('--task-timeout', type=float, default=TIMEOUT, metavar='S', help='longest time for a bag '
+    add('--scheduler', metavar='ADDRESS', help='Dask cluster, such as tcp://host:8786 (default: '
+        'local processes)')
+    add('--workers', type=_positive, metavar='N', help='number of local processes (default: '
+        'limited by cores and memory)')
+    add('--task-timeout', type=float, default=TIMEOUT, metavar='S', help='time limit per bag '
         f'(default {TIMEOUT:g})')
-    add('--task-memory', type=_bytes, default=2 * GIB, metavar='SIZE', help='most memory for a '
+    add('--task-memory', type=_bytes, default=2 * GIB, metavar='SIZE', help='memory limit per '
         'bag (default 2G)')
-    add('--tries', type=_positive, default=3, metavar='N', help='of a bag that ends its local '
-        'worker (default 3)')
-    add('--again', action='store_true', help='try bags once more that failed')
-    add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles whose '
-        'own report is drawn')
-    add('--kpi', action='store_true', help='with limits (--accept): judge each leg by them, and '
-        "the decisions by each vehicle's result of all legs; kpi.json")
-    add('--files', action='store_true', help='write the load-ready files of each vehicle')
+    add('--tries', type=_positive, default=3, metavar='N', help='retries of a bag that ends its '
+        'local worker (default 3)')
+    add('--again', action='store_true', help='retry bags that failed')
+    add('--reports', choices=('flagged', 'all', 'none'), default='flagged', help='vehicles that '
+        'get a report of their own')
+    add('--kpi', action='store_true', help='with limits (--accept): compare the decision on each '
+        'leg with the decision on all legs of the vehicle; writes kpi.json')
+    add('--files', action='store_true', help='write ready-to-load files for each vehicle')
     add('--quiet', action='store_true', help='print nothing but errors, and the lines of --accept')
     add_calibration_arguments(parser)
 
@@ -84,13 +84,13 @@ def run(args: argparse.Namespace) -> int:
     from odocal_ros.fleet.outcome import asked, exit_code, said, write_outcome
     from odocal_ros.offline.cli import OK, REJECTED
     if not args.task_timeout > 0:
-        raise BadUsage(f'--task-timeout {args.task_timeout:g}: want seconds above 0')
+        raise BadUsage(f'--task-timeout {args.task_timeout:g}: required: seconds above 0')
     output = Path(args.output)
     bags = find_bags(args.bags, args.vehicle_from)
     jobs = bag_jobs(bags, args, output, args.task_timeout, args.task_memory)
     limits = limits_of(asked(jobs))
     if args.kpi and not limits:
-        raise BadUsage('--kpi judges legs by limits: give --accept NAME=LOW:HIGH')
+        raise BadUsage('--kpi needs limits: give --accept NAME=LOW:HIGH')
     writable(output)
     with engine(args.scheduler, args.workers, args.task_memory, args.tries) as client:
         if not args.quiet:
@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _computed(client: Any, jobs: 'list[BagJob]', args: argparse.Namespace) -> list[str]:
-    """Have all rows; return the file of each, and tell how far it is meanwhile."""
+    """Compute all rows; return the file of each, and show the progress."""
     from tqdm import tqdm
 
     from odocal_ros.fleet.jobs import computed_rows

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The legs that a vehicle has driven: by time, what they tell of a value, which are rejected."""
+"""The legs that a vehicle has driven: by time, their values, and which are rejected."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from odocal_ros.fleet.changes import covariance, History, history
 from odocal_ros.fleet.leg_text import legs_from
 from odocal_ros.fleet.rows import Row
 from odocal_ros.fleet.tables import utc
-from odocal_ros.library.bags import told_apart
+from odocal_ros.library.bags import unique_names
 from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Reason, Verdict
 from odocal_ros.settings.config import Config
@@ -46,11 +46,11 @@ class Driven:
 
 
 def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[Driven]:
-    """Return the legs of rows by time, those of bags of one name told apart as replay does it."""
+    """Return the legs of rows by time, with unique bag names as in replay."""
     legs = [legs_from(row.legs) for row in rows]
     entries = [{'bag': next((leg.bag for leg in some), row.bag)}
                for row, some in zip(rows, legs, strict=True)]
-    named, _ = told_apart([Path(row.bag) for row in rows], legs, entries)
+    named, _ = unique_names([Path(row.bag) for row in rows], legs, entries)
     km = [known[row.bag].odometer_km if row.bag in known else row.odometer_km
           for row, some in zip(rows, legs, strict=True) for _ in some]
     return sorted((Driven(leg, k) for leg, k in zip(named, km, strict=True)),
@@ -59,16 +59,16 @@ def driven_legs(rows: Sequence[Row], known: dict[str, FleetBag]) -> list[Driven]
 
 def history_of(name: str, driven: Sequence[Driven],
                config: Config) -> tuple[list[int], History, History]:
-    """Return which legs tell of a value, its history over days, and over kilometres."""
-    told = []
+    """Return the legs that determine a value, its history over days, and over kilometres."""
+    found = []
     for k, one in enumerate(driven):
         e = one.estimates.get(name)
         if one.leg.verdict is not Verdict.REJECTED and e is not None and e.value is not None:
-            told.append((k, e.value, one.leg.methods[e.method]))
-    if not told:
+            found.append((k, e.value, one.leg.methods[e.method]))
+    if not found:
         return [], History(), History()
     scale = name == 'scale_factor'
-    number, values, methods = (list(column) for column in zip(*told, strict=True))
+    number, values, methods = (list(column) for column in zip(*found, strict=True))
     value = np.array(values)
     y = np.log(value / value[0]) if scale else np.asarray(wrap(value - value[0]))
     own, shared = _errors(name, methods)
@@ -76,9 +76,9 @@ def history_of(name: str, driven: Sequence[Driven],
     days -= days[0]
     V = covariance(own, shared, days, config.verdict.scale_drift_per_day if scale else 0.0)
     km = [driven[k].odometer_km for k in number]
-    by_way = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
+    by_distance = History() if not scale or None in km else history(y, V, np.array(km) / 1000)
     year = 365.25    # days
-    return number, history(y, V, days / year), by_way
+    return number, history(y, V, days / year), by_distance
 
 
 def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -98,7 +98,7 @@ def _errors(name: str, methods: Sequence[Any]) -> tuple[np.ndarray, list[np.ndar
 
 
 def rejecting(leg: LegResult) -> list[Reason]:
-    """Return why a leg is rejected, empty where it is not."""
+    """Return the explanation why a leg is rejected, empty if it is not."""
     return [r for r in (*leg.reasons, *(r for m in leg.methods.values() for r in m.reasons))
             if r.code.gravity is Verdict.REJECTED and leg.verdict is Verdict.REJECTED]
 
@@ -110,8 +110,8 @@ def rejected_from(driven: Sequence[Driven]) -> int:
 
 
 def gone(lost: Sequence[Driven]) -> Reason:
-    """Say that a vehicle is not known as it is now, and why."""
+    """Return the reason why the current state of a vehicle is unknown."""
     last = rejecting(lost[-1].leg)[0]
     since = f'{utc(lost[0].leg.start_ns):%Y-%m-%d}'
-    return replace(last, text=f'the last {len(lost)} legs, from {since} on, are all rejected: '
+    return replace(last, text=f'the last {len(lost)} legs, since {since}, are all rejected: '
                    f'{last.text}')

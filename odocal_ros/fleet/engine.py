@@ -20,9 +20,9 @@ from odocal_ros.errors import BadUsage, OdocalError
 
 NEEDS = ('cryptography', 'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas')
 MEMORY = 2 * 2**30       # judgement: bytes for a task, unless said
-FEWEST = 50              # judgement: of them, least: workers may be on their way
-LOST = ('the Dask scheduler is gone; start it again and give the same command: what is done is '
-        'kept')
+FEWEST = 50              # judgement: of them, least: workers may be starting
+LOST = ('the connection to the Dask scheduler is lost; start it again and repeat the command: '
+        'finished bags are kept')
 
 
 class EngineLost(OdocalError):
@@ -54,8 +54,8 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
         try:
             client = Client(scheduler, timeout='5s')
         except (OSError, RuntimeError, ValueError) as error:
-            raise BadUsage(f'--scheduler {scheduler}: nobody answers there ({error}); start one '
-                           'with: dask scheduler') from None
+            raise BadUsage(f'--scheduler {scheduler}: no answer ({error}); start one with: dask '
+                           'scheduler') from None
         with client:
             yield client
         return
@@ -67,7 +67,7 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
             # a look at the stack each 10 ms costs a core a twentieth
             'distributed.worker.profile.enabled': False,
             # without Dask's MALLOC_TRIM_THRESHOLD_: memory given back at once is a page fault when
-            # it is wanted next, which took a quarter of a bag's time
+            # it is needed next, which took a quarter of a bag's time
             'distributed.nanny.pre-spawn-environ': dict.fromkeys(
                 ('OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), 1)}
     with dask.config.set(ours), LocalCluster(
@@ -80,14 +80,14 @@ def engine(scheduler: str | None, workers: int | None, memory: int,
 
 
 def _workers(memory: int) -> int:
-    """Return how many processes cores and free memory allow."""
+    """Return the number of processes that cores and free memory allow."""
     import psutil
     free = int(psutil.virtual_memory().available)
     return max(1, min(len(os.sched_getaffinity(0)), free // memory))
 
 
 def dashboard(client: Any) -> str:
-    """Return where the engine can be watched, and what that needs."""
+    """Return the address of the dashboard, and its requirements."""
     if not client.dashboard_link:
         return 'none'
     hint = '' if find_spec('bokeh') else ' (pip install bokeh to see it)'

@@ -62,10 +62,10 @@ def _population(name: str, rows: list[dict[str, Any]]) -> tuple[str, str, str]:
         every += [(at[i], off[i]) for i in keep]
     _within(ax, np.array(every))
     ax.set_xticks(range(len(models)), [model or 'no model' for model in models])
-    ax.set_ylabel('off the median, ' + ('%' if scale else 'deg'))
+    ax.set_ylabel('deviation from the median, ' + ('%' if scale else 'deg'))
     title = f'{TITLES[name]} by model.'
-    says = ('One point a vehicle with its sigma; red: far from its model; an arrow: beyond the '
-            'picture.')
+    says = ('One point per vehicle with its sigma; red: outlier of its model; arrow: outside the '
+            'plot.')
     return svg(figure, f'population-{COMPARED[name]}', f'{title} {says}'), title, says
 
 
@@ -85,42 +85,42 @@ def _within(ax: Any, points: np.ndarray) -> None:
 
 
 def _control(vehicles: Sequence[dict[str, Any]], legs: Path) -> tuple[str, str, str] | None:
-    """Draw the scale of legs over dates, those that changed or drift told apart."""
+    """Draw the scale of legs over dates, those that changed or drift highlighted."""
     from odocal_ros.output.plots_svg import BLUE, GREEN, GREY, PINK, RED, sheet, svg
     base = {row['vehicle']: row['scale_factor'] for row in vehicles if row['scale_factor']}
-    most_lines = 6    # vehicles that are told apart in time
-    told = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
+    most_lines = 6    # vehicles that are highlighted
+    named = [row['vehicle'] for row in vehicles if row['vehicle'] in base and any(
         change['value'] == 'scale_factor' for change in json.loads(row['changes']))][:most_lines]
-    told += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
-             and row['vehicle'] not in told][:most_lines - len(told)]
-    found = _legs(legs, set(base), set(told))
+    named += [row['vehicle'] for row in vehicles if row['vehicle'] in base and flagged(row)
+             and row['vehicle'] not in named][:most_lines - len(named)]
+    found = _legs(legs, set(base), set(named))
     if not found:
         return None
     figure, (ax,) = sheet(3.4)
     rest = np.array([(day, value / base[vehicle]) for vehicle, day, value, _ in found
-                     if vehicle not in told]).reshape(-1, 2)
+                     if vehicle not in named]).reshape(-1, 2)
     ax.plot(rest[:, 0].astype('datetime64[s]'), (rest[:, 1] - 1) * 100, '.', ms=2.5, color=GREY,
             label='others')
     styles = [(colour, mark) for mark in 'os' for colour in (BLUE, RED, GREEN, PINK)]
-    for vehicle, (colour, mark) in zip(told, styles, strict=False):
+    for vehicle, (colour, mark) in zip(named, styles, strict=False):
         own = sorted((day, value, sigma) for name, day, value, sigma in found if name == vehicle)
         day, value, sigma = np.array(own).T
         ax.errorbar(day.astype('datetime64[s]'), (value / base[vehicle] - 1) * 100,
                     sigma / base[vehicle] * 100, fmt=f'{mark}-', ms=3.5, lw=1.0, color=colour,
                     label=vehicle[:18])
-    ax.set_ylabel('scale off the present one, %')
+    ax.set_ylabel('deviation from the current scale, %')
     figure.autofmt_xdate(rotation=20, ha='right')
     figure.subplots_adjust(bottom=0.2, top=0.82)
     figure.legend(loc='upper center', borderaxespad=0.2, ncols=4, handlelength=1.4,
                   columnspacing=1.0)
     title = 'Scale over time.'
-    says = ('Legs against the present scale of their vehicle; with lines: vehicles that changed '
-            'or want looking at, the worst first.')
+    says = ('Legs relative to the current scale of their vehicle. Lines: vehicles that changed '
+            'or need inspection, the worst first.')
     return svg(figure, 'control', f'{title} {says}'), title, says
 
 
-def _legs(path: Path, known: set[str], told: set[str]) -> list[tuple[str, float, float, float]]:
-    """Return (vehicle, seconds since 1970, scale, sigma) of legs, of others than told thinned."""
+def _legs(path: Path, known: set[str], named: set[str]) -> list[tuple[str, float, float, float]]:
+    """Return (vehicle, seconds since 1970, scale, sigma) of legs, thinned for other vehicles."""
     import pyarrow.parquet as pq
     columns = ['vehicle', 'start_ns', 'scale_factor', 'scale_factor_sigma', 'verdict']
     with pq.ParquetFile(path) as file:
@@ -132,7 +132,7 @@ def _legs(path: Path, known: set[str], told: set[str]) -> list[tuple[str, float,
                 k += 1
                 vehicle = row['vehicle']
                 if row['scale_factor'] is None or row['verdict'] == 'rejected' \
-                        or vehicle not in known or vehicle not in told and k % every:
+                        or vehicle not in known or vehicle not in named and k % every:
                     continue
                 found.append((vehicle, row['start_ns'] / 1e9, row['scale_factor'],
                               row['scale_factor_sigma'] or 0.0))

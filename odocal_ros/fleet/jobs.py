@@ -30,7 +30,7 @@ def bag_jobs(bags: Sequence[FleetBag], args: Namespace, folder: Path, seconds: f
     Return a job for each bag.
 
     args : as replay's options parse them (``add_calibration_arguments``).   config : settings
-    that go before them, in any form that the library takes.
+    that take precedence, in any form accepted by the library.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def computed_rows(client: Any, jobs: Sequence[BagJob],
 
 def _known(store: RowStore, job: BagJob) -> str | None:
     """Return the key of the row of a bag on this machine that is unchanged."""
-    if not is_local(job.bag.bag):      # a server is asked by the worker: it may not answer
+    if not is_local(job.bag.bag):      # the worker contacts servers: they may not answer
         return None
     try:
         return store.known(seen_as(job.bag.bag, job.settings))
@@ -103,7 +103,7 @@ def _known(store: RowStore, job: BagJob) -> str | None:
 def _why(error: BaseException) -> str:
     from distributed.scheduler import KilledWorker
     if isinstance(error, KilledWorker):
-        return (f'its worker was ended {error.allowed_failures + 1} times while it was computed: '
+        return (f'its worker ended {error.allowed_failures + 1} times during the computation: '
                 'killed, or out of memory')
     return f'{type(error).__name__}: {error}'
 

@@ -8,12 +8,12 @@
 # the License.
 
 """
-How good short drives are at telling good vehicles from bad ones: odocal fleet --kpi.
+Pass and fail rates of single legs against all legs of a vehicle: odocal fleet --kpi.
 
-The result of all legs of a vehicle since its last change is the reference. Its sigma is widened by
-the scatter of these legs beyond their own sigmas, since tyres warm and wear between drives. Where
-two sigma of it lie within all limits the vehicle is good, where they lie outside of one it is bad;
-others are on the limit and left out. Each leg is judged by the same limits alone.
+The result of all legs of a vehicle since its last change is the reference. Its sigma is increased
+by the scatter of these legs beyond their own sigmas, since tyres warm and wear between drives. The
+vehicle is good if the 2-sigma interval is within all limits, and bad if it is outside one of them;
+other vehicles are left out. Each leg is tested against the same limits.
 """
 
 from collections.abc import Iterable, Sequence
@@ -33,14 +33,14 @@ from odocal_ros.settings.config import Config, with_settings
 
 KPI = 'kpi.json'
 NORMAL = 1.4826                  # statistical: sigma over the median of absolute errors
-FEWEST = 3                       # judgement: legs of a reference, of which a piece is one
-MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: ends of the rows of the table
+FEWEST = 3                       # judgement: legs of a reference; a tested leg is one of them
+MINUTES = (2.0, 5.0, 10.0, 30.0)      # judgement: upper ends of the rows of the table
 Limits = dict[str, tuple[float, float]]
 
 
 @dataclass
 class Count:
-    """Legs by what they were said to be and what their vehicles are."""
+    """Numbers of legs by their decision and by the class of their vehicle."""
 
     good_pass: int = 0
     good_fail: int = 0
@@ -56,7 +56,7 @@ class Count:
         setattr(self, name, getattr(self, name) + 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return counts and rates; None where there is nothing to divide by."""
+        """Return counts and rates; None if a denominator is 0."""
         good = self.good_pass + self.good_fail + self.good_open
         bad = self.bad_pass + self.bad_fail + self.bad_open
         return {
@@ -72,18 +72,18 @@ def _ratio(part: int, whole: int) -> float | None:
 
 
 def limits_of(settings: dict[str, Any]) -> Limits:
-    """Return the limits that settings hold."""
+    """Return the limits in settings."""
     return dict(with_settings(Config(), settings).accept.limits)
 
 
 def kpi(vehicles: Iterable[dict[str, Any]], legs: Iterable[dict[str, Any]],
         limits: Limits) -> dict[str, Any]:
-    """Return the figures of rows of vehicles.parquet and legs.parquet, of all and by duration."""
+    """Return the rates from rows of vehicles.parquet and legs.parquet, of all and by duration."""
     last: dict[str, list[dict[str, Any]]] = {}
     for leg in legs:
         kept = last.setdefault(leg['vehicle'], [])
         if kept and leg['period'] != kept[-1]['period']:
-            kept.clear()          # by date: a change of the vehicle begins anew
+            kept.clear()          # by date: a change of the vehicle starts a new reference
         kept.append(leg)
     counts = {end: Count() for end in (*MINUTES, math.inf)}
     whole, judged = Count(), {'good': 0, 'bad': 0, 'on_the_limit': 0}
@@ -109,7 +109,7 @@ def _estimate(row: dict[str, Any], name: str) -> Estimate:
 
 
 def _decision(row: dict[str, Any], limits: Limits) -> Decision:
-    """Return what limits say of a vehicle or a leg; a rejected one is undecided."""
+    """Return the decision of the limits on a vehicle or a leg; rejected ones are undecided."""
     if row['verdict'] == Verdict.REJECTED.value:
         return Decision.UNDECIDED
     return max((hold(name, _estimate(row, name), *ends).decision
@@ -118,13 +118,13 @@ def _decision(row: dict[str, Any], limits: Limits) -> Decision:
 
 def _widened(row: dict[str, Any], legs: Sequence[dict[str, Any]],
              limits: Limits) -> dict[str, float]:
-    """Return the sigmas of a reference with the scatter of its legs."""
+    """Return the sigmas of a reference, increased by the scatter of its legs."""
     found = {}
     for name in limits:
         sigma = f'{name}_sigma'
         known = [leg for leg in legs if None not in (leg[name], leg[sigma])]
         if row[name] is not None and row[sigma] is not None and known:
-            # by the median: a leg that is plainly wrong is what is to be counted
+            # by the median: a wrong leg must be counted, not widen the reference
             scatter = NORMAL * median(abs(leg[name] - row[name]) for leg in known)
             beyond = scatter**2 - median(leg[sigma] for leg in known)**2
             found[sigma] = math.sqrt(row[sigma]**2 + max(beyond, 0.0))
@@ -132,7 +132,7 @@ def _widened(row: dict[str, Any], legs: Sequence[dict[str, Any]],
 
 
 def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) -> str:
-    """Write kpi.json; return it as lines for a terminal."""
+    """Write kpi.json; return the table as printed lines."""
     import pyarrow.parquet as pq
     columns = ['vehicle', 'verdict', 'period', 'duration_s', *(
         f'{name}{part}' for name in VALUES for part in ('', '_sigma'))]
@@ -147,8 +147,8 @@ def write_kpi(vehicles: Sequence[dict[str, Any]], limits: Limits, output: Path) 
 
 def _lines(found: dict[str, Any], output: Path) -> str:
     of = found['vehicles']
-    lines = ['', f'legs judged by the limits: {of["good"]} good vehicles, {of["bad"]} bad, '
-             f'{of["on_the_limit"]} left out (on the limit, or fewer than {FEWEST} legs)',
+    lines = ['', f'legs tested against the limits: {of["good"]} good vehicles, {of["bad"]} bad, '
+             f'{of["on_the_limit"]} left out (undecided, or fewer than {FEWEST} legs)',
              f'  {"minutes":<10}{"legs":>7}{"precision":>11}{"recall":>9}{"false accept":>14}'
              f'{"false reject":>14}{"undecided":>11}']
     for row in [*found['by_minutes'], {'up_to': 'all'} | found['all']]:

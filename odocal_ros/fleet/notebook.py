@@ -20,7 +20,7 @@ from odocal_ros.errors import BadUsage
 def calibrate_bags(bags: Any, config: Any = None, client: Any = None,
                    output: str | Path | None = None, **options: Any) -> Any:
     """
-    Calibrate bags, each by itself, and return a pandas DataFrame with a row a leg.
+    Calibrate bags separately, and return a pandas DataFrame with one row per leg.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def _bag(row: Mapping[str, Any]) -> Any:
 
 
 def _arguments(options: dict[str, Any]) -> Any:
-    """Return what replay's options would parse to."""
+    """Return the parsed options of replay."""
     from argparse import ArgumentParser
 
     from odocal_ros.offline.replay import add_calibration_arguments
@@ -78,7 +78,7 @@ def _arguments(options: dict[str, Any]) -> Any:
     args = parser.parse_args([])
     unknown = set(options) - set(vars(args))
     if unknown:
-        raise BadUsage(f'calibrate_bags knows no {", ".join(sorted(unknown))}; want '
+        raise BadUsage(f'calibrate_bags has no option {", ".join(sorted(unknown))}; options: '
                        f'{", ".join(sorted(vars(args)))}')
     for name, value in options.items():
         setattr(args, name, value)

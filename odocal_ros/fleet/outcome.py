@@ -62,7 +62,7 @@ def write_outcome(client: Any, jobs: Sequence[BagJob], rows: Sequence[str], outp
 
 
 def asked(jobs: Sequence[BagJob]) -> dict[str, Any]:
-    """Return what was asked of results now, whatever the rows were made with."""
+    """Return the limits of this run, independent of those of the rows."""
     from odocal_ros.fleet.rows import NOT_OF_LEGS
     from odocal_ros.library.asked import config_of
     from odocal_ros.settings.config import flat
@@ -113,7 +113,7 @@ def draw_report(job: ReportJob) -> str:
 
 
 def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
-    """Return what a person must know of a fleet."""
+    """Return the summary of a fleet for people."""
     counts = Counter(row['decision'] or row['verdict'] for row in vehicles)
     failed = sum(row['bags_failed'] for row in vehicles)
     bags = sum(row['bags'] for row in vehicles)
@@ -128,7 +128,7 @@ def said(vehicles: Sequence[dict[str, Any]], output: Path, most: int) -> str:
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
-    """Return what is worth saying of a vehicle."""
+    """Return the remarks on a vehicle."""
     out = [row['decision'] or row['verdict']]
     for change in json.loads(row['changes']):
         size = (f'{100 * change["size"]:+.2f} %' if change['value'] == 'scale_factor' else
@@ -136,11 +136,11 @@ def remarks(row: dict[str, Any]) -> list[str]:
         odometer = change['value'] == 'scale_factor' and abs(change['size']) > TYRE_SPREAD
         out.append(f'{change["value"].replace("_", " ")} changed by {size} between '
                    f'{change["after"][:10]} and {change["by"][:10]}'
-                   + ', which no tyres do: look at the odometer' * odometer)
+                   + ', too large for tyres: check the odometer' * odometer)
     if row['outlier']:
-        out.append(f'{" and ".join(row["outlier"].split())} far from its model')
+        out.append(f'{" and ".join(row["outlier"].split())} outlier of its model')
     if row['odd_legs']:
-        out.append(f'odd leg {", ".join(row["odd_legs"].split())}')
+        out.append(f'outlier leg {", ".join(row["odd_legs"].split())}')
     if row['rejected_for']:
         since = f', all since {row["rejected_since"]:%Y-%m-%d}' if row['rejected_since'] else ''
         out.append(f'{row["legs"] - row["legs_good"]} of {row["legs"]} legs rejected '

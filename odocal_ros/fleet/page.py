@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""fleet.html: one page that needs no network, for whoever answers for all the vehicles."""
+"""fleet.html: one page that needs no network, for the owner of the fleet."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -18,7 +18,7 @@ from odocal_ros.settings.levels import NORMAL_MEDIAN
 
 Floats = NDArray[np.float64]
 FAR = 4.0            # statistical: sigmas of a vehicle from its model: by chance one in 16,000
-LEAST = 3            # judgement: vehicles of which a spread can be told
+LEAST = 3            # judgement: vehicles needed for a spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Population:
 
 def population(values: Floats, sigmas: Floats) -> Population:
     """
-    Return what vehicles have in common, values (n,) with their sigmas.
+    Return the population of vehicles, values (n,) with their sigmas.
 
     The spread is that with which half of all lie as near to the mean as the normal law says; the
     mean is Huber's, so that a vehicle far off moves neither.

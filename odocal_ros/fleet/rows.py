@@ -88,7 +88,7 @@ class RowStore:
         self.folder = Path(folder)
 
     def path(self, key: str) -> Path:
-        """Return where the row of a key is."""
+        """Return the path of the row of a key."""
         return self.folder / 'rows' / key[:2] / f'{key}.parquet'
 
     def put(self, row: Row) -> None:
@@ -142,7 +142,7 @@ def row_schema() -> Any:
 
 
 def _whole(path: Path) -> bool:
-    """Return whether a file begins and ends as Parquet does: one that was cut does not."""
+    """Return True if a file starts and ends as Parquet does; a truncated one does not."""
     with open(path, 'rb') as file:
         head = file.read(len(MAGIC))
         file.seek(-len(MAGIC), os.SEEK_END)
@@ -168,6 +168,6 @@ def rows_of(paths: Iterable[Path | str]) -> Iterator[Row]:
                 table = pq.ParquetFile(file).read(use_threads=False)
                 rows = [Row(**entry) for entry in table.cast(row_schema()).to_pylist()]
             except (pa.ArrowException, OSError, TypeError, ValueError) as error:
-                raise BadData(f'{path} is no row of a fleet ({said_by(error)}); remove it and '
-                              'give the command again') from None
+                raise BadData(f'{path} is not a fleet row ({said_by(error)}); remove it and '
+                              'repeat the command') from None
         yield from rows

@@ -162,7 +162,7 @@ def beside_their_model(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def flagged(row: dict[str, Any]) -> bool:
-    """Return whether somebody should look at a vehicle."""
+    """Return True if a vehicle needs inspection."""
     return bool(row['outlier'] or row['bags_failed'] or row['odd_legs'] or row['rejected_for']
                 or json.loads(row['changes']) or row['verdict'] == 'rejected'
                 or row['decision'] in ('FAIL', 'UNDECIDED'))

@@ -106,7 +106,7 @@ def write_table(path: Path, schema: Any, tables: Iterable[Any]) -> None:
 
 
 class _Sink:
-    """A file that pyarrow may write to and believes it has closed."""
+    """A file that pyarrow can write and that ignores its close."""
 
     closed = False
 

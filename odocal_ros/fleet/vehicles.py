@@ -37,7 +37,7 @@ from odocal_ros.pipeline.calibrate import combine
 from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, with_settings
 
-GONE = 2             # judgement: last legs, all rejected: one may be but a drive gone wrong
+FEWEST_REJECTED = 2             # judgement: last legs, all rejected; one alone may be a bad drive
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Vehicle:
 
 
 def vehicle_of(job: VehicleJob) -> Vehicle:
-    """Return what the rows of a vehicle's bags say of it."""
+    """Return the vehicle result from the rows of its bags."""
     rows = [row for row in rows_of(job.rows) if row.vehicle == job.vehicle]
     known = {bag.bag: bag for bag in job.bags}
     done = sorted((row for row in rows if row.status == DONE), key=lambda row: row.start_ns)
@@ -81,9 +81,9 @@ def vehicle_of(job: VehicleJob) -> Vehicle:
     now = driven[starts[-1]:]
     calibration = combine([one.leg for one in now], config, imu=known_imu(config))
     lost = driven[rejected_from(driven):]
-    if len(lost) >= GONE and calibration.verdict is not Verdict.REJECTED:
+    if len(lost) >= FEWEST_REJECTED and calibration.verdict is not Verdict.REJECTED:
         calibration = replace(calibration, reasons=(gone(lost), *calibration.reasons))
-    row |= _told(calibration, config, driven, starts) | _changes(histories, driven) \
+    row |= _current(calibration, config, driven, starts) | _changes(histories, driven) \
         | {'rejected_for': ' '.join(dict.fromkeys(
             r.code.name for one in driven for r in rejecting(one.leg))),
            'rejected_since': utc(lost[0].leg.start_ns) if lost else None}
@@ -116,9 +116,9 @@ def _periods(histories: dict[str, Any]) -> list[int]:
                          for change in found.changes})
 
 
-def _told(calibration: Calibration, config: Config, driven: Sequence[Driven],
+def _current(calibration: Calibration, config: Config, driven: Sequence[Driven],
           starts: Sequence[int]) -> dict[str, Any]:
-    """Return what the calibration since the last change says."""
+    """Return the calibration since the last change."""
     estimates, legs = calibration.estimates, [one.leg for one in driven]
     row: dict[str, Any] = {}
     for name in VALUES:
@@ -143,19 +143,20 @@ def _told(calibration: Calibration, config: Config, driven: Sequence[Driven],
 def _changes(histories: dict[str, Any], driven: Sequence[Driven]) -> dict[str, Any]:
     """Return the changes of all values by date, and the drift of the scale."""
     found = []
-    for name, (number, told, _) in histories.items():
-        for change in told.changes:
+    for name, (number, history, _) in histories.items():
+        for change in history.changes:
             before, after = (driven[number[k]].leg for k in (change.leg - 1, change.leg))
             found.append({
                 'value': name, 'after': _iso(before.start_ns), 'by': _iso(after.start_ns),
                 'leg': number[change.leg] + 1, 'size': _size(name, change), 'sigma': change.sigma,
                 'unit': '1' if name == 'scale_factor' else 'rad'})
-    odd = Counter(number[k] + 1 for number, told, _ in histories.values() for k in told.odd)
-    _, by_date, by_way = histories['scale_factor']
+    odd = Counter(number[k] + 1 for number, history, _ in histories.values() for k in history.odd)
+    _, by_date, by_distance = histories['scale_factor']
     return {'changes': json.dumps(sorted(found, key=lambda change: change['by'])),
             'odd_legs': ' '.join(map(str, sorted(odd))),
             'drift_per_year': by_date.slope, 'drift_per_year_sigma': by_date.slope_sigma,
-            'drift_per_1000_km': by_way.slope, 'drift_per_1000_km_sigma': by_way.slope_sigma}
+            'drift_per_1000_km': by_distance.slope,
+            'drift_per_1000_km_sigma': by_distance.slope_sigma}
 
 
 def _size(name: str, change: Change) -> float:
@@ -167,7 +168,8 @@ def _leg_row(job: VehicleJob, k: int, one: Driven, starts: Sequence[int],
     model = next((b.model for b in job.bags if b.model), '')
     return leg_row(job.vehicle, model, k + 1, one.odometer_km, one.leg) | {
         'period': sum(start <= k for start in starts),
-        'odd': any(k in (number[i] for i in told.odd) for number, told, _ in histories.values())}
+        'odd': any(k in (number[i] for i in history.odd)
+                   for number, history, _ in histories.values())}
 
 
 def _iso(stamp_ns: int) -> str:

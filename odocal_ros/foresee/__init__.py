@@ -7,4 +7,4 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a leg will tell while it is driven, on few of its rows; without ROS."""
+"""Forecast of a leg during the drive, from few of its rows; without ROS."""

@@ -8,7 +8,7 @@
 # the License.
 
 """
-What a drive can tell as things are configured and heard, and what it cannot, before it is driven.
+Values that a drive can determine with these settings and inputs, before it is driven.
 
 Asked of the code that will judge the leg: the alignment it will have, the methods that run.
 """
@@ -30,18 +30,18 @@ from odocal_ros.settings.config import Config, with_settings
 EXACT_HEADING = 1e-6      # rad; judgement: of a heading that is said to be known exactly
 COURSE_FIX_SIGMA = 1.5    # m; physical: of a single receiver, that a course may come from
 SOURCES = {'fixed': 'the configured heading', 'heading_topic': 'the heading topic',
-           'imu_orientation': "the Imu's orientation", 'gyrocompass': 'the gyrocompass'}
+           'imu_orientation': 'the IMU orientation', 'gyrocompass': 'the gyrocompass'}
 ALL_SAMPLES = 'smoother'   # the method that needs no heading from outside
 
 
 @dataclass(frozen=True)
-class Heard:
+class Received:
     """
     What came before the start mark.
 
     variances : of the yaw, rad^2, that ``heading_topic`` and ``imu_orientation`` state, inf where
     none is sent.   rested_s : length of the standstill that the leg begins with, or last had.
-    latitude : rad.   height : the fixes carry one.   felt : the Imu sends its acceleration.
+    latitude : rad.   height : the fixes carry one.   felt : the IMU has an accelerometer.
     """
 
     variances: dict[str, float]
@@ -54,7 +54,7 @@ class Heard:
 
 @dataclass(frozen=True)
 class Ability:
-    """Quantities that the drive can tell, those that it cannot and why, what weakens all."""
+    """Observable quantities, those that are not with the cause, and a common weakness."""
 
     can: tuple[str, ...]
     cannot: tuple[str, ...]
@@ -63,58 +63,60 @@ class Ability:
     def words(self) -> str:
         """Return it as a sentence."""
         *first, last = self.can
-        told = f'{", ".join(first)} and {last}' if first else last
-        text = f'this drive can tell {told}'
+        values = f'{", ".join(first)} and {last}' if first else last
+        text = f'observable: {values}'
         if self.cannot:
-            text += f'; it cannot tell {"; nor ".join(self.cannot)}'
+            text += f'; not observable: {"; ".join(self.cannot)}'
         return text + (f'; {self.weak}' if self.weak else '')
 
 
-def ability(config: Config, heard: Heard) -> Ability:
-    """Return what a leg that starts here can tell and what not."""
+def ability(config: Config, received: Received) -> Ability:
+    """Return the values that a leg can estimate with these settings, and those it cannot."""
     methods = [name for name in METHODS if name in deciding(config.method)
-               and (heard.felt or name != ALL_SAMPLES)]
-    told = [(True, 'the scale'), _yaw(config, heard, methods),
-            (True, 'the pitch') if heard.height else
-            (False, 'the pitch, since the fixes carry no height')]
-    if not heard.felt:
-        told[-1] = False, 'the pitch, since the Imu sends no acceleration'
-    if heard.two_wheels:
-        told += _of_two_wheels(config)
-    weak = '' if heard.rested_s >= config.leg.standstill else (
-        'level and gyro bias come from the drive itself, since it starts without a standstill')
-    return Ability(tuple(text for can, text in told if can),
-                   tuple(text for can, text in told if not can), weak)
+               and (received.felt or name != ALL_SAMPLES)]
+    values = [(True, 'the scale'), _yaw(config, received, methods),
+            (True, 'the pitch') if received.height else
+            (False, 'the pitch (fixes without height)')]
+    if not received.felt:
+        values[-1] = False, 'the pitch (IMU without acceleration)'
+    if received.two_wheels:
+        values += _of_two_wheels(config)
+    weak = '' if received.rested_s >= config.leg.standstill else (
+        'level and gyro bias are estimated from the drive, because it starts without a standstill')
+    return Ability(tuple(text for can, text in values if can),
+                   tuple(text for can, text in values if not can), weak)
 
 
-def _yaw(config: Config, heard: Heard, methods: Sequence[str]) -> tuple[bool, str]:
+def _yaw(config: Config, received: Received, methods: Sequence[str]) -> tuple[bool, str]:
     if ALL_SAMPLES in methods:
-        return True, 'the yaw (by stops, starts and turns)'
-    alignment = _alignment(config, heard)
+        return True, 'the yaw (from stops, starts and turns)'
+    alignment = _alignment(config, received)
     if not alignment.heading_separable:
-        return False, ('the yaw, since the course over ground, which holds it, is the only '
-                       'heading: give another (alignment.heading_source)')
+        return False, ('the yaw (the only heading is the course over ground, which includes it: '
+                       'set alignment.heading_source)')
     source, sigma = SOURCES[alignment.heading_source], math.degrees(alignment.heading_sigma)
     asked = math.degrees(config.verdict.max_yaw_sigma)
     if sigma >= asked:
-        return False, f'the yaw to {asked:.2g} deg, since {source} is good to {sigma:.2g} deg'
-    return True, f'the yaw (by {source}, {sigma:.2g} deg)'
+        return False, (f'the yaw to {asked:.2g} deg ({source} has an uncertainty of {sigma:.2g} '
+                       'deg)')
+    return True, f'the yaw (from {source}, {sigma:.2g} deg)'
 
 
 def _of_two_wheels(config: Config) -> list[tuple[bool, str]]:
     if ALL_SAMPLES not in deciding(config.method):
-        return [(False, f'left from right wheel, since method {config.method} takes their mean')]
+        return [(False, f'left and right wheel separately (method {config.method} uses their '
+                 'mean)')]
     width = config.odometer.track_width
     return [(True, 'left and right wheel')] + [(True, 'the track width (in turns)')] * (not width)
 
 
-def _alignment(config: Config, heard: Heard) -> Alignment:
+def _alignment(config: Config, received: Received) -> Alignment:
     """Return the alignment that a drive straight on from here will have."""
-    rest = heard.rested_s if heard.rested_s >= config.leg.standstill else 0.0
+    rest = received.rested_s if received.rested_s >= config.leg.standstill else 0.0
     t = np.arange(-min(rest, config.leg.preroll), 60.0, 0.5)
     drive = from_rates(t, np.where(t >= 0.0, 10.0, 0.0), np.zeros_like(t),
-                       latitude=heard.latitude)
-    return plan_alignment(drive, with_heading(config, heard.variances), COURSE_FIX_SIGMA,
+                       latitude=received.latitude)
+    return plan_alignment(drive, with_heading(config, received.variances), COURSE_FIX_SIGMA,
                           drive.standstills(config.leg.standstill))[0]
 
 
@@ -129,7 +131,7 @@ def with_heading(config: Config, variances: dict[str, float]) -> Config:
     """
     Return config with the heading source, and its sigma, that the alignment will find.
 
-    variances : as in ``Heard``. What is left ``auto`` is a gyrocompass or the course, as the
+    variances : as in ``Received``. What is left ``auto`` is a gyrocompass or the course, as the
     alignment itself decides.
     """
     asked = config.alignment

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Whose clock differs from the Imu's, from the blocks as they come, and how it is said."""
+"""Whose clock differs from the IMU's, from the blocks as they come, and how it is said."""
 
 from collections import deque
 
@@ -20,20 +20,20 @@ from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import CLOCK_APART, DAY_NS
 
 IMU_BLOCKS = 40       # judgement: newest, that rows of others are laid beside: some seconds
-CLOCK_ROWS = 10       # judgement: newest of a topic that its clock is told by
+CLOCK_ROWS = 10       # judgement: newest of a topic that determine its clock
 
 
 class Clocks:
     """
-    Compares the stamps of rows that arrived together: whose clock differs from the Imu's.
+    Compares the stamps of rows that arrived together: whose clock differs from the IMU's.
 
-    simulated : arrivals are told by the node's clock when it hears them, not when they are sent.
+    simulated : arrivals are times of the node's clock at reception, not at sending.
     """
 
     def __init__(self, simulated: bool = False) -> None:
         self._simulated = simulated
         self._imu: deque[tuple[Ints, Ints]] = deque(maxlen=IMU_BLOCKS)
-        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the Imu's
+        self._waiting: dict[str, tuple[int, int]] = {}      # newest row of others, till the IMU's
         self._ahead_s: dict[str, deque[float]] = {}
 
     def feed(self, slot: str, block: Samples) -> None:
@@ -48,7 +48,7 @@ class Clocks:
         received, stamps = (np.concatenate(column) for column in zip(*self._imu, strict=True))
         first_received, first_stamp = int(received[0]), int(stamps[0])
         received, stamps = received - first_received, stamps - first_stamp
-        # messages that queued for a node in simulated time arrive late, the Imu's more so than
+        # messages that queued for a node in simulated time arrive late, the IMU's more so than
         # others': which of them belong together is not known then
         queued = self._simulated and np.ptp(received - stamps) > CLOCK_APART * 1e9
         for name, (row_ns, stamp_ns) in list(self._waiting.items()):
@@ -61,15 +61,15 @@ class Clocks:
                 self._ahead_s.setdefault(name, deque(maxlen=CLOCK_ROWS)).append(float(ahead))
 
     def differing(self, config: Config) -> list[tuple[str, float]]:
-        """Return (slot, s ahead of the Imu) of topics whose clock differs, offsets applied."""
+        """Return (slot, s ahead of the IMU) of topics whose clock differs, offsets applied."""
         offsets = {'odometer': config.odometer.time_offset, 'fix': config.gnss.time_offset,
                    'odometer_right': config.odometer.time_offset,
                    'fix_velocity': config.gnss.time_offset}
         result = []
         for slot, ahead in self._ahead_s.items():
             offset = offsets.get(slot, 0.0) - config.imu.time_offset
-            # latency on the way makes a row look older: behind are those of whom the freshest is;
-            # that of an Imu's row makes others look newer: ahead are those of whom most are
+            # latency makes a row look older: only a clock whose freshest row is behind, is behind;
+            # that of an IMU's row makes others look newer: ahead are those of whom most are
             value = max(min(max(ahead) + offset, 0.0), float(np.median(ahead)) + offset)
             if abs(value) > CLOCK_APART:
                 result.append((slot, value))
@@ -77,9 +77,9 @@ class Clocks:
 
 
 def clocks_differ(clocks: list[tuple[str, float]]) -> str:
-    """Return the sentence about clocks that differ from the Imu's."""
-    seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} the '
-                     "Imu's" for slot, s in clocks)
+    """Return the sentence about clocks that differ from the IMU's."""
+    seen = ', '.join(f'{slot} stamps are {_apart(abs(s))} {"ahead of" if s > 0 else "behind"} '
+                     'the IMU stamps' for slot, s in clocks)
     return f'CLOCKS_DIFFER: {seen}. {remedy(max((s for _, s in clocks), key=abs))}'
 
 

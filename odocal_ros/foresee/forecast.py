@@ -19,10 +19,10 @@ from odocal_ros.reasons import Reason
 
 PERCENT_FROM = 0.01       # judgement: relative sigma from which it is said in per cent
 FARTHEST_M = 2e4          # judgement: who must drive on for more needs something else
-# judgement: standstill at an end that is foreseen and asked for; it levels well and tells the gyro
+# judgement: standstill at a predicted end; it gives the level and the gyro
 # bias
 REST_FORESEEN_S = 10.0
-SOURCE_SHARE = 0.01    # judgement: of the variance; a source of less is not told
+SOURCE_SHARE = 0.01    # judgement: of the variance; smaller sources are not listed
 # estimate: unit at the end of its key
 RUNNING = {'scale_factor': '', 'yaw_mounting_angle': '_rad', 'pitch_mounting_angle': '_rad'}
 
@@ -36,11 +36,11 @@ class Prospect:
     """
     What is foreseen of one parameter.
 
-    sigma, asked : relative or rad; sigma None: not determined by the way so far.
-    metres : m more for what is asked, 0: enough, None: no way makes it.
+    sigma, asked : relative or rad; sigma None: not determined by the data so far.
+    metres : m more for the limit, 0: reached, None: unreachable.
     sources : (name, sigma) of the errors that matter, the largest first.
-    why : what keeps it from what is asked where no way helps.
-    now : the value so far, for people, where the drive tells it before its end.
+    why : cause why more driving does not reach the limit.
+    now : the value so far, for people, if it is determined before the end.
     lack : what to drive for it, besides metres.
     """
 
@@ -62,23 +62,23 @@ class Prospect:
         if self.now and sigma is not None:
             known = f'{name} {self.now} +- {sigma} {unit}'
         if self.lack:
-            return f'{known} so far (asked {asked})' if self.now else (
+            return f'{known} so far (limit {asked})' if self.now else (
                 f'{name} is not determined yet' + (f' ({sigma} {unit})' if sigma else ''))
         if self.metres is None:
             return f'{known}: {self.why}'
         if self.metres == 0.0:
-            return f'enough: {known} (asked {asked})'
-        more = f'{_rounded_up(self.metres)} m more bring it to the asked {asked} {unit}'
+            return f'OK: {known} (limit {asked})'
+        more = f'drive {_rounded_up(self.metres)} m more for the limit of {asked} {unit}'
         if sigma is None:
             return f'{name} is not determined yet; {more}'
         return f'{known} so far; {more}' if self.now else (
-            f'{name} would be good to {sigma} {unit} now; {more}')
+            f'{name} uncertainty so far: {sigma} {unit}; {more}')
 
 
 @dataclass(frozen=True)
 class WheelsForecast:
     """
-    What the way so far tells of two wheels by themselves; None: it does not tell them.
+    Estimates of single wheels from the data so far; None: not determined.
 
     left_right, track_width : relative sigmas, of the worse wheel and of the width.
     """
@@ -120,12 +120,12 @@ class Forecast:
 
     @property
     def complete(self) -> bool:
-        """Return whether driving on would bring nothing that was asked for."""
+        """Return True if more driving cannot reach any limit."""
         return not (self.scale.metres or self.yaw.metres or self.lacks)
 
     @property
     def lacks(self) -> list[str]:
-        """Return what to drive besides metres."""
+        """Return the manoeuvres to drive besides metres."""
         return list(dict.fromkeys(p.lack for p in (self.scale, self.yaw) if p.lack))
 
     def ended(self) -> 'Forecast':
@@ -134,16 +134,16 @@ class Forecast:
         return Forecast(scale, yaw, estimates=self.estimates, until_ns=self.until_ns)
 
     def age_s(self, stamp_ns: int) -> float:
-        """Return how long it lies before a stamp, s; NaN where that is no time after it."""
+        """Return the time from the estimate to a stamp, s; NaN if the stamp is not after it."""
         age = (stamp_ns - self.until_ns) * 1e-9
-        return age if age >= 0 else math.nan       # the stamps were wild, or the Imu's are gone
+        return age if age >= 0 else math.nan       # the stamps were wild, or the IMU's are gone
 
 
 def better(earlier: Forecast | None, newest: Forecast | None) -> Forecast | None:
     """
-    Return what two parts of a leg tell, each quantity by the one that tells it better.
+    Return the forecast of two sections of a leg, each quantity from the better one.
 
-    Together they tell no less. Only the newest goes on: what more brings is its to say.
+    Both together are at least as good. Only the newest section continues and can improve.
     """
     if earlier is None or newest is None:
         return newest or earlier
@@ -168,7 +168,7 @@ def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str
     """
     Return the keys of ``~/status``; what is not foreseen is empty.
 
-    age_s : how long ago the way ended that the forecast is of.
+    age_s : age of the newest sample of the forecast.
     """
     keys = _running(forecast, age_s)
     for name, unit, factor in (('scale', 'ppm', 1e6), ('yaw', 'deg', math.degrees(1))):
@@ -183,14 +183,14 @@ def as_keys(forecast: Forecast | None, age_s: float = math.nan) -> dict[str, str
 
 
 def _running(forecast: Forecast | None, age_s: float) -> dict[str, str | float]:
-    """Return the keys of the running estimate, NaN where it tells nothing."""
+    """Return the keys of the running estimate, NaN if it is not determined."""
     found = {} if forecast is None else forecast.estimates
-    told = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
+    estimates = {name: found.get(name, Estimate(None, None, '')) for name in RUNNING}
     keys: dict[str, str | float] = {}
-    for (name, unit), e in zip(RUNNING.items(), told.values(), strict=True):
+    for (name, unit), e in zip(RUNNING.items(), estimates.values(), strict=True):
         for end, value in (('', e.value), ('_sigma', e.sigma if e.value is not None else None)):
             keys[f'estimate_{name}{end}{unit}'] = math.nan if value is None else value
-    giving = dict.fromkeys(e.method for e in told.values() if e.value is not None)
+    giving = dict.fromkeys(e.method for e in estimates.values() if e.value is not None)
     return keys | {'estimate_method': ', '.join(giving),
                    'estimate_age_s': math.nan if forecast is None else age_s}
 

@@ -11,7 +11,7 @@
 Foresight: how good a leg would be if it ended here, and how far to drive until it is good enough.
 
 Foreseen for a vehicle that comes to rest where it is and stands for REST_FORESEEN_S in all, with
-the start mark and the way as recorded. Shown to the operator, never part of a result.
+the start mark and the recorded path. Shown to the operator, never part of a result.
 """
 
 from collections.abc import Callable
@@ -56,14 +56,14 @@ from odocal_ros.screening.screen import Inputs
 from odocal_ros.settings.config import Config
 
 DRIVE_ROWS = 1000         # judgement: of the drive that a prediction is made from
-# judgement: up to so long after the start mark so many tell how good orientations claim to be
+# judgement: this many orientations, until this time after the start mark, give their accuracy
 ORIENTATION_NS, ORIENTATION_ROWS = 10**9, 100
 DRIVE_ON = 'drive on with stops, starts and turns'
 
 
 @dataclass(frozen=True, eq=False)
 class DriveSoFar(PlannedDrive):
-    """A drive up to here and the rest foreseen; what is added to it goes on from here."""
+    """The recorded drive and its predicted rest; added manoeuvres continue from here."""
 
     wanted: Callable[[], bool] = field(default=lambda: True)
 
@@ -86,12 +86,12 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
                 wanted: Callable[[], bool] = lambda: True,
                 smoother: SmootherSoFar | None = None) -> Forecast:
     """
-    Return what is foreseen of a leg that would end here, and what its methods say so far.
+    Return the forecast of a leg that ends here, and the reasons of its methods so far.
 
     Parameters
     ----------
     leg : Leg
-        The way so far; its last row is here.
+        The data so far; its last row is the current position.
     fix_rate : float
         Hz.
     config : Config
@@ -128,7 +128,7 @@ def forecast_of(leg: Leg, fix_rate: float, config: Config,
 
 def _by_ends(leg: Leg, fix_rate: float, config: Config,
              wanted: Callable[[], bool]) -> Forecast:
-    """Return what two_point would make of the leg, its end points being what they are."""
+    """Return the two_point forecast of the leg with its end points."""
     inputs = screened_in_cells(leg, config).inputs
     driven = profile_of(inputs, config)
     sigmas = Sigmas(config=_heading_found(leg, config), quantum=_quantum(inputs, config),
@@ -141,7 +141,7 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
         metres = 0.0 if sigma is not None and sigma <= asked else None
         if metres is None and not why:
             metres = metres_to_go(drive, sigmas, parameter, asked, FARTHEST_M)
-            why = f'no {FARTHEST_M / 1000:.0f} km more bring it to what is asked'
+            why = f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit'
         return Prospect(sigma, asked, metres, sources_of(now.method, parameter), why)
 
     limits = config.verdict
@@ -152,18 +152,18 @@ def _by_ends(leg: Leg, fix_rate: float, config: Config,
 
 
 def _open_yet(by_ends: Prospect) -> Prospect:
-    """Return what the ends foresee, but no never: the smoother may do it yet."""
+    """Return the two_point forecast without its refusals, which the smoother may still resolve."""
     return by_ends if by_ends.metres is not None else replace(by_ends, lack=DRIVE_ON)
 
 
 def _yaw_limit(now: Prediction, asked: float) -> str:
-    """Return why no drive brings the yaw to what is asked, empty where one may."""
+    """Return the explanation why no drive reaches the yaw limit, empty if one can."""
     alignment = now.alignment
     if not alignment.heading_separable:
-        return ('not told from the course over ground, the only heading; give another '
-                '(alignment.heading_source)')
+        return ('not separable from the course over ground, the only heading; set '
+                'alignment.heading_source')
     if alignment.heading_sigma >= asked:
-        return ('no drive brings it below its heading '
+        return ('limited by the heading uncertainty '
                 f'({math.degrees(alignment.heading_sigma):.2g} deg)')
     return ''
 
@@ -182,8 +182,7 @@ def _quantum(inputs: Inputs, config: Config) -> float:
     """Return the size of a count, m; raise BadData while metres are not known at all."""
     scale = place(inputs, config).rough
     if not scale:   # what the profile takes instead, 1, would promise far too much
-        raise BadData('how far a count reaches is not known yet: drive on, or set '
-                      'odometer.nominal_scale')
+        raise BadData('the scale is not known yet: drive on, or set odometer.nominal_scale')
     return inputs.travel.quantum * scale
 
 

@@ -17,7 +17,7 @@ from odocal_ros.data.samples import join, OdometerForm, OdometerSamples, take
 from odocal_ros.screening.late_rows import on_time, ON_TIME_WINDOW
 
 SETTLED_NS = round(ON_TIME_WINDOW * 1e9)    # definition: after which no row to come moves one
-RHYTHM_NS = 3 * SETTLED_NS       # judgement: of rows before, that tell the rhythm
+RHYTHM_NS = 3 * SETTLED_NS       # judgement: of earlier rows, which determine the rhythm
 UNROLLED = OdometerForm('cumulative', 0, '')     # definition: a count that never rolls over
 
 

@@ -10,8 +10,8 @@
 """
 What is wrong with the leg that is recorded, by the functions that will judge it when it is over.
 
-Its rows in cells tell most of it, every few seconds in the worker (``pipeline.faults``). A gap of
-the Imu is seen in the stamps themselves, at once, and is never forgotten.
+Its rows in cells show most faults, every few seconds in the worker (``pipeline.faults``). A gap of
+the IMU is seen in the stamps themselves, at once, and is never forgotten.
 """
 
 from functools import lru_cache
@@ -30,7 +30,7 @@ SILENT_TIME = 0.9    # s; judgement: what comes in no order may be as late; said
 
 
 class ImuGaps:
-    """The Imu stamps of a leg, as few as tell its gaps."""
+    """The IMU stamps of a leg, reduced to those that show its gaps."""
 
     def __init__(self, start_ns: int, limit_s: float) -> None:
         self._start_ns, self._limit_s = start_ns, limit_s
@@ -38,7 +38,7 @@ class ImuGaps:
         self._edges_ns: list[int] = []      # on both sides of a gap
 
     def feed(self, block: ImuSamples) -> int:
-        """Take Imu rows; return where they go on after a gap, 0 without one."""
+        """Take IMU rows; return where they go on after a gap, 0 without one."""
         stamps = block.stamp_ns[block.stamp_ns > self._newest_ns]
         if not len(stamps):
             return 0
@@ -50,7 +50,7 @@ class ImuGaps:
         return self._edges_ns[-1] if len(gaps) else 0
 
     def reasons(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
-        """Return IMU_GAP if there was one; ``silent_s``: since when only the others speak."""
+        """Return IMU_GAP if there was one; ``silent_s``: time without IMU messages."""
         # between two gaps there is none: rows that close fill it
         t = (np.array([*self._edges_ns, self._newest_ns]) - self._start_ns) * 1e-9
         t = np.concatenate([[0.0], t])
@@ -62,17 +62,17 @@ class ImuGaps:
 
 @lru_cache(maxsize=1)      # faults and running estimate of one look ask of the same leg
 def screened_in_cells(leg: Leg, config: Config) -> Screened:
-    """Return what a leg is made of whose Imu rows are means over cells of time."""
+    """Return the inputs of a leg whose IMU rows are means over cells of time."""
     return screened(leg, _with_cells(leg, config))
 
 
 def faults_in_cells(leg: Leg, config: Config) -> tuple[Reason, ...]:
-    """Return the faults of a leg whose Imu rows are means over cells of time."""
+    """Return the faults of a leg whose IMU rows are means over cells of time."""
     return faults(leg, screened_in_cells(leg, config), _with_cells(leg, config))
 
 
 def _with_cells(leg: Leg, config: Config) -> Config:
-    """Return config with cells to be no gaps of the Imu."""
+    """Return config with cells to be no gaps of the IMU."""
     cell_s = float(np.median(np.diff(leg.imu.stamp_ns))) * 1e-9 if len(leg.imu.stamp_ns) > 1 \
         else 0.0
     limit_s = min(config.leg.max_gap + 2 * cell_s, SETTINGS['leg.max_gap'].high or math.inf)

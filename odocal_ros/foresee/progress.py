@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from odocal_ros.data.samples import FixSamples, OdometerForm, OdometerSamples
-from odocal_ros.foresee.ability import Heard, stated_variance
+from odocal_ros.foresee.ability import Received, stated_variance
 from odocal_ros.foresee.clocks_so_far import Clocks
 from odocal_ros.nav.earth import radii
 from odocal_ros.screening.force import felt
@@ -73,17 +73,17 @@ class Travel:
         self.newest_ns, self.total = int(stamps[-1]), float(path[-1])
         self.moved_ns = min(self.moved_ns or int(stamps[0]), self.newest_ns)  # a clock set back
         before, since_ns = self._since
-        if abs(self.newest_ns - since_ns) >= SPEED_SPAN_NS:    # rows of a burst tell no speed
+        if abs(self.newest_ns - since_ns) >= SPEED_SPAN_NS:    # rows of a burst give no speed
             if since_ns:
                 self.top = max(self.top, (self.total - before) * 1e9 / (self.newest_ns - since_ns))
             self._since = self.total, self.newest_ns
 
     def still_s(self) -> float:
-        """Return how long the vehicle has stood."""
+        """Return the duration of the current standstill."""
         return (self.newest_ns - self.moved_ns) * 1e-9 if self.moved_ns else 0.0
 
     def rested_s(self, since_s: float) -> float:
-        """Return how long it stands, or stood at its last standstill if that is not longer ago."""
+        """Return the duration of the current or the last standstill, if that is recent enough."""
         length, end_ns = self._rest
         recent = self.newest_ns - end_ns < since_s * 1e9
         return max(self.still_s(), length if recent else 0.0)
@@ -143,13 +143,13 @@ class Progress:
             moving = travel is not None and bool(travel.moved_ns) and travel.still_s() < STANDING_S
             self._path.feed(block, config.gnss.min_status, moving)
 
-    def heard_before(self, preroll_s: float) -> Heard:
-        """Return what came so far that says what a leg can tell."""
+    def received_before(self, preroll_s: float) -> Received:
+        """Return the samples so far that determine what a leg can estimate."""
         travel = self._travel.get('odometer')
         fix = self._last.get('fix')
-        place = Heard({})
+        place = Received({})
         if fix is not None and np.isfinite(fix.latitude[-1]):
-            place = Heard({}, latitude=float(fix.latitude[-1]),
+            place = Received({}, latitude=float(fix.latitude[-1]),
                           height=bool(np.isfinite(fix.height[-1])))
         sent = {name: self._last.get(slot) for slot, name in (
             ('heading', 'heading_topic'), ('imu', 'imu_orientation'))}
@@ -181,6 +181,6 @@ class Progress:
         return self._path.top
 
     def still_s(self) -> float:
-        """Return how long the vehicle has stood by the odometer."""
+        """Return the duration of the standstill by the odometer."""
         travel = self._travel.get('odometer')
         return travel.still_s() if travel else 0.0

@@ -58,7 +58,7 @@ def nothing_known() -> dict[str, str]:
 def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
                 lost: bool = False) -> dict[str, str]:
     """
-    Return what is good enough in a leg that ends where the vehicle is.
+    Return the values within their limits for a leg that ends now.
 
     Unknown before the first look; a track width that is configured is not asked of the drive.
     ``lost``: the leg would be rejected, and nothing of it is.
@@ -77,7 +77,7 @@ def of_forecast(forecast: Forecast | None, config: Config, two_wheels: bool,
 
 
 def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -> dict[str, str]:
-    """Return what is good enough in a result; of a rejected one nothing is."""
+    """Return the values of a result that meet their limits; none for a rejected one."""
     doubted = {ABOUT[r.code] for r in calibration.reasons
                if r.code in ABOUT and r.code.gravity is not Verdict.ACCEPTED}
     return of_estimates(calibration.estimates, config, two_wheels,
@@ -87,10 +87,10 @@ def of_calibration(calibration: Calibration, config: Config, two_wheels: bool) -
 def of_estimates(estimates: dict[str, Estimate], config: Config, two_wheels: bool, valid: bool,
                  doubted: Set[str] = frozenset()) -> dict[str, str]:
     """
-    Return what is good enough of estimates.
+    Return the estimates within their limits.
 
-    valid : False: nothing is to be used.   doubted : names of estimates that a reason speaks
-    against.
+    valid : False: no value is usable.   doubted : names of estimates with a reason against
+    their use.
     """
     ok = nothing_known()
     for name, quantity in QUANTITIES.items():

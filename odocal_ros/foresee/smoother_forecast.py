@@ -35,9 +35,9 @@ ONLY = ('smoother',)
 SCALE, YAW, PITCH = PARAMETERS
 # physical: m/s^2 of an ordinary stop and start, m/s that one would do it from at least
 STOP_FORCE, STOP_SPEED = 1.5, 5.0
-# physical: the way goes with the sigma to the power of minus this: with white errors of the
+# physical: path length is proportional to sigma to the power of minus this: for white errors of
 # fixes, with slow
-WAY_POWER, WAY_POWER_SLOW = 1.0, 2.0
+PATH_POWER, PATH_POWER_SLOW = 1.0, 2.0
 MOST_STOPS = 50    # judgement: more stops and starts nobody does
 
 
@@ -46,12 +46,12 @@ def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
     """
     Return the smoother's running estimate, None where it says nothing yet or is not asked.
 
-    leg : the way so far.   wanted : asked between passes, Abandoned is raised when it says no.
+    leg : the data so far.   wanted : called between passes; if False, Abandoned is raised.
 
     Raises
     ------
     OdocalError
-        Nothing can be told yet, and the smoother is the only method.
+        There is no forecast yet, and the smoother is the only method.
 
     """
     if smoother is None or 'smoother' not in deciding(config.method):
@@ -65,13 +65,13 @@ def look(leg: Leg, config: Config, smoother: SmootherSoFar | None,
 
 
 def gives_all(running: Running | None) -> bool:
-    """Return whether scale, yaw and pitch of the result will be the smoother's."""
+    """Return True if scale, yaw and pitch of the result will come from the smoother."""
     return running is not None and running.method.verdict is not Verdict.REJECTED and all(
         running.method.estimates[name].value is not None for name in PARAMETERS)
 
 
 def nothing_foreseen(config: Config) -> Forecast:
-    """Return an forecast that only tells what is asked."""
+    """Return a forecast with the required accuracies only."""
     return Forecast(Prospect(None, config.verdict.max_scale_sigma, None),
                     Prospect(None, config.verdict.max_yaw_sigma, None))
 
@@ -80,7 +80,7 @@ def without_force(forecast: Forecast) -> Forecast:
     """Return a forecast without what only an accelerometer determines."""
     yaw = forecast.yaw
     if yaw.sigma is None and not yaw.why:
-        yaw = replace(yaw, why='not determined without an accelerometer or an outside heading')
+        yaw = replace(yaw, why='not determined without an accelerometer or an external heading')
     return replace(forecast, yaw=yaw, pitch=None)
 
 
@@ -98,16 +98,16 @@ def with_running(forecast: Forecast, running: Running, config: Config) -> Foreca
     scale, yaw, pitch = forecast.scale, forecast.yaw, forecast.pitch
     if by.get(SCALE) == 'smoother' or scale.sigma is None:
         scale = _scale(running, scale.asked)
-    told = np.isfinite(running.sigmas)      # no angle without an accelerometer
-    if told[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
+    known = np.isfinite(running.sigmas)      # no angle without an accelerometer
+    if known[1] and (by.get(YAW) == 'smoother' or yaw.sigma is None):
         yaw = _yaw(running, yaw.asked)
-    if told[2] and (by.get(PITCH) == 'smoother' or pitch is None):
+    if known[2] and (by.get(PITCH) == 'smoother' or pitch is None):
         pitch = float(running.sigmas[2])
     return replace(forecast, scale=scale, yaw=yaw, pitch=pitch, wheels=_wheels(method))
 
 
 def _wheels(method: MethodResult) -> WheelsForecast | None:
-    """Return what the running estimate tells of two wheels, None of one counter."""
+    """Return the running estimate of two wheels, None for one counter."""
     if 'track_width' not in method.estimates:
         return None
     left, right, width = (_relative(method.estimates[name]) for name in (
@@ -123,13 +123,13 @@ def _scale(running: Running, asked: float) -> Prospect:
     e = running.method.estimates[SCALE]
     sigma = float(running.sigmas[0])
     slow = _slow_share(running)
-    power = WAY_POWER_SLOW * slow + WAY_POWER * (1 - slow)
+    power = PATH_POWER_SLOW * slow + PATH_POWER * (1 - slow)
     metres = _metres(running, sigma / asked, power)
     now = '' if e.value is None or e.sigma is None else _digits(e.value, e.sigma)
     if now and e.unit != '1':
         now += f' {e.unit}'
     return Prospect(sigma, asked, metres, sources_of(running.method, SCALE),
-                    f'no {FARTHEST_M / 1000:.0f} km more bring it to what is asked', now)
+                    f'even {FARTHEST_M / 1000:.0f} km more do not reach the limit', now)
 
 
 def _slow_share(running: Running) -> float:
@@ -141,7 +141,7 @@ def _slow_share(running: Running) -> float:
 
 
 def _yaw(running: Running, asked: float) -> Prospect:
-    """Return the prospect of the yaw, of which acceleration, along or across, is what tells."""
+    """Return the prospect of the yaw, which accelerations along or across determine."""
     e = running.method.estimates[YAW]
     sigma = float(running.sigmas[1])
     ratio, lack = sigma / asked, ''
@@ -149,7 +149,7 @@ def _yaw(running: Running, asked: float) -> Prospect:
         one = 2 * STOP_FORCE * max(running.speed, STOP_SPEED)
         stops = math.ceil(max(running.agility, one / 2) * (ratio**2 - 1) / one)
         often = 'often' if stops > MOST_STOPS else f'{stops} time{"s" * (stops > 1)}'
-        lack = f'stop and start {often}, or turn as often, for the yaw'
+        lack = f'for the yaw: stop and start {often}, or make as many turns'
     now = '' if e.value is None or e.sigma is None else _digits(
         math.degrees(e.value), math.degrees(e.sigma))
     return Prospect(sigma, asked, _metres(running, ratio, 2.0),

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the smoother makes of the way so far: run on a thinned leg, each look from the last."""
+"""Running estimate of the smoother on a thinned leg, each update from the previous one."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ from odocal_ros.screening.placed import place
 from odocal_ros.screening.sanity import UNUSABLE
 from odocal_ros.settings.config import Config
 
-DRIVING_SPEED = 0.5    # m/s; judgement: a slower step between keyframes tells no usual speed
+DRIVING_SPEED = 0.5    # m/s; judgement: slower steps between keyframes do not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class SmootherSoFar:
         Parameters
         ----------
         leg : Leg
-            The way so far: what came before, and more.
+            The data so far: the earlier data, and more.
         config : Config
             As frozen into the leg.
         wanted : callable
@@ -85,7 +85,7 @@ class SmootherSoFar:
         Raises
         ------
         OdocalError
-            Too little of the drive yet, or no fit to it; the next look starts from nothing.
+            Too little of the drive yet, or no fit to it; the next update is a cold start.
 
         """
         def trace(*_: object) -> None:
@@ -103,14 +103,14 @@ class SmootherSoFar:
         seen = screened_in_cells(leg, config)
         inputs = seen.inputs
         if len(inputs.t_imu) < 4 or len(inputs.travel.t) < 2:
-            raise BadData('the smoother needs samples of the Imu and of the odometer')
+            raise BadData('the smoother needs IMU and odometer samples')
         few = too_little(len(inputs.t_fix), float(inputs.t_imu[-1] - inputs.t_imu[0]))
         if few:
             raise BadData(few.text)
         _refuse_unusable(seen.reasons)
         placed = place(inputs, config)
         if not placed.rough:
-            raise BadData('how far a count reaches is not known yet')
+            raise BadData('the scale is not known yet')
         _refuse_unusable(axes_reasons(
             facing(inputs, placed.rough), config.imu.nominal_yaw))
         if vars(placed.origin) != (self._origin and vars(self._origin)):
@@ -118,7 +118,7 @@ class SmootherSoFar:
             self._growing.forget()
         spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, placed.rough,
                             config.leg.standstill)
-        # a way beyond the odometer's last row would be a slip
+        # travel beyond the last odometer row would be a slip
         t_stop = min(inputs.t_stop, float(inputs.travel.t[-1]))
         view = smoother_leg(inputs, config, placed.origin, placed.fixes_n, spans,
                             placed.rough, t_stop)

@@ -79,7 +79,7 @@ class ThinnedLeg:
         self._cells[slot], self._width_ns[slot] = cells, width_ns
 
     def leg(self, start_ns: int) -> Leg:
-        """Return what there is as a leg that ends with the last cell of the Imu."""
+        """Return the samples so far as a leg that ends with the last cell of the IMU."""
         form, cells = self.form, self._cells | {slot: self._newest(slot) for slot in self._late}
         if form.quantity != 'rate':
             whole = np.issubdtype(cells['odometer'].value.dtype, np.integer) \

@@ -38,22 +38,22 @@ def paths_of(asked: Any) -> list[Path]:
     several = [asked] if isinstance(asked, (str, Path)) or not isinstance(asked, Iterable) \
         else list(asked)
     if not several:
-        raise BadUsage('no bag is given: want a path, or several')
+        raise BadUsage('no bag is given; required: one path or several')
     for one in several:
         try:
             with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
                 Path(one).stat()       # whether it is there is for who reads it to say
         except (OSError, TypeError, ValueError) as error:
-            raise BadUsage(f'{brief_line(repr(one)[:100])} is no path of a bag: '
+            raise BadUsage(f'{brief_line(repr(one)[:100])} is not the path of a bag: '
                            f'{said_by(error)[:100]}') from None
     return [Path(one) for one in several]
 
 
 def topics_of(asked: Any) -> dict[str, str]:
-    """Return slot -> topic, or raise BadUsage where what is asked is no mapping."""
+    """Return slot -> topic, or raise BadUsage if the argument is not a mapping."""
     if asked is not None and not isinstance(asked, Mapping):
-        raise BadUsage(f"topics: want a mapping of slot to topic, as in {{'imu': '/imu/data'}}, "
-                       f'not {type(asked).__name__}')
+        raise BadUsage("topics: required: a mapping of slot to topic such as {'imu': "
+                       f"'/imu/data'}}, not {type(asked).__name__}")
     return dict(asked or {})
 
 
@@ -72,10 +72,10 @@ def config_of(asked: Settings, journal: Mapping[str, object] | None = None) -> C
     if isinstance(asked, Config):
         return asked
     if asked is not None and not isinstance(asked, (str, Path, Mapping)):
-        raise BadUsage('config: want a Config, a mapping of dotted names, or a parameter file, '
-                       f'not {type(asked).__name__}')
+        raise BadUsage('config: required: a Config, a mapping of dotted names, or a parameter '
+                       f'file, not {type(asked).__name__}')
     if '\0' in str(asked):
-        raise BadUsage('config: a path with a zero byte is none')
+        raise BadUsage('config: the path contains a zero byte')
     if isinstance(asked, (str, Path)):
         from odocal_ros.settings.config_file import read_config_file
         asked = read_config_file(Path(asked))

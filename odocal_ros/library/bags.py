@@ -20,7 +20,7 @@ from odocal_ros.outside.names import one_line
 from odocal_ros.settings.config import Config, flat
 
 
-def once(paths: list[Path]) -> tuple[list[Path], list[Path]]:
+def unique_paths(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Return the bags, one given twice once, and those that were given again."""
     first: dict[Path, Path] = {}
     again = []
@@ -32,7 +32,7 @@ def once(paths: list[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def about(path: Path, error: Exception) -> str:
-    """Return what is wrong with one of several bags, beginning with the bag."""
+    """Return the error of one of several bags, starting with the bag."""
     text = str(error)
     if text.startswith(str(path)):
         return text
@@ -43,7 +43,7 @@ def about(path: Path, error: Exception) -> str:
 
 def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
     """
-    Look at each of several bags, so that all that is wrong is told at once and before the work.
+    Look at each of several bags, so that all errors are reported together, before the work.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def look_at_all(paths: list[Path], look: Callable[[Path], object]) -> None:
         except OdocalError as error:
             troubles.append(about(path, error))
     if troubles:
-        raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used, nothing was '
+        raise BadUsage(f'{len(troubles)} of {len(paths)} bags cannot be used; nothing was '
                        f'calibrated: {"; ".join(troubles)}')
 
 
@@ -70,7 +70,7 @@ def unlike_settings(configs: list[Config]) -> list[str]:
             if any(repr(other[name]) != repr(value) for other in others)]
 
 
-def told_apart(paths: list[Path], legs: list[list[LegResult]],
+def unique_names(paths: list[Path], legs: list[list[LegResult]],
                inputs: list[dict[str, Any]]) -> tuple[list[LegResult], list[dict[str, Any]]]:
     """
     Return legs and inputs named so that no two bags have one name: by their paths if need be.

@@ -19,7 +19,7 @@ from odocal_ros.calib.result import LegResult
 from odocal_ros.errors import BadUsage, OdocalError
 from odocal_ros.library.asked import config_of, Leg, legs_of, paths_of, Settings, topics_of
 from odocal_ros.library.calibration import Calibration
-from odocal_ros.library.hearer import Hearer, Notes
+from odocal_ros.library.listener import Listener, Notes
 from odocal_ros.library.read_bag import read_bag, readers_of, Recording
 from odocal_ros.pipeline.stage import Stage
 from odocal_ros.reasons import Reason
@@ -35,7 +35,7 @@ class LegDropped(BadUsage):
 def calibrate_bag(path: Path | str | Sequence[Path | str],
                   topics: Mapping[str, str] | None = None, config: Settings = None,
                   legs: Iterable[Leg] | Leg | None = None, *, holdout: bool = False,
-                  hearer: Hearer | None = None) -> Calibration:
+                  hearer: Listener | None = None) -> Calibration:
     """
     Calibrate from a recorded bag, or from several of one vehicle.
 
@@ -47,14 +47,14 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
         Slot (imu, odometer, odometer_right, fix, fix_velocity, heading) -> topic; the others are
         found by their type.
     config : Config, mapping of dotted names, or a parameter file, optional
-        Settings; they go before those of a journal.
+        Settings; they take precedence over those of a journal.
     legs : optional
         'A:B' in seconds from the bag's first message, 'A/B' for ISO 8601 dates, 'each-stop', or
         (A, B); one or several. None: as the node marked them, else found by the standstills.
     holdout : bool
         Keep the last fifth of each leg back from the fit and check the correction on it.
-    hearer : Hearer, optional
-        Is told how it goes.
+    hearer : Listener, optional
+        Receives notes and progress.
 
     Returns
     -------
@@ -63,28 +63,28 @@ def calibrate_bag(path: Path | str | Sequence[Path | str],
     Raises
     ------
     BadUsage, BadBag, BadData, BadConfig
-        A bag cannot be read or used, or what is asked makes no sense.
+        A bag cannot be read or used, or an argument is invalid.
 
     """
-    from odocal_ros.library.bags import look_at_all, once, told_apart
+    from odocal_ros.library.bags import look_at_all, unique_names, unique_paths
     from odocal_ros.output.frames import framed
     from odocal_ros.output.stored import known_imu
     from odocal_ros.pipeline.calibrate import combine
-    heard = Notes(hearer or Hearer())
+    received = Notes(hearer or Listener())
     asked = _Asked(topics_of(topics), config, legs_of(legs), holdout)
     imu = known_imu(config_of(config))
-    paths, again = once(paths_of(path))
+    paths, again = unique_paths(paths_of(path))
     for twice in again:
-        heard.note(f'{twice} is given twice: it is read once')
+        received.note(f'{twice} is given twice; it is read once')
     if len(paths) > 1:
         look_at_all(paths, lambda one: _look(one, asked))
-    done = _each(paths, asked, heard)
-    settings = _settings_of_all(done, heard)
-    results, inputs = told_apart([one.path for one in done], [one.legs for one in done],
+    done = _each(paths, asked, received)
+    settings = _settings_of_all(done, received)
+    results, inputs = unique_names([one.path for one in done], [one.legs for one in done],
                                  [one.entry for one in done])
     frame = next((one.imu_frame for one in done if one.imu_frame), '')
     result, settings = framed(combine(results, settings, imu=imu), settings, frame)
-    return Calibration(result, settings, tuple(inputs), tuple(heard.said))
+    return Calibration(result, settings, tuple(inputs), tuple(received.said))
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class _Asked:
 
 
 def _look(path: Path, asked: _Asked) -> None:
-    """Open a bag and see that it has what is wanted of it."""
+    """Open a bag and check that it has the required data."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.library.journal import journal_notes
     journal = journal_notes(path)
@@ -117,18 +117,18 @@ class _BagLegs:
     legs: list[LegResult]
 
 
-def _each(paths: list[Path], asked: _Asked, heard: Notes) -> list[_BagLegs]:
-    """Return what is kept of each bag that is used."""
+def _each(paths: list[Path], asked: _Asked, received: Notes) -> list[_BagLegs]:
+    """Return the stored data of each used bag."""
     from odocal_ros.library.bags import about
     done: list[_BagLegs] = []
     dropped = None
     for path in paths:
         try:
-            done.append(_one(path, asked, done[0].unit if done else None, heard))
+            done.append(_one(path, asked, done[0].unit if done else None, received))
         except LegDropped as error:
             dropped = error
             if len(paths) > 1:
-                heard.note(str(error))
+                received.note(str(error))
         except OdocalError as error:
             if len(paths) == 1:
                 raise
@@ -138,49 +138,49 @@ def _each(paths: list[Path], asked: _Asked, heard: Notes) -> list[_BagLegs]:
     return done
 
 
-def _one(path: Path, asked: _Asked, unit: str | None, heard: Notes) -> _BagLegs:
+def _one(path: Path, asked: _Asked, unit: str | None, received: Notes) -> _BagLegs:
     """Read a bag and calibrate its legs; ``unit`` is that of the scale in the bags before."""
-    bag = read_bag(path, asked.topics, asked.config, hearer=heard)
+    bag = read_bag(path, asked.topics, asked.config, hearer=received)
     own = bag.form.scale_unit
     if unit and own != unit:
         raise BadUsage(f'{path}: the scale of its odometer {bag.topics["odometer"]} is in '
-                       f'{NAMED[own]}, that of the bags before in {NAMED[unit]}: there is no '
-                       'mean of them; calibrate them apart, or name topics of one kind')
+                       f'{NAMED[own]}, that of the previous bags in {NAMED[unit]}: they cannot '
+                       'be combined; calibrate them separately, or name topics of one kind')
     return _BagLegs(path, {'bag': bag.name, 'sha256': bag.sha256, 'topics': bag.topics},
-                    bag.config, bag.imu_frame, own, _legs_of(bag, asked, heard))
+                    bag.config, bag.imu_frame, own, _legs_of(bag, asked, received))
 
 
-def _settings_of_all(done: list[_BagLegs], heard: Notes) -> Config:
-    """Return the settings of the last bag; a note tells what others have otherwise."""
+def _settings_of_all(done: list[_BagLegs], received: Notes) -> Config:
+    """Return the settings of the last bag; a note lists the differences of the others."""
     from odocal_ros.library.bags import unlike_settings
     if unlike := unlike_settings([one.config for one in done]):
-        heard.note(f'{", ".join(unlike)}: not the same in all journals; each leg is computed '
-                   f'with its own, limits and files are by those of {done[-1].path.name}')
+        received.note(f'{", ".join(unlike)}: differ between the journals; each leg uses its own '
+                   f'settings, limits and files use those of {done[-1].path.name}')
     return done[-1].config
 
 
-def _legs_of(bag: Recording, asked: _Asked, heard: Notes) -> list[LegResult]:
+def _legs_of(bag: Recording, asked: _Asked, received: Notes) -> list[LegResult]:
     """Return the results of a bag's legs."""
     from odocal_ros.library.legs import open_ended, OPEN_LEG
     if bag.dropped and not asked.legs:
-        raise LegDropped(f'{bag.name}: its leg was cancelled or undone, so it is not '
-                         'replayed; give --leg : to replay it all the same')
+        raise LegDropped(f'{bag.name}: its leg was cancelled or undone and is not replayed; use '
+                         '--leg : to replay it anyway')
     marks = () if asked.legs else bag.marks
     if any(not stop for _, stop in marks):
-        heard.note(f'{bag.name}: {OPEN_LEG}')
+        received.note(f'{bag.name}: {OPEN_LEG}')
     spans = bag.spans(asked.legs)
     notes = [bag.notes + note for note in open_ended(spans, marks)]
-    results = _calibrated(bag, spans, notes, asked.holdout, heard)
+    results = _calibrated(bag, spans, notes, asked.holdout, received)
     if bag.config.leg.automatic and not (marks or asked.legs):
-        results = _worth_keeping(results, heard)
+        results = _worth_keeping(results, received)
     return results
 
 
 def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[Reason, ...]],
-                holdout: bool, heard: Notes) -> list[LegResult]:
+                holdout: bool, received: Notes) -> list[LegResult]:
     from odocal_ros.pipeline.parts import calibrate_parts
     results = []
-    with heard.phase('calibrating') as progress:
+    with received.phase('calibrating') as progress:
         for number, (start_ns, stop_ns) in enumerate(spans, 1):
             which = f'leg {number} of {len(spans)}: ' if len(spans) > 1 else 'calibrating: '
             leg = bag.recorder.close(start_ns, stop_ns, bag.config.leg.preroll)
@@ -193,8 +193,8 @@ def _calibrated(bag: Recording, spans: list[tuple[int, int]], notes: list[tuple[
     return results
 
 
-def _worth_keeping(results: list[LegResult], heard: Notes) -> list[LegResult]:
-    """Return legs found by themselves but for those that are no good, as the node has it."""
+def _worth_keeping(results: list[LegResult], received: Notes) -> list[LegResult]:
+    """Return automatic legs without the unusable ones, as in the node."""
     from odocal_ros.pipeline.automatic import refusal
     why = [refusal(leg) for leg in results]
     if all(why):
@@ -202,6 +202,6 @@ def _worth_keeping(results: list[LegResult], heard: Notes) -> list[LegResult]:
     for leg, reason in zip(results, why, strict=True):
         if reason:
             start = datetime.fromtimestamp(leg.start_ns // 10**9, UTC)
-            heard.note(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
+            received.note(f'the leg of {start:%Y-%m-%d %H:%M:%S} UTC is not used: '
                        f'{reason.code.name}: {reason.text}')
     return [leg for leg, reason in zip(results, why, strict=True) if not reason]

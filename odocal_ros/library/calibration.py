@@ -46,7 +46,7 @@ class Calibration:
     A calibration of a vehicle.
 
     result : all of it, as the pipeline gives it.   config : settings it was made with.
-    inputs : of each bag its name, sha256 and topics.   notes : sentences said on the way.
+    inputs : of each bag its name, sha256 and topics.   notes : sentences from the computation.
     created : ISO 8601 time.
     """
 
@@ -63,7 +63,7 @@ class Calibration:
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return what lowers the verdict or is good to know: code, text, remedy."""
+        """Return the findings that lower the verdict or inform: code, text, remedy."""
         return self.result.reasons
 
     @property
@@ -79,9 +79,9 @@ class Calibration:
     def _estimates(self) -> dict[str, Estimate]:
         """Return the estimates, those that each result has to have also where no leg was fit."""
         from odocal_ros.output.files import ALWAYS
-        told = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
-        told |= self.result.estimates
-        return told
+        named = {name: Estimate(None, None, unit or '') for name, unit in ALWAYS.items()}
+        named |= self.result.estimates
+        return named
 
     def __str__(self) -> str:
         """Return the result as one screen of text, as ``odocal replay`` prints it."""
@@ -105,11 +105,11 @@ class Calibration:
         return trajectory(self.result)
 
     def states(self) -> Series:
-        """Return attitude, biases of the Imu and their sigmas over time; see ``series.states``."""
+        """Return attitude, biases of the IMU and their sigmas over time; see ``series.states``."""
         return states(self.result)
 
     def residuals(self) -> Series:
-        """Return what is left over of each sensor, with its sigma; see ``residuals.residuals``."""
+        """Return the residuals of each sensor with their sigmas; see ``residuals.residuals``."""
         return residuals(self.result)
 
     def plot_track(self, ax: Any, leg: int = 1) -> Any:
@@ -121,7 +121,7 @@ class Calibration:
         return ax
 
     def plot_residuals(self, ax: Any, leg: int = 1) -> Any:
-        """Draw dead reckoning less fix over the way on matplotlib axes; return these."""
+        """Draw dead reckoning minus fix over the path on matplotlib axes; return these."""
         from odocal_ros.output.plots import draw_residuals
         draw_residuals(ax, self._drawable(leg))
         ax.legend()
@@ -132,7 +132,7 @@ class Calibration:
         """
         Write all result files; return their paths, calibration.json first.
 
-        ``tell`` is given a sentence when the report cannot be drawn.
+        ``tell`` receives a sentence if the report cannot be drawn.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class Calibration:
 
     def export(self, *files: Path | str) -> list[Path]:
         """
-        Write time series for other programs; the names tell which: ``export.KNOWN``.
+        Write time series for other programs; the names select them: ``export.KNOWN``.
 
         trajectory.tum (evo), states.csv, residuals.parquet, track.kml, debug.mcap and others.
         """
@@ -158,5 +158,5 @@ class Calibration:
             raise BadUsage(f'leg {leg}: there are legs 1 to {len(self.result.legs)}')
         found = self.result.legs[leg - 1].evidence
         if found is None or not len(found.t):
-            raise BadUsage(f'leg {leg} has no track to draw: its reasons say why')
+            raise BadUsage(f'leg {leg} has no track to draw; see its reasons')
         return found

@@ -14,7 +14,7 @@ The variance of a difference is taken as the sum of both variances. Errors that 
 heading source, a lever arm) may be the same in both calibrations, and then part of them cancels;
 but calibration.json has their size only, not their direction on each drive, so that nothing is
 taken off. For a source that always acts the same way (the heading on the yaw) the sum is the
-cautious side; ``sigmas_if_shared_cancels`` tells how it would look if all of it were common.
+cautious side; ``sigmas_if_shared_cancels`` assumes that all of it is common.
 """
 
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Difference:
 
     @property
     def beyond(self) -> bool:
-        """Return whether the change is more than chance explains."""
+        """Return True if the change is significant."""
         return self.sigmas is not None and abs(self.sigmas) > REMARK_SIGMAS
 
 
@@ -94,19 +94,19 @@ def changes(stored: list[Stored]) -> list[Change]:
 
 
 def notes(stored: list[Stored]) -> list[str]:
-    """Return what a reader of the changes has to know of the calibrations."""
+    """Return the notes on the compared calibrations."""
     out = []
     for s in stored:
         if not s.usable:
             codes = ', '.join(dict.fromkeys(s.reasons[:3]))
-            out.append(f'{s.name} is rejected ({codes}): shown, but not judged')
+            out.append(f'{s.name} is rejected ({codes}): shown, but not compared')
     for i, a in enumerate(stored):
         for b in stored[i + 1:]:
             if a.bags & b.bags or a.legs & b.legs:
-                out.append(f'{a.name} and {b.name} are made from the same drive: their errors '
-                           'are partly the same, a change is more certain than shown')
+                out.append(f'{a.name} and {b.name} use the same drive: their errors are '
+                           'correlated, so a change is more significant than shown')
     if _differently_mounted(stored):
-        out.append('imu.mounting_rpy differs: the mounting angles are not compared')
+        out.append('imu.mounting_rpy differs: mounting angles are not compared')
     return out
 
 
@@ -115,7 +115,7 @@ def _order(name: str) -> tuple[int, str]:
 
 
 def _differently_mounted(stored: list[Stored]) -> bool:
-    """Return whether the mounting angles are measured from different nominal mountings."""
+    """Return True if the mounting angles refer to different nominal mountings."""
     return len({str(s.config.get('imu.mounting_rpy')) for s in stored}) > 1
 
 
@@ -127,8 +127,8 @@ def _change(name: str, stored: list[Stored]) -> Change:
     for i in have:
         if stored[i].estimates[name].unit != unit:
             raise BadUsage(f'{stored[i].name}: {name} is in {stored[i].estimates[name].unit}, in '
-                           f'{stored[have[0]].name} in {unit}; compare calibrations of one '
-                           'odometer, read the same way')
+                           f'{stored[have[0]].name} in {unit}; compare calibrations of the same '
+                           'odometer and unit')
         entries.append(Entry(i, stored[i].estimates[name], _difference(name, stored, first, i),
                              _difference(name, stored, previous, i)))
         if stored[i].usable:
@@ -145,7 +145,7 @@ def _difference(name: str, stored: list[Stored], since: int | None,
     assert old.value is not None     # what has no value is no entry
     assert new.value is not None
     change = new.value - old.value
-    if name in ANGLES:      # of an Imu that faces backwards they lie about +-pi
+    if name in ANGLES:      # of an IMU that faces backwards they lie about +-pi
         change = float(wrap(change))
     if old.sigma is None or new.sigma is None:
         return Difference(since, change, None, None, None)

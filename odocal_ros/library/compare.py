@@ -28,8 +28,8 @@ CAUSES = {
     'yaw': 'the IMU was moved, or the heading comes from another source; calibrate again to be '
            'sure',
     'pitch': 'load, suspension, or the IMU was moved; calibrate again to be sure',
-    'lever': 'a mount was moved, or its measure is wrong',
-    'delay': 'a driver, bus or receiver was set differently'}
+    'lever': 'a sensor was moved, or its lever arm is wrong',
+    'delay': 'a driver, bus or receiver has other settings'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +79,7 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
 
     """
     if len(calibrations) < 2:
-        raise BadUsage('compare: one calibration has nothing to be compared with; give two or '
-                       'more, the oldest first')
+        raise BadUsage('compare: only one calibration; give two or more, the oldest first')
     stored = [stored_from(one.to_dict(), f'calibration {number}')
               if isinstance(one, Calibration) else read_stored(Path(one))
               for number, one in enumerate(calibrations, 1)]
@@ -91,7 +90,8 @@ def compare(*calibrations: Calibration | Path | str) -> Comparison:
 def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | None]:
     """Return one sentence on all changes, and whether any counts; None: nothing to judge."""
     if not found:
-        return ('nothing to judge: no value is in two calibrations that are not rejected', None)
+        return ('nothing to compare: no value exists in two calibrations that are not '
+                'rejected', None)
     judged = [(abs(d.sigmas), c, d) for c in found for e in c.entries if stored[e.index].usable
               for d in (e.to_first, e.to_previous) if d is not None and d.sigmas is not None]
     beyond: dict[str, tuple[float, Change, Difference]] = {}
@@ -101,10 +101,10 @@ def _verdict(found: list[Change], stored: list[Stored]) -> tuple[str, bool | Non
     if beyond:
         return '; '.join(_cause(c, d, stored) for _, c, d in beyond.values()), True
     if not judged:
-        return 'nothing to judge: no sigma is known', None
+        return 'nothing to compare: no sigma is known', None
     size, change, _ = max(judged, key=lambda one: one[0])
-    return (f'no change beyond {REMARK_SIGMAS:.0f} sigma: the largest is that of the '
-            f'{label(change.parameter)}, {size:.1f} sigma'), False
+    return (f'no change beyond {REMARK_SIGMAS:.0f} sigma; largest: {label(change.parameter)}, '
+            f'{size:.1f} sigma'), False
 
 
 def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
@@ -112,7 +112,7 @@ def _cause(change: Change, difference: Difference, stored: list[Stored]) -> str:
     cause = next((text for key, text in CAUSES.items() if key in words), 'calibrate again')
     if 'scale' in words and abs(difference.change) > ANOTHER_SCALE * _value_before(
             change, difference, stored):
-        cause = f'{OTHER}; compare calibrations of one odometer'
+        cause = f'{OTHER}; compare calibrations of the same odometer'
     return (f'{label(change.parameter)} changed by {amount(change, difference, stored)} '
             f'({abs(difference.sigmas or 0.0):.1f} sigma) since '
             f'{stored[difference.since].name}: {cause}')
@@ -146,7 +146,6 @@ def hints(found: Sequence[Change], stored: Sequence[Stored]) -> Iterator[str]:
             sigmas = abs(d.sigmas_if_shared_cancels or 0.0) if d is not None else 0.0
             if d is not None and stored[last.index].usable and not d.beyond \
                     and sigmas > REMARK_SIGMAS:
-                yield (f'note: the change of the {label(change.parameter)} would be '
-                       f'{sigmas:.1f} sigma if the errors of heading '
-                       'source, lever arm and the like were the same in both')
+                yield (f'note: the change of the {label(change.parameter)} is {sigmas:.1f} sigma '
+                       'if errors of heading source and lever arms are the same in both')
                 break

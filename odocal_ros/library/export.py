@@ -81,7 +81,7 @@ def mcap(result: Calibration, path: Path) -> None:
     """
     Write all series as one mcap file, for PlotJuggler and Foxglove.
 
-    /odocal/track NavSatFix; /odocal/biases Imu: the vehicle's attitude, and the biases in the
+    /odocal/track NavSatFix; /odocal/biases IMU: the vehicle's attitude, and the biases in the
     place of rates and forces, their variances in that of those; /odocal/residuals/SENSOR
     JointState: each component and its sigma, units in the names.
     """
@@ -119,7 +119,7 @@ def _residual_topics(result: Calibration) -> list[encode.Topic]:
 
 
 def _side_by_side(left: Left) -> Series:
-    """Return what is left over of a sensor as columns: each component, then its sigma."""
+    """Return the residuals of a sensor as columns: each component, then its sigma."""
     columns = {'t': left.t}
     for name, value, sigma in zip(left.components, left.value.T, left.sigma.T, strict=True):
         columns |= {f'{name}_{IN_NAMES[left.unit]}': value.astype(float),
@@ -149,19 +149,19 @@ KNOWN = ('trajectory.tum', 'track.kml', 'debug.mcap', 'drive.rrd', *(
 
 
 def check_names(files: Iterable[Path | str]) -> None:
-    """Raise BadUsage where a file has a name that tells nothing, or no program to write it."""
+    """Raise BadUsage for a file with an unknown name, or without a library to write it."""
     for file in files:
         if Path(file).suffix == '.parquet' and not _there('pyarrow'):
             raise BadUsage(f'export: {file}: Parquet needs pyarrow: {TABLES}')
         if Path(file).suffix == '.rrd' and not _there('rerun'):
             raise BadUsage(f'export: {file}: a recording of Rerun needs rerun-sdk: {RERUN}')
         if Path(file).name not in KNOWN:
-            raise BadUsage(f'export: {file}: there are {", ".join(KNOWN)}')
+            raise BadUsage(f'export: {file}: unknown; available: {", ".join(KNOWN)}')
 
 
 def export(result: Calibration, files: Iterable[Path | str]) -> list[Path]:
     """
-    Write series as files; their names tell which, and how: ``KNOWN``.
+    Write series as files; their names select series and format: ``KNOWN``.
 
     Raises
     ------

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The smoothed drive as a recording of Rerun: track, map, attitude and biases by time."""
+"""The smoothed drive as a Rerun recording: track, map, attitude and biases over time."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def rrd(result: Calibration, path: Path) -> None:
     Write drive.rrd.
 
     leg_N/track LineStrips3D, m in the leg's n; leg_N/map GeoLineStrings; leg_N/vehicle Transform3D
-    by time; leg_N/states/NAME Scalars by time, names and units as in states.csv.
+    over time; leg_N/states/NAME Scalars over time, names and units as in states.csv.
     """
     import rerun
     recording = rerun.RecordingStream('odocal_ros')

@@ -37,7 +37,7 @@ class JournalNotes:
 
 def journal_notes(bag: Path) -> JournalNotes | None:
     """
-    Return what a journal says, given its folder or a file of it; None for any other bag.
+    Return the metadata of a journal from its folder or a file; None for other bags.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def journal_notes(bag: Path) -> JournalNotes | None:
     if not path.exists():
         return None
     if not is_file(path):
-        raise BadUsage(f'{path}: is a pipe, a device or a folder; remove it to replay the bag')
+        raise BadUsage(f'{path}: is not a regular file; remove it to replay the bag')
     from odocal_ros.settings.config_file import read_journal_file
     settings, about = read_journal_file(path, BLOCK)
     topics = {slot: about[f'topics.{slot}'] for slot in SLOTS if f'topics.{slot}' in about}

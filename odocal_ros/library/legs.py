@@ -39,8 +39,8 @@ EACH_STOP = 'each-stop'
 OPENING = 0.2                 # judgement: of the distance; a first stop later splits no leg
 STATUS_NAME = 'calibrator: calibration'
 DROPPED = ('cancelled', 'undone')
-OPEN_LEG = ('the leg has no stop mark, recording ended while it was driven: it is taken to end at '
-            'the last sample that all topics have')
+OPEN_LEG = ('the leg has no stop mark, because recording ended during the leg: it ends at the '
+            'last sample that all topics have')
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 
 
@@ -66,7 +66,7 @@ def parse_leg(text: str) -> LegSpan:
     separator = '/' if '/' in text else ':'
     parts = text.split(separator)
     if len(parts) != 2:
-        raise BadUsage(f'--leg {text}: want A:B in seconds, or A/B for ISO 8601 dates')
+        raise BadUsage(f'--leg {text}: required: A:B in seconds, or A/B for ISO 8601 dates')
     (start, rel_a), (stop, rel_b) = (_edge(p.strip(), text) for p in parts)
     if start is not None and stop is not None and rel_a == rel_b and stop <= start:
         raise BadUsage(f'--leg {text}: the end is not after the start')
@@ -81,8 +81,8 @@ def _edge(text: str, whole: str) -> tuple[int | None, bool]:
         seconds = Decimal(text)
         if seconds.is_finite():
             if seconds.copy_abs() >= LATEST_NS // 10**9:
-                raise BadUsage(f'--leg {whole}: {text[:40]} is no time of a recording: beyond the '
-                               'year 2116')
+                raise BadUsage(f'--leg {whole}: {text[:40]} is not a valid time: beyond the year '
+                               '2116')
             return int((seconds * 10**9).to_integral_value()), abs(seconds) < EPOCH
     except InvalidOperation:
         pass
@@ -95,7 +95,7 @@ def _edge(text: str, whole: str) -> tuple[int | None, bool]:
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     whole_ns = (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
     if abs(whole_ns) >= LATEST_NS:
-        raise BadUsage(f'--leg {whole}: {text} is no time of a recording')
+        raise BadUsage(f'--leg {whole}: {text} is not a valid time')
     return whole_ns, False
 
 
@@ -125,7 +125,7 @@ def open_ended(spans: Spans, marks: Sequence[tuple[int, int]]) -> list[tuple[Rea
 
 
 def dropped_legs(bag: 'Bag') -> bool:
-    """Return whether the operator cancelled or undid a leg that is marked in the bag."""
+    """Return True if the operator cancelled or undid a leg that is marked in the bag."""
     return any(values.get('leg_event') in DROPPED for values in _last_marks(bag))
 
 
@@ -149,7 +149,7 @@ def _remember(last: dict[tuple[str, int], dict[str, str]], values: dict[str, str
         start, _ = int(values['leg_start_ns']), int(values['leg_stop_ns'])
     except (KeyError, ValueError):
         return
-    # ids begin again with each run of the node: a leg is told by its start too
+    # ids begin again with each run of the node: a leg is identified by its start too
     leg_id = values.get('leg_id', ''), start
     if leg_id[0] in ('', '0'):
         return
@@ -173,7 +173,7 @@ def find_legs(recorder: LegRecorder, bag: 'Bag | Recording', asked: Sequence[Leg
     bag : Bag
         For its time span.
     asked : list of LegSpan or 'each-stop'
-        Empty: marks if there are any, else legs by themselves with leg.automatic, else one from
+        Empty: marks if there are any, else automatic legs with leg.automatic, else one from
         standstill to standstill.
     marks : list of (start, stop)
         As the node marked them.
@@ -209,14 +209,13 @@ def _marked(marks: Sequence[tuple[int, int]], last: int, bag: 'Bag | Recording')
     """Return marked legs, each with an end."""
     legs = [(a, b or last) for a, b in marks if (b or last) > a]
     if not legs:
-        raise BadData(f'{bag.name}: the recording broke off at its start mark, or so soon after '
-                      'that nothing of the leg is in it; drive it again (--leg : takes what came '
-                      'before the mark)')
+        raise BadData(f'{bag.name}: the recording ended at the start mark or right after it, so '
+                      'the leg is empty; drive it again (--leg : uses the data before the mark)')
     return legs
 
 
 def _common(recorder: LegRecorder) -> tuple[int, int]:
-    """Return the first and the last stamp at which all of Imu, odometer and fix are there."""
+    """Return the first and the last stamp at which all of IMU, odometer and fix are there."""
     stamps = [recorder.rows(slot).stamp_ns for slot in ('imu', 'odometer', 'fix')]
     stamps = [s[s > 0] for s in stamps]
     stamps = [s for s in stamps if len(s)]
@@ -235,8 +234,8 @@ def _placed(span: LegSpan, bag: 'Bag | Recording', first: int, last: int) -> tup
     begin, end = min(bag.start_ns, first), max(bag.end_ns, last)
     if stop <= start or stop < begin - 10**10 or start > end + 10**10:
         length = (bag.end_ns - bag.start_ns) * 1e-9
-        raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} holds nothing; the '
-                       f'bag runs from 0 to {length:.1f} s')
+        raise BadUsage(f'{bag.name}: the leg {_s(start, bag)}:{_s(stop, bag)} is empty; the bag '
+                       f'runs from 0 to {length:.1f} s')
     return start, stop
 
 
@@ -252,20 +251,20 @@ def stops_of(inputs: Inputs, first: int, config: Config) -> Stops:
 
     Returns
     -------
-    (k, 2) ns, and (k, 2) m driven before each with the whole way, None where that is not known.
+    (k, 2) ns, and (k, 2) m driven before each with the total, None if unknown.
 
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
         return np.empty((0, 2), np.int64), None
     scale = place(inputs, config).rough or 1.0
     spans = standstills(inputs.t_imu, inputs.w_b, inputs.travel, scale, config.leg.standstill)
-    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
-    metres = np.interp(spans, inputs.travel.t, way) if len(spans) else np.empty((0, 2))
-    return first + np.round(spans * 1e9).astype(np.int64), (metres, float(way[-1]))
+    path_length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(inputs.travel.s)))]) * scale
+    metres = np.interp(spans, inputs.travel.t, path_length) if len(spans) else np.empty((0, 2))
+    return first + np.round(spans * 1e9).astype(np.int64), (metres, float(path_length[-1]))
 
 
 def by_themselves(recorder: LegRecorder, last: int, config: Config) -> Spans:
-    """Return the legs that the node would have begun and ended by itself."""
+    """Return the legs that the node would start and end automatically."""
     search = LegSearch(config)
     for slot in ('fix', 'imu', 'odometer'):
         search.feed(slot, recorder.rows(slot), recorder.form)

@@ -43,12 +43,12 @@ class Planned:
 
     @property
     def verdict(self) -> Verdict:
-        """Return what such a drive will be good for."""
+        """Return the predicted verdict of such a drive."""
         return self.plan.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return what is worth saying of it."""
+        """Return the reasons of the prediction."""
         return self.plan.reasons
 
     def sigma(self, parameter: str) -> float | None:
@@ -57,11 +57,11 @@ class Planned:
 
     @cached_property
     def helps(self) -> list[Change]:
-        """Return what would make it better, each computed: that takes some seconds."""
+        """Return the computed improvements; this takes some seconds."""
         return changes(self.drive, self.sigmas, self.plan)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``odocal plan --json`` prints; sigmas of the scale are relative."""
+        """Return the output of ``odocal plan --json``; sigmas of the scale are relative."""
         plan, sigmas = self.plan, self.sigmas
         two_point, alignment = plan.two_point, plan.two_point.alignment
         return {
@@ -105,7 +105,7 @@ def plan(*, distance: float | None = None, speed: float | None = None,
     bag, topics
         That of a recorded bag, with the figures of its own fixes.
     config : Config, mapping of dotted names, or a parameter file, optional
-        Settings: Imu grade, heading source and the like.
+        Settings: IMU grade, heading source and the like.
     figures
         As ``plan.predict.Sigmas`` has them: fix, fix_up m, fix_rate Hz, quantum m a count,
         sway m/s, slip m/sqrt(s).
@@ -123,11 +123,11 @@ def plan(*, distance: float | None = None, speed: float | None = None,
                        f'--distance with --speed{"; not " if given else ""}'
                        f'{" and ".join("--" + k for k in given)}')
     if duration is not None and not scenario:
-        raise BadUsage('--duration goes with --scenario; elsewhere distance and speed give it')
+        raise BadUsage('--duration requires --scenario; otherwise distance and speed give it')
     if given[0] != 'distance' and (standstill is not None or turns is not None):
-        raise BadUsage(f'--standstill and --turns go with --distance, not with --{given[0]}')
+        raise BadUsage(f'--standstill and --turns require --distance, not --{given[0]}')
     if speed is not None and not (math.isfinite(speed) and speed > 0):
-        raise BadUsage(f'--speed {speed:g}: want a number above 0; a drive must move')
+        raise BadUsage(f'--speed {speed:g}: required: a number above 0')
     settings = config_of(config)
     own: dict[str, Any] = {}
     if scenario:

@@ -36,20 +36,20 @@ def from_figures(speed: float, distance: float, standstill: float, turns: int,
     for flag, value, least in (('--speed', speed, 0.0), ('--distance', distance, 0.0),
                                ('--acceleration', acceleration, 0.0)):
         if not (math.isfinite(value) and value > least):
-            raise BadUsage(f'{flag} {value:g}: want a number above 0; a drive must move')
+            raise BadUsage(f'{flag} {value:g}: required: a number above 0')
     if not (math.isfinite(standstill) and standstill >= 0):
-        raise BadUsage(f'--standstill {standstill:g}: want 0 s or more')
+        raise BadUsage(f'--standstill {standstill:g}: required: 0 s or more')
     top = min(speed, math.sqrt(distance * acceleration))
     ramp, cruise = top / acceleration, distance / top - top / acceleration
     whole = 2 * (standstill + ramp) + cruise
     most_metres = 1e6
     if distance > most_metres or whole > MOST_SECONDS:
-        raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {whole / 3600:.1f} h; want '
-                       f'{most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h at most')
+        raise BadUsage(f'--distance {distance:g} at --speed {speed:g}: {whole / 3600:.1f} h; the '
+                       f'limits are {most_metres / 1000:g} km and {MOST_SECONDS / 3600:g} h')
     turn_time = 8.0    # s of a turn of 90 deg
     if turns < 0 or turns * turn_time > cruise:
-        raise BadUsage(f'--turns {turns}: want 0 to {int(cruise / turn_time)}, each takes '
-                       f'{turn_time:g} s of the {cruise:.0f} s at full speed')
+        raise BadUsage(f'--turns {turns}: required: 0 to {int(cruise / turn_time)}; each turn '
+                       f'takes {turn_time:g} s of the {cruise:.0f} s at full speed')
     t = np.linspace(0.0, whole, max(2, math.ceil(whole / max(DRIVE_STEP, whole / 20_000)) + 1))
     knots = standstill + np.array([0.0, ramp, ramp + cruise, 2 * ramp + cruise])
     t = np.union1d(t, knots)        # kinks on the grid: the trapezoid sum is then exact
@@ -92,7 +92,7 @@ def from_gpx(path: Path, speed: float | None = None) -> PlannedDrive:
     position_n = Origin(*geodetic[0]).to_n(geodetic)
     if t is None:
         if speed is None:
-            raise BadUsage(f'{path}: the track has no times; give --speed to drive it at')
+            raise BadUsage(f'{path}: the track has no times; give --speed')
         steps = np.hypot(*np.diff(position_n[:, :2], axis=0).T)
         t = np.concatenate([[0.0], np.cumsum(steps / speed)])
     return _from_points(path, t, position_n, geodetic[0])
@@ -107,13 +107,13 @@ def _gpx_points(path: Path) -> tuple[Floats | None, Floats]:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); give the path of a GPX '
                        'file') from None
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise BadUsage(f'{path}: is no GPX file ({error}); export the track again as '
+        raise BadUsage(f'{path}: is not a GPX file ({error}); export the track again as '
                        'GPX') from None
     points = [e for e in root.iter() if e.tag.rpartition('}')[2] in ('trkpt', 'rtept')]
     most_points = 1_000_000
     if not 2 <= len(points) <= most_points:
-        raise BadUsage(f'{path}: holds {len(points)} track points, want 2 to {most_points:,}; '
-                       'export a track, not waypoints')
+        raise BadUsage(f'{path}: holds {len(points)} track points; required: 2 to '
+                       f'{most_points:,}. Export a track, not waypoints')
     try:
         level = [(float(p.get('lat', 'nan')), float(p.get('lon', 'nan'))) for p in points]
         heights = np.array([float(_child(p, 'ele') or 'nan') for p in points])
@@ -147,7 +147,7 @@ def _seconds(text: str | None) -> float | None:
 
 
 def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> PlannedDrive:
-    """Return the drive through points; nearer than 5 m they tell no direction."""
+    """Return the drive through points; nearer than 5 m they give no direction."""
     rising = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0])
     t, p = t[rising], position_n[rising]
     used = [0]
@@ -156,26 +156,26 @@ def _from_points(path: Path, t: Floats, position_n: Floats, start: Floats) -> Pl
         if np.hypot(*(p[k] - p[used[-1]])[:2]) >= gpx_step:
             used.append(k)
     if len(used) < 2:
-        raise BadUsage(f'{path}: the track never moves {gpx_step:g} m; give one that was driven')
+        raise BadUsage(f'{path}: the track never moves {gpx_step:g} m; give a driven track')
     a, b = np.array(used[:-1]), np.array(used[1:])
     step = p[b] - p[a]
-    way, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
+    path_length, level = np.linalg.norm(step, axis=1), np.hypot(*step[:, :2].T)
     # a slow step was mostly a stop: its motion is put into the interval of its last point
-    pace = way / (t[b] - t[a])
+    pace = path_length / (t[b] - t[a])
     gpx_rest, gpx_slow = 0.3, 0.1    # m/s, of the median speed: slower steps were mostly a stop
     rest = pace < max(gpx_rest, gpx_slow * np.median(pace))
     begin = np.where(rest, t[b - 1], t[a])
     grid = np.arange(t[0], t[-1], max(DRIVE_STEP, (t[-1] - t[0]) / 50_000))
     if len(grid) < 2 or t[-1] - t[0] > MOST_SECONDS:
-        raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; want up to '
+        raise BadUsage(f'{path}: the track lasts {t[-1] - t[0]:.1f} s; the limit is '
                        f'{MOST_SECONDS / 3600:g} h')
     piece = np.clip(np.searchsorted(t[b], grid), 0, len(b) - 1)
     moving = (grid >= begin[piece]) & (grid <= t[b][piece])
-    speed = np.where(moving, (way / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
+    speed = np.where(moving, (path_length / np.maximum(t[b] - begin, 1e-3))[piece], 0.0)
     yaw = np.unwrap(arctan2(step[:, 1], step[:, 0]))
     middle = (begin + t[b]) / 2
     # s: what changes faster between points is their noise and spacing; rests, found too long by
-    # the way to the next point used, lose half of it at each end
+    # the path to the next used point loses half of it at each end
     gpx_smooth = 4.0
     wide = max(1, round(gpx_smooth / (grid[1] - grid[0]) / 2)) * 2 + 1
     slopes = 5    # odd; times longer for slopes: heights are noisier, hills longer

@@ -19,8 +19,8 @@ from odocal_ros.bagio.read import Bag, bag_sha256, open_bag
 from odocal_ros.data.leg import Leg, LegRecorder
 from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.library.asked import config_of, Leg as AskedLeg, legs_of, Settings
-from odocal_ros.library.hearer import Hearer
 from odocal_ros.library.journal import journal_notes, JournalNotes
+from odocal_ros.library.listener import Listener
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.outside.names import one_line
 from odocal_ros.reasons import Reason
@@ -35,7 +35,7 @@ class Recording:
     """
     A bag that was read.
 
-    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : of the Imu's headers.
+    name, sha256 : of the bag.   topics : slot -> topic.   imu_frame : of the IMU's headers.
     start_ns, end_ns : bag times of its first and last message.   marks : (start, stop) stamps of
     the legs that a node marked, stop 0 where there is none; dropped : it took one back.
     notes : what a result says of the bag.   config : settings in force, a journal's among them.
@@ -55,7 +55,7 @@ class Recording:
 
     @property
     def form(self) -> OdometerForm:
-        """Return what the odometer's values mean."""
+        """Return the meaning of the odometer values."""
         return self.recorder.form
 
     def samples(self, slot: str) -> Samples:
@@ -76,7 +76,7 @@ class Recording:
 
 def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
                journal: JournalNotes | None) -> tuple[dict[str, str], dict[str, Reader]]:
-    """Return slot -> topic of a bag, and topic -> reader; those named go before a journal's."""
+    """Return slot -> topic of a bag, and topic -> reader; named ones precede a journal's."""
     from odocal_ros.library.topics import choose_topics
     named = (journal.topics_in(bag.topics) if journal else {}) | dict(topics)
     chosen = choose_topics(bag.topics, config, named)
@@ -85,7 +85,7 @@ def readers_of(bag: Bag, topics: Mapping[str, str], config: Config,
 
 
 def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: Settings = None,
-             *, hearer: Hearer | None = None) -> Recording:
+             *, hearer: Listener | None = None) -> Recording:
     """
     Read a bag: a rosbag2 folder (sqlite3, mcap), a rosbag1 file, or a file of either.
 
@@ -98,8 +98,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
         found by their type.
     config : Config, mapping of dotted names, or a parameter file, optional
         Settings.
-    hearer : Hearer, optional
-        Is told how it goes.
+    hearer : Listener, optional
+        Receives notes and progress.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
 
     """
     from odocal_ros.library.legs import dropped_legs, marked_legs
-    hearer = hearer or Hearer()
+    hearer = hearer or Listener()
     path = Path(path)
     journal = journal_notes(path)
     settings = config_of(config, journal.settings if journal else None)
@@ -116,8 +116,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
         name = one_line(bag.name)
         if journal:
-            hearer.note(f'{bag.name} is a journal: settings and topics from {journal.path}; '
-                        'options go before them')
+            hearer.note(f'{bag.name} is a journal: settings and topics come from '
+                          f'{journal.path}; options take precedence')
         chosen, readers = readers_of(bag, topics or {}, settings, journal)
         digest = beside.submit(bag_sha256, bag)
         recorder = LegRecorder()

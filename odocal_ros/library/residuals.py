@@ -36,7 +36,7 @@ class Left:
 
 
 def left_in(leg: LegResult) -> list[Left]:
-    """Return what is left over of each sensor in a leg, none where it has no track and no fit."""
+    """Return the residuals of each sensor in a leg, none without track and fit."""
     found = []
     if (e := leg.evidence) is not None:
         sigma = np.repeat(e.fix_sigma[:, None], 2, axis=1)
@@ -53,7 +53,7 @@ def left_in(leg: LegResult) -> list[Left]:
 
 def residuals(result: Calibration) -> Series:
     """
-    Return what is left over of each sensor, a row for each component of each.
+    Return the residuals of each sensor, one row per component.
 
     sensor, component, value, sigma, unit : the calibrated drive less what the sensor says, and one
     standard deviation of the noise it is modelled with.   distance_m : driven until then.
@@ -72,7 +72,7 @@ def residuals(result: Calibration) -> Series:
     found = [(number, leg, _rows(leg, one)) for number, leg in enumerate(result.legs, 1)
              for one in left_in(leg)]
     if not found:
-        raise BadUsage('no leg has a track to hold against its fixes: see the reasons')
+        raise BadUsage('no leg has a track to compare with its fixes; see the reasons')
     return stacked(found)
 
 

@@ -11,7 +11,7 @@
 Time series of a calibration as columns: what was estimated along each leg.
 
 A series is a dict of equally long arrays. Of every row: ``leg``, from 1, and ``stamp_ns``, header
-time. Names tell the unit, but for SI and rad. At most 5000 rows of a leg. What is left over of the
+time. Names give the unit, except SI and rad. At most 5000 rows of a leg. What is left over of the
 sensors: residuals.py.
 """
 
@@ -28,8 +28,8 @@ from odocal_ros.nav.dead_reckoning import forward_b, Origin
 from odocal_ros.nav.rotations import quat_from_matrix, rpy_from_matrix
 
 Series = dict[str, NDArray[Any]]
-NONE = ('no leg has a fit of the smoother, which gives this series; see the reasons, or take the '
-        'method auto')
+NONE = ('no leg has a result of the smoother, which computes this series; see the reasons, or '
+        'use method auto')
 
 
 def trajectory(result: Calibration) -> Series:
@@ -51,7 +51,7 @@ def trajectory(result: Calibration) -> Series:
 
 def states(result: Calibration) -> Series:
     """
-    Return attitude and biases of the Imu, second by second, as the smoother finds them.
+    Return attitude and biases of the IMU, second by second, as the smoother finds them.
 
     roll, pitch, yaw : of the vehicle in n, yaw from east.   gyro_bias_x ... : rad/s, in the body
     frame b.   accelerometer_bias_x ... : m/s^2.   Each with its sigma: gyro_bias_x_sigma ...

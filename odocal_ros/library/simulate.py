@@ -69,7 +69,7 @@ def simulate(scenario: str | SimOptions = 'town', out: Path | str | None = None,
 
 
 def beside(out: Path) -> list[Path]:
-    """Return where truth and settings go: with the bag's name where another bag's are there."""
+    """Return the paths of truth and settings; with the name of the bag if others exist there."""
     plain = [out.parent / name for name in (TRUTH, SETTINGS)]
     text = plain[0].read_text(encoding='utf-8', errors='replace') if plain[0].exists() else ''
     if MADE_HERE in text and one_line(f'Truth of {out.name}.') not in text:
@@ -82,8 +82,8 @@ def _check_beside(path: Path, force: bool) -> None:
     if not path.exists():
         return
     if not force:
-        raise BadUsage(f'{path} is there already; give --force to replace it, or --out in '
-                       'another folder')
+        raise BadUsage(f'{path} already exists; give --force to replace it, or --out in another '
+                       'folder')
     if MADE_HERE not in path.read_text(encoding='utf-8', errors='replace'):
         raise BadUsage(f'{path} was not made by odocal simulate and is kept; give --out in '
                        'another folder')
@@ -94,7 +94,7 @@ def _write_beside(out: Path, drive: Drive, heading_sigma: float | None) -> None:
     with uninterrupted():      # a bag is never without its truth
         _write_yaml(truth, truth_entries(drive, out.name), f'Truth of {out.name}.')
         _write_yaml(known, {'/**/calibrator': {'ros__parameters': settings(drive, heading_sigma)}},
-                    f'What an operator of {out.name} would know.')
+                    f'Settings of the operator of {out.name}.')
 
 
 def _write_yaml(path: Path, content: dict[str, Any], title: str) -> None:

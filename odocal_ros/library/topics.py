@@ -42,15 +42,15 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
     topics : dict
         Name -> TopicInfo of a bag.
     config : Config
-        Which inputs are wanted, and of what type the odometer is.
+        Required inputs, and the type of the odometer.
     overrides : dict
         Slot -> topic, as the user named them.
 
     Raises
     ------
     BadUsage
-        A topic named is not there, or a wanted input cannot be told: none or several serve. All
-        such inputs are named at once, with the option that settles each.
+        A named topic is missing, or a required input is not unique: none or several fit. All
+        such inputs are named at once, with the option that selects each.
 
     """
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
@@ -65,7 +65,7 @@ def choose_topics(topics: Topics, config: Config, overrides: dict[str, str]) -> 
             troubles.append(_trouble(topics, slot, found, config))
     if troubles:
         raise BadUsage('; '.join(troubles) + (
-            '' if all(': name ' in text for text in troubles) else
+            '' if all('; choose one with ' in text for text in troubles) else
             f'; the bag has {_described(topics, topics)}'))
     return chosen
 
@@ -96,7 +96,7 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
     elif slot == 'heading':
         if config.alignment.heading_source == 'auto':    # by the name the node listens to
             return [name for name in found if _last(name) == 'heading']
-        # the only one is the Imu's
+        # the only one is the IMU's
         alone = len(found) == 1 and 'imu' not in chosen
         found = [name for name in found if 'heading' in name] or ([] if alone else found)
     elif slot == 'imu':
@@ -111,13 +111,13 @@ def candidates(topics: Topics, slot: str, config: Config, chosen: dict[str, str]
 
 
 def _optional(slot: str, config: Config) -> bool:
-    """Tell whether a leg can do without a slot whose topic is not clear."""
+    """Return True if a leg does not need a slot whose topic is ambiguous."""
     return slot == 'fix_velocity' or (
         slot == 'heading' and config.alignment.heading_source != 'heading_topic')
 
 
 def _of_receiver(name: str) -> bool:
-    """Tell whether a topic's name has the word of a receiver, and none of another source."""
+    """Return True if the name of a topic has a receiver word and no word of another source."""
     words = re.split('[/_]', name.lower())
     return (any(word.startswith(GNSS) for word in words)
             and not _has(name, (*COMMANDS, 'filtered', 'fused', 'ekf', 'odom', 'wheel', 'speed')))
@@ -139,7 +139,7 @@ def named(topics: Topics, slot: str, topic: str) -> str:
                                f'{_described(topics, topics)}')
             if not _may_serve(topics[name].msgtype, slot):
                 raise BadUsage(f'{OPTION[slot]} {topic}: the topic is of {topics[name].msgtype}, '
-                               f'which cannot be the {_label(slot)}; the bag has '
+                               f'which cannot be used as {_label(slot)}; the bag has '
                                f'{_described(topics, topics)}')
             return name
     raise BadUsage(f'{OPTION[slot]} {topic}: no such topic; the bag has '
@@ -147,24 +147,24 @@ def named(topics: Topics, slot: str, topic: str) -> str:
 
 
 def _may_serve(msgtype: str, slot: str) -> bool:
-    """Return whether a type can be a slot's; odometers may be of a foreign one."""
+    """Return True if a type fits a slot; odometers can have a foreign type."""
     if slot in ('odometer', 'odometer_right'):
         return full_type(msgtype) not in (IMU, FIX)
     return full_type(msgtype) in SENSORS[slot]
 
 
 def _trouble(topics: Topics, slot: str, found: list[str], config: Config) -> str:
-    """Say why a slot is open and what settles it."""
+    """Return the explanation why a slot is open and the option that selects it."""
     if found:
         hint = ''
         if slot == 'odometer' and {'left', 'right'} <= {
                 side for name in found for side in ('left', 'right') if side in _last(name)}:
-            hint = ', or set odometer.left and odometer.right to topic for two wheels'
-        return (f'{len(found)} topics could be the {_label(slot)}: name one with {OPTION[slot]} '
-                f'of {_described(topics, found)}{hint}')
+            hint = '; for two wheels set odometer.left and odometer.right to topic'
+        return (f'{len(found)} topics can be the {_label(slot)}; choose one with {OPTION[slot]}: '
+                f'{_described(topics, found)}{hint}')
     types = tuple(_types(slot, config))
-    what = ' or '.join(types) if len(types) < 3 else 'a type that odometers have'
-    beside = ' beside that of the Imu' if slot == 'heading' else ''
+    what = ' or '.join(types) if len(types) < 3 else 'an odometer type'
+    beside = ' besides the IMU' if slot == 'heading' else ''
     return f'no {_label(slot)} (a topic of {what}{beside}) in the bag'
 
 
@@ -175,12 +175,12 @@ def _described(topics: Topics, names: Iterable[str]) -> str:
 
 
 def _label(slot: str) -> str:
-    return {'imu': 'Imu', 'odometer_right': 'right odometer', 'fix_velocity': 'GNSS velocity'
+    return {'imu': 'IMU', 'odometer_right': 'right odometer', 'fix_velocity': 'GNSS velocity'
             }.get(slot, slot)
 
 
 def _last(name: str) -> str:
-    """Return the end of a topic's name that tells wheels apart: all of it but a namespace."""
+    """Return the end of a topic's name that distinguishes wheels: all of it but a namespace."""
     return name.rstrip('/').rpartition('/')[2]
 
 

@@ -19,7 +19,7 @@ from odocal_ros.calib.result import Estimate, MethodResult
 from odocal_ros.output.figures import length, time_span
 from odocal_ros.pipeline.combination import together
 from odocal_ros.planning.drive import PlannedDrive, REST_SPEED
-from odocal_ros.planning.manoeuvres import stop_and_start, town_driving, turns_both_ways
+from odocal_ros.planning.manoeuvres import left_and_right_turns, stop_and_start, town_driving
 from odocal_ros.planning.methods import Plan, plan_methods
 from odocal_ros.planning.predict import predict, Sigmas
 from odocal_ros.planning.smoother import spacing_for
@@ -38,7 +38,7 @@ class Change:
     yaw: float | None
 
     def gain(self, before: Plan, parameter: str) -> float:
-        """Return how many times smaller the sigma gets; inf where there was none before."""
+        """Return the ratio of the old to the new sigma; inf if there was none before."""
         now, then = self.sigma(parameter), before.sigma(parameter)
         if now is None:
             return 1.0 if then is None else 0.0
@@ -50,7 +50,7 @@ class Change:
 
 
 def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
-    """Return what could be changed, each with what it leaves of the result's sigmas."""
+    """Return the possible changes, each with the resulting sigmas."""
     # keyframes as far apart as they were: farther ones alone make a sigma larger
     spacing = spacing_for(drive)
     found = []
@@ -64,26 +64,26 @@ def changes(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
 def _other_drives(drive: PlannedDrive, sigmas: Sigmas,
                   before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
     """Yield longer drives, and such with more to see in them."""
-    yield (f'{length(drive.distance)} more, straight on', drive.lengthened(drive.distance),
+    yield (f'{length(drive.distance)} more, straight ahead', drive.lengthened(drive.distance),
            sigmas)
     least_rest = 60.0    # s
     rest = max(least_rest, *before.two_point.standing)
     yield (f'standing {time_span(rest)} longer at both marks', drive.standing_longer(rest),
            sigmas)
-    yield 'a stop and a start on the way', stop_and_start(drive), sigmas
-    yield 'a turn to the left and one to the right on the way', turns_both_ways(drive), sigmas
+    yield 'one more stop and start', stop_and_start(drive), sigmas
+    yield 'one more left turn and right turn', left_and_right_turns(drive), sigmas
     town_minutes = 5
     yield (f'{town_minutes} min more, stop and go with turns', town_driving(drive, town_minutes),
            sigmas)
     farthest = _until_farthest(drive, sigmas)
     if farthest is not None:
-        yield (f'marking the end where you are farthest off ({length(farthest.distance)})',
+        yield (f'end mark at the farthest point ({length(farthest.distance)})',
                farthest, sigmas)
 
 
 def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
                     before: Plan) -> Iterator[tuple[str, PlannedDrive, Sigmas]]:
-    """Yield fixes, heading and Imu that are better than what there is."""
+    """Yield fixes, heading and IMU that are better than what there is."""
     if sigmas.fix > 2 * RTK:
         yield f'RTK fixes ({RTK:g} m)', drive, replace(sigmas, fix=RTK, fix_up=2 * RTK)
     alignment = before.two_point.alignment
@@ -92,12 +92,12 @@ def _better_sensors(drive: PlannedDrive, sigmas: Sigmas,
     better = outside_heading if now > 2 * outside_heading else now / 2
     config = with_settings(sigmas.config, {'alignment.heading_source': 'heading_topic',
                                            'alignment.heading_sigma': better})
-    yield (f'a heading known to {math.degrees(better):.2g} deg', drive,
+    yield (f'a heading with {math.degrees(better):.2g} deg uncertainty', drive,
            replace(sigmas, config=config))
     grade = GRADES.index(sigmas.config.imu.grade)
     if grade + 1 < len(GRADES):
         finer = with_settings(sigmas.config, {'imu.grade': GRADES[grade + 1]})
-        yield f'an Imu of {GRADES[grade + 1]} grade', drive, replace(sigmas, config=finer)
+        yield f'an IMU of {GRADES[grade + 1]} grade', drive, replace(sigmas, config=finer)
 
 
 def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
@@ -115,7 +115,7 @@ def _until_farthest(drive: PlannedDrive, sigmas: Sigmas) -> PlannedDrive | None:
 
 
 def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Change]:
-    """Return two legs combined, the second the other way: each value by its method."""
+    """Return two legs combined, the second in reverse direction: each value by its method."""
     if before.sigma(SCALE) is None:
         return []
     other = {'two_point': predict(drive.turned_around(), sigmas).method}
@@ -126,7 +126,7 @@ def _second_leg(drive: PlannedDrive, sigmas: Sigmas, before: Plan) -> list[Chang
             left[parameter] = None
             continue
         one = before.methods[name]
-        # all that the smoother knows is in body axes: the way it goes is the same to it
+        # the smoother works in body axes: the direction of the drive does not matter
         both = together(name, [_whole(one), _whole(other.get(name, one))],
                         (0, round(drive.duration * 1e9)), sigmas.config)
         left[parameter] = both.estimates[parameter].sigma

@@ -53,23 +53,23 @@ def provisional(at_stop: SessionView) -> str:
     """
     session, forecast = at_stop.session, at_stop.forecast
     known = forecast.estimates if forecast else {}
-    estimate = 'it has no running estimate'
+    estimate = 'there is no running estimate'
     if any(e.value is not None for e in known.values()):
-        estimate = (f'its running estimate is {values_in_words(known)}, as it was '
-                    f'{at_stop.forecast_age_s:.0f} s before its end')
-    faults = [f'As driven it would be rejected: {r.code.name}: {r.text}'
+        estimate = (f'the running estimate is {values_in_words(known)}, computed '
+                    f'{at_stop.forecast_age_s:.0f} s before the end')
+    faults = [f'Now it would be rejected: {r.code.name}: {r.text}'
               for r in at_stop.faults[:1] if at_stop.lost_cause]
     of_all = ' of all legs' if session.legs else ''
     return _sentences([
         f'provisional: leg {session.leg_id} is being computed; {estimate}', *faults,
-        f'The final result{of_all} has a verdict and replaces this; it follows on ~/status and in '
-        'the parameters result.*, and ~/stop_leg called again waits for it'])
+        f'The final result{of_all} with its verdict follows on ~/status and in the parameters '
+        'result.*; call ~/stop_leg again to wait for it'])
 
 
 def restored(result: Restored, unit: str, good: str) -> tuple[bool, str]:
     """Return the answer that carries a restored result; ``unit`` is that of its scale."""
     return result.valid, _sentences([f'no leg is running; {result.words(unit)}', good,
-                                     'Next: drive a leg to renew it'])
+                                     'Next: drive a leg to update it'])
 
 
 def _sentences(parts: Iterable[str]) -> str:

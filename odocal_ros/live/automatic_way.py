@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Legs that begin and end by themselves in the node, where ``leg.automatic`` asks for it."""
+"""Automatic legs of the node, with ``leg.automatic``."""
 
 from typing import Any
 
@@ -25,9 +25,9 @@ from odocal_ros.settings.config import Config, LegConfig
 
 class AutomaticWay(LegCompletion):
     """
-    The way of legs that nobody marks: ``LegSearch`` says where, from the samples alone.
+    Handle automatic legs: ``LegSearch`` finds them from the samples.
 
-    A leg of the operator's goes before; the search goes on where it ended.
+    A leg of the operator takes precedence; the search continues after it.
     """
 
     def __init__(self, *args: Any) -> None:
@@ -36,7 +36,7 @@ class AutomaticWay(LegCompletion):
         self._searched: LegConfig | None = None      # the settings it was made with
         self._counted_ns = 0                  # start of the leg whose metres are counted
         self._warned: set[str] = set()        # changes of the scale that were said
-        self._recording.tap = self._hear
+        self._recording.tap = self._receive
 
     def tick(self) -> None:
         """Take over what the worker has done and what time has brought."""
@@ -45,7 +45,7 @@ class AutomaticWay(LegCompletion):
         if self._search is not None and self._search.spans:
             self._by_itself(self._search)
 
-    def _hear(self, slot: str, block: Samples) -> None:
+    def _receive(self, slot: str, block: Samples) -> None:
         self._watch.feed(slot, block)
         if self._search is not None:
             self._search.feed(slot, block, self._recording.inputs.form)
@@ -68,10 +68,10 @@ class AutomaticWay(LegCompletion):
             return
         why = _not_ours(found, self._config())
         if why:
-            self._log.warning(f'{found.name} is not gone on from: {why}')
+            self._log.warning(f'{found.name} is not continued: {why}')
         else:
             self.session.carried = found.carried
-            self._log.info(f'goes on from {found.name}: {found.carried.legs} legs, the last of '
+            self._log.info(f'continues {found.name}: {found.carried.legs} legs, the last of '
                            f'{iso(found.carried.last_ns)}')
 
     def _by_itself(self, search: LegSearch) -> None:
@@ -118,9 +118,9 @@ class AutomaticWay(LegCompletion):
 
 
 def _not_ours(found: Stored, config: Config) -> str:
-    """Return why a result is of another vehicle or mounting, empty where it is not."""
+    """Return the explanation why a result belongs to another vehicle or mounting, else empty."""
     if found.vehicle != config.vehicle:
-        return f'it is of vehicle {found.vehicle!r}'
+        return f'it belongs to vehicle {found.vehicle!r}'
     if list(found.config.get('imu.mounting_rpy', ())) != list(config.imu.mounting_rpy):
-        return 'imu.mounting_rpy was another'
+        return 'imu.mounting_rpy has changed'
     return ''

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The computation under way, and those who wait for what it brings."""
+"""The running computation, and the callers that wait for its result."""
 
 from collections.abc import Callable
 import math
@@ -30,7 +30,7 @@ class Computing:
     """
     At most one job that counts; what a dropped one brings is thrown away.
 
-    ``failed(trouble)`` hears of a job that raised, or whose result could not be taken;
+    ``failed(trouble)`` is called for a job that raised, or whose result could not be taken;
     ``done()`` is called after each that counted. ``alive()`` is false while the node is shut
     down: what breaks then is no failure.
     """
@@ -42,7 +42,7 @@ class Computing:
         self._waiting: list[tuple[Future, float]] = []     # until when, s of the monotonic clock
         self.at = Stage()
 
-    def tell(self, stage: Stage) -> None:
+    def report(self, stage: Stage) -> None:
         """Take over how far the job is; called by the worker's thread."""
         self.at = stage
         give_back()      # what the pass before needed
@@ -86,7 +86,7 @@ class Computing:
             future.set_result((success, text))
 
     def answer_late(self, text: Callable[[], str]) -> None:
-        """Answer those whose patience is over: the job goes on."""
+        """Answer callers whose waiting time is over; the job continues."""
         now = time.monotonic()
         late = [future for future, until in self._waiting if until <= now]
         self._waiting = [one for one in self._waiting if one[1] > now]

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the node says on its console by itself: what it waits for, that it is ready, what fails."""
+"""Console log of the node: missing inputs, readiness, failures."""
 
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session_view import SessionView
@@ -21,7 +21,7 @@ class Console:
     """
     Turns what changes into lines of the log; what stays is repeated seldom.
 
-    ``tell`` is given every view, with the time of a clock that never stands.
+    ``report`` receives every view, with the time of a steady clock.
     """
 
     def __init__(self, log: PlainLog) -> None:
@@ -32,10 +32,10 @@ class Console:
         self._due_ns = 0             # when the next word about what is missing is due
         self._pause_ns = SILENCE_FIRST_NS
         self._leg_id = 0             # the leg whose faults are said
-        self._told: set[Code] = set()      # of them
+        self._reported: set[Code] = set()      # of them
 
-    def tell(self, now: SessionView, steady_ns: int) -> None:
-        """Say what is new."""
+    def report(self, now: SessionView, steady_ns: int) -> None:
+        """Log new events."""
         self._faults(now)
         for text in set(now.doubled) - self._doubled:
             self._doubled.add(text)
@@ -58,20 +58,20 @@ class Console:
         self._due_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         if not self._ready:
             rates = ', '.join(f'{slot} {hz:.0f} Hz' for slot, hz in now.rates_hz.items() if hz)
-            what = ('legs begin and end by themselves' if now.config.leg.automatic else
+            what = ('legs start and end automatically' if now.config.leg.automatic else
                     'stand still for 10 s, then call ~/start_leg')
-            self._log.info(f'ready ({rates}): {what}')
+            self._log.info(f'ready ({rates}): {what}' if rates else f'ready: {what}')
         elif self._silence:
-            self._log.info('all inputs are there again')
+            self._log.info('all inputs are available again')
         self._ready, self._silence = True, False
 
     def _faults(self, now: SessionView) -> None:
-        """Say what is wrong with the leg that is recorded, each once."""
+        """Log the problems of the current leg, each once."""
         leg_id = now.session.leg_id
         if self._leg_id != leg_id:
-            self._leg_id, self._told = leg_id, set()
+            self._leg_id, self._reported = leg_id, set()
         for fault in now.faults:
-            if fault.code not in self._told:
-                self._told.add(fault.code)
+            if fault.code not in self._reported:
+                self._reported.add(fault.code)
                 self._log.warning(f'leg {leg_id}: {fault.code.name}: {fault.text}. '
                                   f'{fault.remedy}')

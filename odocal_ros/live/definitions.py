@@ -37,7 +37,7 @@ def message_class(msgtype: str) -> Any:
 
 
 def _has_messages(package: str) -> bool:
-    """Return whether a package has messages, without running anything of it."""
+    """Return True if a package has messages, without importing it."""
     found = PathFinder.find_spec(package)
     places = found and found.submodule_search_locations or ()
     return any(Path(place, 'msg').is_dir() for place in places)
@@ -47,7 +47,7 @@ def definition_of(kind: type) -> str:
     """
     Return the definition of a message class as a bag holds it: its .msg text and those it uses.
 
-    Constants and defaults, of which the classes do not tell, are not in it; the bytes of a message
+    Constants and defaults, which the classes do not have, are not in it; the bytes of a message
     do not depend on them.
     """
     texts: dict[str, str] = {}

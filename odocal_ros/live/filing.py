@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Result files on their way to the disk: written by the worker, answered by a future."""
+"""Result files: written by the worker, answered by a future."""
 
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -38,7 +38,7 @@ class Filing:
         self._node = node
         self._worker, self._log, self._show = worker, log, show
         self._folders = ResultFolders()
-        self._warned: Calibration | None = None    # the operator was told that latest stays
+        self._warned: Calibration | None = None    # the operator knows that latest stays
         self._under_way = 0
         self._artist = Worker()        # a leg that ends meanwhile need not wait for a report
 
@@ -60,13 +60,13 @@ class Filing:
                 if stays and asked:
                     self._warned = calibration
                 future.set_result((True, f'saved to {folder}' + (
-                    f'; latest stays where it was: {stays}; call ~/save'
-                    f'{" again" * asked} to point it here all the same' if stays else '')))
+                    f'; latest is unchanged: {stays}; call ~/save{" again" * asked} to point it '
+                    'to this result anyway' if stays else '')))
             else:
                 self.trouble = answers.one_line(error)
                 future.set_result((False, f'not saved: {self.trouble}'))
-            tell = self._log.info if error is None else self._log.warning
-            tell(future.result()[1])
+            log = self._log.info if error is None else self._log.warning
+            log(future.result()[1])
             self._show()
 
         self._worker.submit(partial(
@@ -77,7 +77,7 @@ class Filing:
 
     @property
     def busy(self) -> bool:
-        """Return whether files are being written."""
+        """Return True while files are being written."""
         return self._under_way > 0 or self._artist.busy
 
     def _write(self, *values: Any) -> tuple[Path, str]:
@@ -89,7 +89,7 @@ class Filing:
 
     def _drawn(self, why: str, error: Exception | None) -> None:
         if error is not None or why:
-            self._log.warning('the report is not drawn: '
+            self._log.warning('the report could not be drawn: '
                               f'{answers.one_line(error) if error else why}')
 
     def poll(self) -> None:
@@ -107,7 +107,8 @@ class Filing:
         def then(folder: Path | None, error: Exception | None) -> None:
             self.saved = '' if folder is None else str(folder)
             if error is not None:
-                self._log.warning(f'latest still shows a dropped leg: {answers.one_line(error)}')
+                self._log.warning('latest still contains a dropped leg: '
+                                  f'{answers.one_line(error)}')
             self._show()
 
         self._worker.submit(partial(self._folders.withdraw, outputs.marks(left)), then)

@@ -22,15 +22,15 @@ from odocal_ros.reasons import Reason, Verdict
 KMH = 3.6    # definition: km/h in a m/s
 FORECAST_OLD_S = 15.0    # judgement: age from which what is foreseen is said to be old
 DRIVE = 'drive '
-STRAIGHT = 'go straight on at speed until left and right wheel are told apart'
-TURNS = 'turn by about 90 deg in all, or more, for the track width'
+STRAIGHT = 'drive straight at speed until left and right wheel are separable'
+TURNS = 'for the track width: turn by 90 deg in total or more'
 
 
 def hint(now: SessionView) -> str:
-    """Return what is missing, or what to do next."""
+    """Return the action: provide missing inputs, or the next step."""
     session, state = now.session, now.session.state
     if state is State.COMPUTING:
-        return f'computing: {now.computed.words() or "begun"}; the result follows on ~/status'
+        return f'computing: {now.computed.words() or "started"}; the result follows on ~/status'
     if state is State.FAILED:
         return ('call ~/stop_leg to compute the leg again, or ~/cancel_leg to drop it'
                 if session.open_leg else 'call ~/reset')
@@ -44,7 +44,7 @@ def hint(now: SessionView) -> str:
         actions, facts = _while_recording(now)
         return '; '.join([*facts, *actions])
     if state is State.IDLE:
-        return ('drive off: a leg begins by itself' if now.config.leg.automatic
+        return ('start driving: a leg starts automatically' if now.config.leg.automatic
                 else _before_start(now.still_s))
     return after_result(now)
 
@@ -59,7 +59,7 @@ def action_first(now: SessionView) -> str:
 
 
 def quantities_ok(now: SessionView) -> dict[str, str]:
-    """Return which quantities are good enough: of the leg that is recorded, else of the result."""
+    """Return the quantities that meet their limits: of the current leg, else of the result."""
     session = now.session
     if session.state is State.RECORDING:
         return quantities.of_forecast(now.forecast, now.config, now.two_wheels, now.lost_cause)
@@ -88,7 +88,7 @@ def seconds_to_stand(now: SessionView) -> float:
 
 
 def manoeuvres(now: SessionView) -> list[str]:
-    """Return what the leg still lacks in driving, besides metres and standstill."""
+    """Return the missing manoeuvres of the leg, besides metres and standstill."""
     if now.session.state is not State.RECORDING:
         return []
     wants, least = [], now.session.config.leg.min_speed
@@ -100,7 +100,7 @@ def manoeuvres(now: SessionView) -> list[str]:
 
 
 def _of_two_wheels(now: SessionView) -> list[str]:
-    """Return what the wheels need; before the first look only what any drive needs."""
+    """Return the manoeuvres for the wheels; before the first update only the general ones."""
     config = now.session.config
     wheels = None if now.forecast is None else now.forecast.wheels
     asked = quantities.QUANTITIES['left_right'].limit(config)
@@ -119,7 +119,7 @@ def _before_start(still_s: float) -> str:
 
 
 def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
-    """Return what to do, and what is known."""
+    """Return the hint: what to do, then what is known."""
     metres, wants = metres_to_go(now), manoeuvres(now)
     facts = [f'{r.code.name}: {r.text}' for r in now.faults[:1]]     # a caution, or a gap
     slow = now.max_speed < now.session.config.leg.min_speed
@@ -133,26 +133,26 @@ def _while_recording(now: SessionView) -> tuple[list[str], list[str]]:
         return [*wants, _end(now)], facts
     facts.append(now.forecast.words())
     if now.forecast_age_s > FORECAST_OLD_S:
-        facts.append(f'as it was {now.forecast_age_s:.0f} s ago')
+        facts.append(f'estimate is {now.forecast_age_s:.0f} s old')
     ends = now.forecast.complete or now.session.by_itself
     return wants + ([_end(now)] if ends else []), facts
 
 
 def _fault(now: SessionView) -> str:
-    """Return what the leg would be rejected for, and what to do."""
+    """Return the reason that would reject the leg, and its remedy."""
     worst = now.faults[0]
     if now.session.by_itself:
         return (f'the leg will not be used: {worst.code.name}: {worst.text}. '
-                f'{worst.remedy.rstrip(".")}; the next begins by itself')
+                f'{worst.remedy.rstrip(".")}; the next leg starts automatically')
     return (f'call ~/cancel_leg and start again: the leg would be rejected: {worst.code.name}: '
             f'{worst.text}. {worst.remedy.rstrip(".")}')
 
 
 def _end(now: SessionView) -> str:
-    """Return how to end the leg."""
+    """Return the instruction that ends the leg."""
     if now.session.by_itself:
         left = now.session.config.leg.automatic_minutes - now.duration_s / 60
-        return (f'the leg ends by itself, at a standstill or within {max(1, round(left))} min')
+        return (f'the leg ends automatically at a standstill, or within {max(1, round(left))} min')
     if now.still_s < now.session.config.leg.standstill:
         return f'stand still {REST_FORESEEN_S:.0f} s at the end point, then call ~/stop_leg'
     left = seconds_to_stand(now)
@@ -160,7 +160,7 @@ def _end(now: SessionView) -> str:
 
 
 def after_result(now: SessionView) -> str:
-    """Return what would help most after a result, and what would help the other quantities."""
+    """Return the advice after a result: the largest improvement, then the other quantities."""
     reasons = now.session.calibration.reasons if now.session.calibration else ()
     config = now.config
     lacking = config.verdict.min_legs - len(now.session.legs)
@@ -172,7 +172,7 @@ def after_result(now: SessionView) -> str:
     if grave:
         return grave[0].remedy
     saved = config.output.autosave or now.saved
-    text = 'drive on: legs begin and end by themselves'
+    text = 'drive on: legs start and end automatically'
     if not config.leg.automatic:
         text = f'{"" if saved else "call ~/save, or "}drive another leg for a smaller sigma'
     notes = _notes(reasons, quantities_ok(now))
@@ -183,8 +183,8 @@ def _notes(reasons: Sequence[Reason], ok: dict[str, str]) -> list[str]:
     """Return the remedies of what is not OK and yet no reason against the result."""
     wanted = {part: quantities.QUANTITIES[name].label for name, value in ok.items()
               if value == quantities.NO for part in quantities.QUANTITIES[name].estimates}
-    told: dict[str, None] = {}
+    advice: dict[str, None] = {}
     for r in reasons:
         if ABOUT.get(r.code) in wanted:
-            told[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None
-    return list(told)
+            advice[f'for the {wanted[ABOUT[r.code]]}: {r.remedy[0].lower()}{r.remedy[1:]}'] = None
+    return list(advice)

@@ -18,10 +18,10 @@ from odocal_ros.data.arrays import Bools, Ints
 from odocal_ros.data.samples import FixSamples, Samples
 from odocal_ros.settings.levels import TIME_ANEW_NS, TIME_ANEW_ROWS
 
-# judgement: of stamps that tell a rate, blocks that hold them; of silence until a topic is gone
+# judgement: stamps for a rate, blocks with them; silence until a topic is lost
 RATE_SPAN_NS, RATE_BLOCKS = 3 * 10**9, 64
 SILENCE_NS = 2 * 10**9
-# judgement: a stamp further ahead is believed when TIME_ANEW_ROWS of them follow one another
+# judgement: a stamp further ahead is accepted if TIME_ANEW_ROWS of them follow
 WILD_STAMP_NS = 30 * 10**9
 
 
@@ -39,7 +39,7 @@ class Health:
         self.lost = 0          # by the middleware's sequence numbers
         self.gaps = 0
         self.newest_ns = 0
-        self.heard_ns = 0
+        self.received_ns = 0
         self.delay_s = 0.0     # arrival minus stamp of the newest row
         self.jumped_back = False
         self.fix_status: int | None = None
@@ -52,11 +52,11 @@ class Health:
 
     def arrived(self, sequences: Sequence[int | None], now_ns: int) -> None:
         """Count messages as they came; sequences are the publisher's numbers, or None."""
-        self.heard_ns = now_ns
+        self.received_ns = now_ns
         numbers = [s for s in [self._last_sequence, *sequences] if s is not None]
         if len(numbers) > 1:
             steps = np.diff(np.asarray(numbers, dtype=np.int64))
-            # several publishers, or one that started anew: the numbers then say nothing
+            # several publishers, or one that restarted: the numbers are useless
             if (steps > 0).all():
                 self.lost += int((steps - 1).sum())
         if numbers:
@@ -81,7 +81,7 @@ class Health:
         return sound
 
     def _not_ahead(self, stamps: Ints) -> Bools:
-        """Return which stamps are given and not far ahead of the last, unless enough follow."""
+        """Return a mask of stamps that exist and are not far ahead of the last one."""
         sound: Bools = stamps > 0
         given = stamps[sound]
         if not len(given) or not self._ahead and (
@@ -113,10 +113,10 @@ class Health:
 
     def _newest(self, stamps: Ints) -> int:
         """
-        Return the newest stamp with a block of them, and note whether time has started anew.
+        Return the newest stamp with a block of them, and note whether time has restarted.
 
         One or two stale stamps are a hiccup of the driver, more are a new start of time; where a
-        block ends with few of them, or has but one row, the next one tells.
+        block ends with few of them, or has but one row, the next one decides.
         """
         known = stamps if not self.newest_ns else np.r_[self.newest_ns, stamps]
         steps = np.diff(known)
@@ -138,14 +138,14 @@ class Health:
 
     def silent_s(self, now_ns: int) -> float:
         """Return seconds since the last message, infinite before the first."""
-        return (now_ns - self.heard_ns) * 1e-9 if self.heard_ns else float('inf')
+        return (now_ns - self.received_ns) * 1e-9 if self.received_ns else float('inf')
 
     def silence_allowed_s(self) -> float:
-        """Return how long this topic may be silent before it counts as gone."""
+        """Return the time without messages after which this topic counts as silent."""
         return max(SILENCE_NS * 1e-9, 5 * self._interval_s)
 
     def flowing(self, now_ns: int) -> bool:
-        """Return whether messages that can be used are coming."""
+        """Return True if usable messages arrive."""
         return bool(self.newest_ns) and self.silent_s(now_ns) < self.silence_allowed_s()
 
     def rate_hz(self, now_ns: int) -> float:
@@ -160,7 +160,7 @@ class Health:
         return (recent[-1][0] - recent[0][0]) / ((recent[-1][1] - recent[0][1]) * 1e-9)
 
     def forget(self) -> None:
-        """Start anew after a jump of time; counts of losses stay."""
+        """Restart after a jump of time; counts of losses stay."""
         self.newest_ns = 0
         self.jumped_back = False
         self._ahead, self._behind = [], 0

@@ -53,11 +53,11 @@ class Inputs:
         return [self.by_slot[slot] for slot in slots if slot in self.by_slot]
 
     def missing(self, config: Config) -> list[str]:
-        """Return why a leg cannot be started, one line for each topic that lacks."""
+        """Return the causes why a leg cannot start, one line per missing topic."""
         return [one.why() for one in self.required(config) if not one.flowing()]
 
     def doubled(self) -> list[str]:
-        """Return what is to be said of topics with several publishers."""
+        """Return the warnings on topics with several publishers."""
         return [text for text in (one.doubled() for one in self.by_slot.values()) if text]
 
     @property

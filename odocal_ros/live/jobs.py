@@ -37,8 +37,8 @@ class Computed:
     """
     What a leg gave.
 
-    results : one, or one of each part where the Imu had a gap.
-    carried, folded : what earlier legs tell now, and how many of those kept are in it.
+    results : one, or one of each part where the IMU had a gap.
+    carried, folded : information of earlier legs, and how many kept legs are in it.
     """
 
     results: tuple[LegResult, ...]
@@ -50,7 +50,7 @@ class Computed:
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """What a leg begun by itself gave that does not count, and why not."""
+    """Result of an unused automatic leg, and the cause."""
 
     results: tuple[LegResult, ...]
     why: Reason

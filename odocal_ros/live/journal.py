@@ -24,7 +24,7 @@ from rclpy.serialization import serialize_message
 from odocal_ros.live.definitions import message_class
 from odocal_ros.live.journal_leg import Plan
 from odocal_ros.live.journal_text import journal_text
-from odocal_ros.live.journal_writer import Heard, JournalWriter
+from odocal_ros.live.journal_writer import JournalWriter, Received
 from odocal_ros.live.recording import PREROLL_MARGIN_S
 from odocal_ros.live.result_files import output_root
 from odocal_ros.live.session import Session
@@ -32,7 +32,7 @@ from odocal_ros.live.topic_input import Input
 from odocal_ros.settings.config import Config
 
 BATCH_NS = 800_000_000    # judgement: with the writing, a kill then costs about a second
-JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node is told to end
+JOURNAL_GRACE_S = 2.0     # judgement: for the last batch, once the node must stop
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 DROPPED = ('cancelled', 'undone')
 
@@ -50,37 +50,37 @@ class Journal:
         self._node = node.get_fully_qualified_name()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._writer = JournalWriter()
-        self._batch: dict[str, Heard] = {}
-        self._marks: Heard | None = None
+        self._batch: dict[str, Received] = {}
+        self._marks: Received | None = None
         self._due_ns = 0
         self._limit, self._reach_ns = 0, 0
         self._leg_id = 0                 # of the leg whose journal is not joined yet, 0: none
         self._ended = False              # its samples are complete
         self._last_event = ''
         self._dropped: set[int] = set()  # legs that the journal knows to be dropped
-        self._told = ''
+        self._reported = ''
 
     @property
     def trouble(self) -> str:
-        """Return why the leg cannot be written, empty if it can."""
+        """Return the explanation why the leg cannot be written, empty if it can."""
         return self._writer.trouble if self._limit else ''
 
     @property
     def folder(self) -> str:
-        """Return where the newest leg is written."""
+        """Return the folder of the newest leg."""
         return self._writer.folder if self._limit else ''
 
     def remember(self, source: Input, raws: list[bytes], sent_ns: list[int]) -> None:
         """Take messages of a topic as the recorder got them."""
         if not self._limit:
             return
-        heard = self._batch.get(source.slot)
-        if heard is None:
-            heard = self._batch[source.slot] = Heard(
+        received = self._batch.get(source.slot)
+        if received is None:
+            received = self._batch[source.slot] = Received(
                 source.topic, source.msgtype, message_class(source.msgtype))
-        heard.raws += raws
-        heard.sent_ns += sent_ns
-        heard.newest_ns = source.health.newest_ns
+        received.raws += raws
+        received.sent_ns += sent_ns
+        received.newest_ns = source.health.newest_ns
 
     def tick(self, config: Config, busy: bool) -> None:
         """Hand over what has come if it is time to; join a leg's files once nobody waits."""
@@ -92,10 +92,10 @@ class Journal:
         if self._ended and not busy:
             self._leg_id, self._ended = 0, False
             self._writer.submit(self._writer.finish)
-        if self.trouble != self._told:
-            self._told = self.trouble
-            if self._told:
-                self._log.warning(f'the journal cannot be written: {self._told}')
+        if self.trouble != self._reported:
+            self._reported = self.trouble
+            if self._reported:
+                self._log.warning(f'the journal cannot be written: {self._reported}')
 
     def _limit_from(self, config: Config) -> int:
         """Take over what the settings say; return the limit, 0 for no journal."""
@@ -128,7 +128,7 @@ class Journal:
             journal_text(config, session.leg_id, session.start_ns, topics, self._node),
             config.journal.max_bytes))
 
-    def hear(self, session: Session, array: DiagnosticArray) -> None:
+    def receive(self, session: Session, array: DiagnosticArray) -> None:
         """Take a status as it was published: the marks of a leg are in it."""
         leg_id, event = session.leg_id, session.event
         dropped = event in DROPPED and leg_id not in self._dropped
@@ -147,8 +147,8 @@ class Journal:
             late.sent_ns.append(self._clock.now().nanoseconds)
             self._writer.submit(self._writer.add, leg_id, late)
 
-    def _no_marks(self) -> Heard:
-        return Heard(self._topic, STATUS_TYPE, DiagnosticArray)
+    def _no_marks(self) -> Received:
+        return Received(self._topic, STATUS_TYPE, DiagnosticArray)
 
     def end(self) -> None:
         """Take note that the leg's samples are complete: what comes now belongs to no leg."""

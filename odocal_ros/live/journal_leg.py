@@ -59,12 +59,12 @@ class LegJournal:
 
     @property
     def folder(self) -> str:
-        """Return where it is written, empty before it is."""
+        """Return the folder of the journal, empty before it exists."""
         return str(self._bag.folder) if self._bag else ''
 
     @property
     def marks_wait(self) -> bool:
-        """Return whether there are marks that the finished journal lacks."""
+        """Return True if the finished journal lacks marks."""
         return bool(self._late)
 
     def put(self, chunks: list[Chunk]) -> None:
@@ -76,7 +76,7 @@ class LegJournal:
             self._try(self._write)
         if self.trouble and not self._over and sum(
                 chunk.size for chunk in self._waiting) > WAITING_BYTES:
-            self._give_up(f'{self.trouble}; it is not tried again in this leg')
+            self._give_up(f'{self.trouble}; no further attempt in this leg')
 
     def finish(self) -> None:
         """Make one whole bag of it."""
@@ -118,7 +118,8 @@ class LegJournal:
             taken = make_room(self.plan.root, self.plan.limit, size)
             self._others = taken - self._bag.size
             if taken + size > self.plan.limit:
-                self._give_up(f'{self.plan.root}: journal.max_bytes is used up; raise it')
+                self._give_up(f'{self.plan.root}: the limit journal.max_bytes is reached; raise '
+                              'it')
                 return
         self._bag.append(self._waiting)
         self._waiting = []
@@ -155,7 +156,7 @@ class LegJournal:
         except OSError as error:
             where = error.filename or self.plan.root
             self.trouble = (f'{where}: {error.strerror or error}; free disk space or set '
-                            'output.directory to a folder that can be written')
+                            'output.directory to a writable folder')
         else:
             if not self._over:
                 self.trouble = ''

@@ -46,7 +46,7 @@ def clear_empty(root: Path) -> None:
 
 
 def is_nothing(path: Path) -> bool:
-    """Return whether a file of a journal holds no message, for certain."""
+    """Return True if a journal file certainly holds no message."""
     return path.name == JOURNAL or path.name.endswith(PART)
 
 
@@ -79,7 +79,7 @@ def make_room(root: Path, limit: int, needed: int = 0) -> int:
 def claim(folder: Path) -> TextIO:
     """Mark a journal as written to, until the file returned is closed or its process ends."""
     file = (folder / JOURNAL).open(encoding='utf-8')
-    with suppress(OSError):      # a file system without locks: then nobody can tell
+    with suppress(OSError):      # a file system without locks: then it is unknown
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return file
 

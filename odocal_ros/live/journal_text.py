@@ -33,7 +33,7 @@ def journal_text(config: Config, leg_id: int, start_ns: int, topics: dict[str, s
 
 
 def replay_command(folder: str, start_ns: int) -> str:
-    """Return what computes a cancelled leg from its journal, from its mark to its last sample."""
+    """Return the command that computes a cancelled leg from its journal, mark to last sample."""
     seconds, nanoseconds = divmod(start_ns, 10**9)
     start = f'{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds // 1000:06}'
     return for_shell(['odocal', 'replay', folder, '--leg', f'{start}/'])

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The journal's thread: packs what was heard, remembers the pre-roll, writes legs."""
+"""The journal's thread: packs received messages, keeps the pre-roll, writes legs."""
 
 from collections import deque
 from collections.abc import Callable
@@ -25,7 +25,7 @@ PREROLL_BYTES = 256 * 2**20    # judgement: 1 kHz for 600 s are 55 MB
 
 
 @dataclass
-class Heard:
+class Received:
     """Raw messages of one topic since the last batch."""
 
     topic: str
@@ -120,13 +120,13 @@ class JournalWriter:
 
     # jobs
 
-    def take(self, batch: dict[str, Heard], reach_ns: int, marks: Heard | None) -> None:
+    def take(self, batch: dict[str, Received], reach_ns: int, marks: Received | None) -> None:
         """Pack a batch, keep it for the pre-roll of legs to come, and write it if one is open."""
         chunks = []
-        for slot, heard in batch.items():
-            chunk = self._packed(heard)
+        for slot, received in batch.items():
+            chunk = self._packed(received)
             chunks.append(chunk)
-            self._preroll.feed(slot, heard.newest_ns or heard.sent_ns[-1], chunk, reach_ns)
+            self._preroll.feed(slot, received.newest_ns or received.sent_ns[-1], chunk, reach_ns)
         self._show_late()
         if self._leg is not None:
             self._leg.put(chunks * self._listening + ([self._packed(marks)] if marks else []))
@@ -144,7 +144,7 @@ class JournalWriter:
         """Write no more samples to the open leg: what may come are marks."""
         self._listening = False
 
-    def add(self, leg_id: int, marks: Heard) -> None:
+    def add(self, leg_id: int, marks: Received) -> None:
         """Add a mark to the journal of a leg that is closed."""
         if leg_id in self._closed:
             leg = self._closed[leg_id]
@@ -160,12 +160,12 @@ class JournalWriter:
             self._closed[leg.leg_id] = leg
             self._leg = None
 
-    def _packed(self, heard: Heard) -> Chunk:
-        number = self._numbers.get(heard.topic)
+    def _packed(self, received: Received) -> Chunk:
+        number = self._numbers.get(received.topic)
         if number is None:
-            number = self._numbers[heard.topic] = len(self._numbers) + 1
+            number = self._numbers[received.topic] = len(self._numbers) + 1
             self._channels[number] = Channel(
-                heard.topic, heard.msgtype, definition=('msg', definition_of(heard.kind)))
-        first = self._counts.get(heard.topic, 0)
-        self._counts[heard.topic] = first + len(heard.raws)
-        return pack(number, heard.sent_ns, heard.raws, first)
+                received.topic, received.msgtype, definition=('msg', definition_of(received.kind)))
+        first = self._counts.get(received.topic, 0)
+        self._counts[received.topic] = first + len(received.raws)
+        return pack(number, received.sent_ns, received.raws, first)

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A leg's way from its stop mark to the answer: closed, computed, combined, told, saved."""
+"""Completion of a leg: closed, computed, combined, answered, saved."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -48,7 +48,7 @@ LATE_TOPIC_S = 1.0   # judgement: a topic later than that at the stop mark is no
 
 class LegCompletion:
     """
-    A leg's way from mark to answer; the operator's commands are in ``Operation``.
+    Process a leg from mark to answer; the operator's commands are in ``Operation``.
 
     Nothing blocks: the heavy work runs in the worker thread, and ``tick`` takes over what it has
     done.
@@ -71,14 +71,14 @@ class LegCompletion:
         self._snapshot: LegRecorder | None = None  # of the open leg, kept for another try
         self._at_stop: SessionView | None = None   # of the open leg: its last running estimate
         self._distance_m = 0.0                # of the leg last touched
-        self._silent = False                  # the Imu, in the leg
+        self._silent = False                  # the IMU, in the leg
         self._console = Console(self._log)
         self._filing = Filing(self._worker, self._log, self.show_status, self._node_name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     @property
     def awaited(self) -> bool:
-        """Return whether there is work that somebody waits for."""
+        """Return True if somebody waits for work."""
         return self.session.state is State.COMPUTING or self._filing.busy
 
     def tick(self) -> None:
@@ -94,11 +94,11 @@ class LegCompletion:
             self._computing.answer_late(partial(answers.provisional, self._at_stop))
         if self.session.state is State.RECORDING:
             self._watch.look(self._recording.newest_imu_ns)
-            self._hear_silence()
+            self._report_silence()
         self._journal.tick(self._config(), self.session.busy)
 
-    def _hear_silence(self) -> None:
-        """Say at once that the Imu is silent, or speaks again."""
+    def _report_silence(self) -> None:
+        """Log immediately that the IMU is silent, or back."""
         silent = self._recording.imu_silent_s() > SILENT_TIME
         if silent is not self._silent:
             self._silent = silent
@@ -118,12 +118,12 @@ class LegCompletion:
         return self._filing.close(max(0.0, until - time.monotonic())) and done
 
     def left_behind(self) -> str:
-        """Return where a leg lies that was not stopped, and what computes it; empty: none was."""
+        """Return the folder and replay command of a leg that was not stopped, else empty."""
         if self.session.state is not State.RECORDING:
             return ''
         folder = self._journal.folder
-        kept = (f'what was driven is in {folder}: {for_shell(["odocal", "replay", folder])} '
-                'computes it') if folder else 'no journal was kept of it'
+        kept = (f'the data is in {folder}; compute it with '
+                f'{for_shell(["odocal", "replay", folder])}') if folder else 'it has no journal'
         return f'leg {self.session.leg_id} was not stopped: {kept}'
 
     def _start_time_anew(self) -> None:
@@ -133,12 +133,12 @@ class LegCompletion:
             self._drop_leg(lost='time jumped back')
             self._log.warning(self._lost_leg())
         else:
-            self._log.warning('time jumped: the samples so far are dropped')
+            self._log.warning('time jumped: all samples so far are dropped')
         self._recording.start_anew()
         self._journal.start_anew()
 
     def view(self) -> SessionView:
-        """Return what is so just now."""
+        """Return the current view of the node."""
         session = self.session
         recording = session.state is State.RECORDING
         if recording:
@@ -161,14 +161,14 @@ class LegCompletion:
     def show_status(self) -> None:
         """Publish the status as it is now, and say what is new in it."""
         now = self.view()
-        self._console.tell(now, self._steady.now().nanoseconds)
+        self._console.report(now, self._steady.now().nanoseconds)
         array = self._publishing.show_status(now)
-        self._journal.hear(self.session, array)
+        self._journal.receive(self.session, array)
 
-    # a leg's way
+    # the processing of a leg
 
     def _mark_ns(self) -> int:
-        """Return the stamp of the newest Imu sample: marks are on the sensors' own clock."""
+        """Return the stamp of the newest IMU sample: marks are on the sensors' own clock."""
         self.pump()
         return self._recording.newest_imu_ns
 
@@ -183,7 +183,7 @@ class LegCompletion:
             self.end_leg_now()
 
     def _why_not(self) -> str:
-        """Return why no leg can be started, empty where one can."""
+        """Return the explanation why no leg can start, empty if one can."""
         missing = self._recording.inputs.missing(self._config())
         clocks = self._recording.progress.clocks.differing(self._config())
         return '; '.join(missing) or (clocks_differ(clocks) if clocks else '')
@@ -196,16 +196,16 @@ class LegCompletion:
         if not by_itself:
             self._recording.progress.begin_leg()
         self._watch.begin(self._recording.snapshot(), mark_ns, session.config)
-        self._ability = ability(session.config, self._recording.heard_before(
+        self._ability = ability(session.config, self._recording.received_before(
             session.config.leg.preroll))
         self.show_status()
         text = (f'recording leg {session.leg_id} since {outputs.iso(mark_ns)}; '
-                f'{hint(self.view())}. As configured, {self._ability.words()}')
+                f'{hint(self.view())}. With these settings, {self._ability.words()}')
         self._log.info(text)
         return text
 
     def end_leg_now(self) -> None:
-        """End the leg at the newest Imu stamp."""
+        """End the leg at the newest IMU stamp."""
         self._end_leg(self._mark_ns())
 
     def _end_leg(self, mark_ns: int) -> None:
@@ -233,7 +233,7 @@ class LegCompletion:
         kept = [leg.results for leg in session.legs]
         self._computing.submit(partial(
             jobs.compute, samples, session.start_ns, session.stop_ns, kept, session.config,
-            session.carried, session.by_itself, self._computing.tell), self._take_leg)
+            session.carried, session.by_itself, self._computing.report), self._take_leg)
 
     def _fail(self, trouble: str) -> None:
         if self.session.state is State.COMPUTING:      # else the result itself is there
@@ -272,15 +272,15 @@ class LegCompletion:
         return success, text
 
     def _lost_leg(self) -> str:
-        """Return what became of a leg that was dropped by nobody's wish, empty without one."""
+        """Return the text on a leg that was dropped automatically, empty without one."""
         session = self.session
         if not session.lost:
             return ''
         folder = self._journal.folder
-        kept = (f'what was driven is in {folder}: {replay_command(folder, session.start_ns)} '
-                'computes it' if folder else 'no journal was kept of it')
-        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; ~/start_leg starts '
-                'another')
+        kept = (f'the data is in {folder}; compute it with '
+                f'{replay_command(folder, session.start_ns)}' if folder else 'it has no journal')
+        return (f'leg {session.leg_id} was cancelled: {session.lost}; {kept}; call ~/start_leg '
+                'for a new leg')
 
     def _drop_leg(self, text: str = '', lost: str = '') -> None:
         self.session.cancel(lost)

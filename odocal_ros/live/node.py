@@ -43,14 +43,14 @@ usage: calibrator [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO
 Calibrates a vehicle's odometer against IMU and GNSS while it is driven (a ROS 2 node; the same
 over recorded bags is 'odocal replay').
 
-listens to   imu/data, odometer, fix; fix_velocity and heading where they are sent; where set so
+subscribes   imu/data, odometer, fix; fix_velocity and heading if published; if configured
              odometer_right
              (another name: -r odometer:=/your/topic)
 services     ~/start_leg before a drive and ~/stop_leg after it, which answers with the result;
              ~/cancel_leg, ~/undo_leg, ~/reset, ~/save   (all std_srvs/srv/Trigger)
-says         ~/status: what it waits for and what to do next; /diagnostics; ~/path/...; the
+publishes    ~/status: missing inputs and what to do next; /diagnostics; ~/path/...; the
              result as parameters result.*
-settings     parameters, all in config/calibrator.yaml with what they mean:
+settings     parameters, all described in config/calibrator.yaml:
              'calibrator --ros-args --params-file calibrator.yaml', or one by one
              'calibrator --ros-args -p odometer.nominal_scale:=0.02'"""
 SERVICES = ('start_leg', 'stop_leg', 'cancel_leg', 'undo_leg', 'reset', 'save')
@@ -111,13 +111,13 @@ class Calibrator(SettledNode):
         ours = [p.name for p in parameters if p.name in params.RESULTS]
         if ours:
             return SetParametersResult(successful=False, reason=(
-                f'{ours[0]} is set by the node after each leg; give it as an override at start-up '
-                'to restore a result'))
+                f'{ours[0]} is set by the node after each leg; to restore a result, give it as '
+                'an override at start-up'))
         session = self.operation.session
         if session.busy:
             return SetParametersResult(successful=False, reason=(
-                f'leg {session.leg_id} is {session.state.value}: its configuration is '
-                'frozen; end it with ~/stop_leg or ~/cancel_leg, then set'))
+                f'leg {session.leg_id} is {session.state.value}: its configuration is fixed; end '
+                'it with ~/stop_leg or ~/cancel_leg first'))
         try:
             params.changed(self.config, parameters)
         except OdocalError as error:
@@ -144,7 +144,7 @@ class Calibrator(SettledNode):
             self._pace()
 
     def _pace(self) -> None:
-        """Take turns as often as is wanted now."""
+        """Take messages as often as needed now."""
         awaited = self.operation.awaited
         period_s = AWAITED_TURN_S if awaited else min(TURN_S, 1 / self.config.publish.rate)
         period_ns = round(period_s * 1e9)
@@ -177,7 +177,7 @@ class Calibrator(SettledNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until it is told to end; see ``process.run``."""
+    """Run the node until it must stop; see ``process.run``."""
     return run('calibrator', HELP, Calibrator, args)
 
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The node that applies a calibration: counter and Imu in, odometry and twist out."""
+"""The node that applies a calibration: counter and IMU in, odometry and twist out."""
 
 from functools import partial
 import re
@@ -38,13 +38,13 @@ HELP = """\
 usage: odometry --ros-args --params-file CALIBRATION.yaml [-p NAME:=VALUE] [-r FROM:=TO] ...
 
 Applies a calibration that 'odocal replay' or the calibrator wrote: dead reckoning of a vehicle by
-its odometer and Imu, with a covariance (a ROS 2 node).
+its odometer and IMU, with a covariance (a ROS 2 node).
 
-listens to   imu/data, odometer; where set so odometer_right
+subscribes   imu/data, odometer; if configured odometer_right
              (another name: -r odometer:=/your/topic)
 publishes    odometry (nav_msgs/Odometry), odometry/twist
              (geometry_msgs/TwistWithCovarianceStamped)
-settings     parameters, all in config/odometry.yaml with what they mean"""
+settings     parameters, all described in config/odometry.yaml"""
 
 
 class OdometryNode(SettledNode):
@@ -94,12 +94,12 @@ class OdometryNode(SettledNode):
             self._publish(pose)
         if poses and not self._begun:
             self._begun = True
-            self.get_logger().info('odometry begins')
-        for text in self._odometry.take_told():
+            self.get_logger().info('odometry starts')
+        for text in self._odometry.take_notes():
             self._say(text, now_ns)
 
     def _say(self, text: str, now_ns: int) -> None:
-        """Say what was found: a new beginning each time, other kinds of sentence seldom."""
+        """Log the findings: every restart, other kinds of sentence at a limited rate."""
         kind = re.sub(r'[-+.\de]*\d', '#', text)
         if text.startswith(BEGINS_ANEW) or now_ns - self._said_ns.get(kind, 0) > SAID_AGAIN_NS:
             self._said_ns[kind] = now_ns
@@ -124,8 +124,9 @@ class OdometryNode(SettledNode):
         missing = [why for why in (one.why() for one in self._inputs.values()) if why]
         apart = self._odometry.apart()
         if not missing and apart:
-            missing = [f'the stamps of the odometer are {apart:+.3g} s from those of the Imu: two '
-                       'clocks; mend the drivers, or set use_sim_time where a bag is played']
+            missing = [f'odometer stamps differ by {apart:+.3g} s from the IMU stamps. Likely '
+                       'cause: two clocks. Check the drivers, or set use_sim_time if a bag is '
+                       'played']
         if not missing:
             self._silent_ns, self._pause_ns = 0, SILENCE_FIRST_NS
         elif not self._silent_ns:
@@ -164,7 +165,7 @@ def _wanted(config: ApplyConfig) -> dict[str, tuple[str, ...]]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until it is told to end; see ``process.run``."""
+    """Run the node until it must stop; see ``process.run``."""
     return run('odometry', HELP, OdometryNode, args)
 
 

@@ -30,7 +30,7 @@ class Operation(AutomaticWay):
     """
 
     def start_leg(self) -> tuple[bool, str]:
-        """Open a leg at the newest Imu stamp."""
+        """Open a leg at the newest IMU stamp."""
         session, mark_ns = self.session, self._mark_ns()
         if session.state is State.RECORDING and not session.by_itself:
             return True, (f'recording since {outputs.iso(session.start_ns)}, leg '
@@ -38,7 +38,7 @@ class Operation(AutomaticWay):
         if why := self._why_not():
             raise Refused(f'no leg can be started: {why}')
         if session.state is State.RECORDING:      # one that nobody asked for
-            self._drop_leg(f'leg {session.leg_id} makes room for one of the operator')
+            self._drop_leg(f'leg {session.leg_id} is replaced by a started by the operator')
         return True, self._begin_leg(mark_ns)
 
     def stop_leg(self) -> tuple[bool, str] | Future:
@@ -76,7 +76,7 @@ class Operation(AutomaticWay):
         return True, text
 
     def undo_leg(self) -> tuple[bool, str] | Future:
-        """Drop the last kept leg and combine the others anew."""
+        """Drop the last kept leg and combine the others again."""
         left = [one for leg in self.session.begin_undo() for one in leg.results]
         text = f'leg {self.session.leg_id} is undone'
         self._log.info(text)
@@ -86,9 +86,9 @@ class Operation(AutomaticWay):
             self._publishing.set_results(None)
             self._publishing.show_paths(jobs.leg_paths(None, self._config()))
             self._computing.drop()      # an undo just before may still be combined
-            self._computing.answer(True, f'{text}, none is left')
+            self._computing.answer(True, f'{text}; no leg is left')
             self.show_status()
-            return True, f'{text}, none is left'
+            return True, f'{text}; no leg is left'
 
         def take(outcome: tuple[Calibration, jobs.Paths]) -> None:
             self.session.finish_undo(outcome[0])

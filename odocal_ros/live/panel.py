@@ -37,20 +37,21 @@ def panel(level: bytes, name: str, status: dict[str, str], hint: str) -> Panel:
 
 
 def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
-    """Return how much of what is asked is there: label -> (0 to 1, in words)."""
+    """Return the progress towards each limit: label -> (0 to 1, text)."""
     if status.get('state') == 'computing':
-        return {}      # the hint has the passes: nobody knows how many there will be
-    way, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
+        return {}      # the hint has the passes: their total is unknown
+    driven, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
-    found = {'way': (way / (way + lacks) if way + lacks > 0 else 0.0, f'{lacks:.0f} m to go'),
+    done = driven / (driven + lacks) if driven + lacks > 0 else 0.0
+    found = {'way': (done, f'{lacks:.0f} m to go'),
              'standing': (1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go')}
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         asked = number(status, f'asked_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
-        # a sigma falls with the way or its root: its share of what is asked is a modest measure
+        # a sigma falls with the path length or its root: the ratio to the limit is a rough measure
         share = min(asked / sigma, 1.0) if sigma > 0 else 0.0
         known = f'{three_digits(sigma)} {unit}' if sigma > 0 else 'not known'
-        found[name] = share, f'{known}, asked {three_digits(asked)} {unit}'
+        found[name] = share, f'{known}, limit {three_digits(asked)} {unit}'
     return found
 
 

@@ -45,7 +45,7 @@ QOS: dict[str, tuple[str, ...]] = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available'),
     'history': ('keep_last', 'keep_all', 'system_default'), 'depth': ()}
 NO_STAMP = 'an unknown date'
-TAKE = 'take the file that ~/save wrote'
+TAKE = 'use the file that ~/save wrote'
 
 
 def _result_defaults(estimates: Iterable[str]) -> dict[str, Any]:
@@ -113,12 +113,12 @@ def declare(node: Node, kind: type = Config) -> Any:
 def _warn_of_unknown(node: Node, settings: dict[str, Setting]) -> None:
     """Name overrides in our groups that are no settings; ROS passes over what nobody declares."""
     groups = {name.partition('.')[0] for name in settings if '.' in name}
-    for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public way to them
+    for name in getattr(node, '_parameter_overrides', {}):  # rclpy has no public access to them
         group, dot, _ = name.partition('.')
         near = difflib.get_close_matches(name, settings, 1, 0.8)
         if name not in settings and (near or dot and group in groups):
             mean = f': did you mean {near[0]}?' if near else ''
-            node.get_logger().warning(f'no parameter {name}{mean or "."} It is not taken.')
+            node.get_logger().warning(f'no parameter {name}{mean or "."} It is ignored.')
 
 
 def check_qos(node: Node, topics: Iterable[str]) -> None:
@@ -136,7 +136,7 @@ def check_qos(node: Node, topics: Iterable[str]) -> None:
             if value is not None and not number and value not in wanted:
                 want = f'one of {", ".join(wanted)}' if wanted else 'a whole number above 0'
                 raise BadConfig(f'{name}: {value!r} is not {want}; correct the parameter and '
-                                'start again')
+                                'restart')
 
 
 def changed(config: Config, parameters: list[Parameter]) -> Config:
@@ -149,7 +149,7 @@ def fixed(parameters: list[Parameter]) -> SetParametersResult:
     """Refuse to set what holds as long as the node runs."""
     ours = [p.name for p in parameters if p.name.startswith(PREFIX) or p.name in SETTINGS]
     return SetParametersResult(successful=not ours, reason=(
-        f'{ours[0]} is taken at the start: start the node anew with it') if ours else '')
+        f'{ours[0]} is only read at start-up: restart the node with it') if ours else '')
 
 
 def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restored | None:
@@ -169,9 +169,9 @@ def declare_results(node: Node, estimates: dict[str, str] = ESTIMATES) -> Restor
                           for name in _result_defaults(estimates)}, estimates)
     here = node.get_parameter('vehicle').value
     if kept is not None and kept.vehicle and here and kept.vehicle != here:
-        raise BadConfig(f"the result given is of vehicle '{one_line(kept.vehicle)}', and this "
-                        f"node is of '{one_line(here)}': give the calibration.yaml of "
-                        'that one, or none')
+        raise BadConfig(f"the result belongs to vehicle '{one_line(kept.vehicle)}', but this "
+                        f"node to '{one_line(here)}': give the calibration.yaml of this vehicle, "
+                        'or none')
     return kept
 
 
@@ -209,9 +209,9 @@ def restored_from(results: dict[str, Any],
 def _restored(results: dict[str, Any], names: dict[str, str]) -> Restored | None:
     legs, stamp = results[PREFIX + 'legs'], results[PREFIX + 'stamp']
     if legs < 0:
-        raise ValueError(f'result.legs: {legs} is no number of legs')
+        raise ValueError(f'result.legs: {legs} is not a number of legs')
     if one_line(stamp) != stamp:
-        raise ValueError(f"result.stamp: '{one_line(stamp)}' is no date")
+        raise ValueError(f"result.stamp: '{one_line(stamp)}' is not a date")
     estimates = {}
     for name, unit in names.items():
         value, sigma = (None if math.isnan(x) else x for x in (
@@ -246,5 +246,5 @@ def _refusal(name: str, setting: Setting, error: Exception) -> str:
     """Return one line that says what rclpy refused and what to write instead."""
     text = ' '.join(str(error).split()).removesuffix(f': {name}').split('Reason: ')[-1]
     if setting.kind in ('float', 'floats') and isinstance(error, InvalidParameterTypeException):
-        return f'{text}; write it as a decimal number, such as 3.0'
-    return f'{text}; correct the parameter and start again'
+        return f'{text}; write it as a decimal number such as 3.0'
+    return f'{text}; correct the parameter and restart'

@@ -20,7 +20,7 @@ class PlainLog:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
 
-    # rclpy tells callers apart by their lines, and wants one severity of each
+    # rclpy distinguishes callers by their lines, and wants one severity of each
     def debug(self, text: str) -> None:
         """Log for developers."""
         self._logger.debug(brief_line(text))
@@ -30,7 +30,7 @@ class PlainLog:
         self._logger.info(brief_line(text))
 
     def warning(self, text: str) -> None:
-        """Log what the operator may mend."""
+        """Log problems that the operator can fix."""
         self._logger.warning(brief_line(text))
 
     def error(self, text: str) -> None:

@@ -48,19 +48,19 @@ class SettledNode(Node):
                 self.destroy_node()  # type: ignore[no-untyped-call]
                 raise
         except (ParameterException, InvalidQosOverridesError) as error:
-            raise BadConfig(f'{said_by(error)}; correct the parameter and start again') from None
+            raise BadConfig(f'{said_by(error)}; correct the parameter and restart') from None
 
     def _build(self) -> None:
         raise NotImplementedError
 
     def _look_for_namesake(self) -> None:
-        """Say once where another node has this one's name."""
+        """Log once if another node has the same name."""
         own = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own) > 1:
             self._alone.cancel()
             self.get_logger().warning(
                 f'another node is called {self.get_fully_qualified_name()}: services, parameters '
-                'and topics of both mix; stop one, or rename it with -r __node:=NAME')
+                'and topics conflict; stop one, or rename it with -r __node:=NAME')
 
     def get_logger(self) -> PlainLog:
         """Return the node's log."""
@@ -70,7 +70,7 @@ class SettledNode(Node):
 def run(name: str, about: str, make: Callable[[], Node],
         args: list[str] | None = None) -> int:
     """
-    Run a node until it is told to end.
+    Run a node until it must stop.
 
     name : of the command.   about : what --help prints.   make : returns the node.
 
@@ -89,8 +89,8 @@ def run(name: str, about: str, make: Callable[[], Node],
             print(f'odocal_ros {__version__}')
             return 0
         if asked:
-            return complain(name, f'{asked[0]} means nothing here: settings are ROS parameters, '
-                            f'written after --ros-args (see {name} --help)')
+            return complain(name, f'{asked[0]} is unknown: settings are ROS parameters after '
+                            f'--ros-args (see {name} --help)')
         _init(args)
     except Exception as error:
         text = said_by(error).split(', at /')[0]
@@ -137,6 +137,6 @@ def _init(args: list[str] | None) -> None:
 
 
 def complain(name: str, text: str) -> int:
-    """Say on stderr why a command cannot go on; return its exit code."""
+    """Print on stderr why a command stops; return its exit code."""
     print(brief_line(f'{name}: {text}'), file=sys.stderr)
     return 1

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The side of the node that speaks: status, diagnostics, paths, result parameters."""
+"""Publishers of the node: status, diagnostics, paths, result parameters."""
 
 from functools import partial
 from typing import Any
@@ -57,7 +57,7 @@ class Publishing:
 
     @property
     def setting_results(self) -> bool:
-        """Return whether it is the node itself that sets ``result.*`` just now."""
+        """Return True while the node itself sets ``result.*``."""
         return self._setting
 
     def results(self) -> dict[str, Any]:
@@ -97,14 +97,14 @@ class Publishing:
         return self._status.topic_name
 
     def view(self, recording: Recording, **known: Any) -> SessionView:
-        """Return what is so just now; ``known`` are the fields that are not read off here."""
+        """Return the current status; ``known`` are the fields that are computed elsewhere."""
         config, progress = known['config'], recording.progress
         return SessionView(
             missing=recording.inputs.missing(config), doubled=recording.inputs.doubled(),
             clocks=progress.clocks.differing(config),
             rates_hz=recording.rates_hz(), results=self.results(),
             max_speed=progress.max_speed(), still_s=progress.still_s(),
-            two_wheels=recording.two_wheels(), heard=recording.heard(),
+            two_wheels=recording.two_wheels(), received=recording.received(),
             restored=known['session'].restored_since(), **known)
 
     def show_status(self, now: SessionView) -> DiagnosticArray:

@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.samples import Samples, take
-from odocal_ros.foresee.ability import Heard
+from odocal_ros.foresee.ability import Received
 from odocal_ros.foresee.progress import Progress
 from odocal_ros.live.inputs import Inputs
 from odocal_ros.live.topic_input import Input
@@ -42,7 +42,7 @@ class Recording:
         self.inputs = Inputs(node, config)
         self.recorder = LegRecorder()
         self._remember = remember
-        self.tap: Callable[[str, Samples], None] | None = None  # hears every block as well
+        self.tap: Callable[[str, Samples], None] | None = None  # also receives every block
         self._clock = node.get_clock()
         self.progress = self._no_progress()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -86,16 +86,16 @@ class Recording:
                     since_ns - round((preroll_s + PREROLL_MARGIN_S) * 1e9), slots)
 
     def _both(self, source: Input) -> bool:
-        """Return whether a topic's messages hold both wheels."""
+        """Return True if the messages of a topic hold both wheels."""
         return source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
 
     @property
     def newest_imu_ns(self) -> int:
-        """Return the stamp of the newest Imu sample decoded, 0 before the first."""
+        """Return the stamp of the newest IMU sample decoded, 0 before the first."""
         return self.inputs.by_slot['imu'].health.newest_ns
 
     def passed(self, mark_ns: int) -> bool:
-        """Return whether every topic that ever spoke has passed a mark."""
+        """Return True if every topic with messages has passed a mark."""
         newest = [one.health.newest_ns for one in self.inputs.by_slot.values()]
         return not any(0 < stamp_ns <= mark_ns for stamp_ns in newest)
 
@@ -109,7 +109,7 @@ class Recording:
 
     @property
     def time_jumped(self) -> bool:
-        """Return whether the clock or the Imu's stamps went back."""
+        """Return True if the clock or the IMU stamps went back."""
         return self._clock_jumped or self.inputs.by_slot['imu'].health.jumped_back
 
     def start_anew(self) -> None:
@@ -122,27 +122,27 @@ class Recording:
             source.health.forget()
 
     def two_wheels(self) -> bool:
-        """Return whether the right wheel is heard by itself, and known to be the right one."""
+        """Return True if the right wheel has its own topic and is known to be the right one."""
         form = self.inputs.form
         return self.recorder.newest_ns('odometer_right') > 0 and (form is None or form.sides)
 
-    def heard_before(self, preroll_s: float) -> Heard:
-        """Return what came so far that says what a leg can tell."""
-        return replace(self.progress.heard_before(preroll_s), two_wheels=self.two_wheels())
+    def received_before(self, preroll_s: float) -> Received:
+        """Return the samples so far that determine what a leg can estimate."""
+        return replace(self.progress.received_before(preroll_s), two_wheels=self.two_wheels())
 
     def rates_hz(self) -> dict[str, float]:
         """Return the rate of each topic by its stamps."""
         now_ns = self._steady.now().nanoseconds
         return {slot: one.health.rate_hz(now_ns) for slot, one in self.inputs.by_slot.items()}
 
-    def heard(self) -> bool:
-        """Return whether any message has come on any topic."""
-        return any(one.health.heard_ns for one in self.inputs.by_slot.values())
+    def received(self) -> bool:
+        """Return True if any message has arrived on any topic."""
+        return any(one.health.received_ns for one in self.inputs.by_slot.values())
 
     def imu_silent_s(self) -> float:
-        """Return for how long the Imu has said nothing while others did."""
-        heard_ns = {slot: one.health.heard_ns for slot, one in self.inputs.by_slot.items()}
-        return max(0, max(heard_ns.values()) - heard_ns['imu']) * 1e-9
+        """Return for how long the IMU has said nothing while others did."""
+        received_ns = {slot: one.health.received_ns for slot, one in self.inputs.by_slot.items()}
+        return max(0, max(received_ns.values()) - received_ns['imu']) * 1e-9
 
     def close(self) -> None:
         """Let go of the clock."""

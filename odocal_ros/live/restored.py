@@ -27,7 +27,7 @@ class Restored:
     vehicle: str = ''
 
     def words(self, unit: str) -> str:
-        """Return it as a sentence; ``unit`` is that of scales by the odometer heard, or empty."""
+        """Return it as a sentence; ``unit`` is that of scales of the odometer, or empty."""
         estimates = {name: replace(e, unit=unit) if unit and name.startswith('scale_factor') else e
                      for name, e in self.estimates.items()}
         use = '' if self.valid else ', which was rejected'

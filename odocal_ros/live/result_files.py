@@ -56,7 +56,7 @@ def iso(stamp_ns: int) -> str:
 
 
 def output_root(config: Config, node: str) -> Path:
-    """Return where results go: the setting, else a folder of the node's own in the ROS home."""
+    """Return the folder of results: the setting, else the node's own folder in the ROS home."""
     home = os.environ.get('ROS_HOME') or '~/.ros'
     own = Path(home) / 'odocal' / node.lstrip('/')
     return Path(config.output.directory or own).expanduser()
@@ -68,7 +68,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
     """
     Write the result files into a folder named by the time, and point ``latest`` at it.
 
-    ``inputs`` name the node. ``imu_frame`` is that of the Imu's headers, for a ``frames.imu``
+    ``inputs`` name the node. ``imu_frame`` is that of the IMU's headers, for a ``frames.imu``
     left empty. Returns the folder, why ``latest`` stays where it was, empty when it does not
     (``force`` moves it), and what adds the report, which takes long to draw.
 
@@ -97,7 +97,7 @@ def save(calibration: Calibration, config: Config, inputs: list[dict[str, Any]],
             folders.prune(folder, config.output.automatic_kept)
     except OSError as error:
         raise OdocalError(f'results cannot be written to {root}: {error.strerror}; set '
-                          'output.directory to a folder that can') from None
+                          'output.directory to a writable folder') from None
     return folder, stays, results.draw if results.has_report else None
 
 

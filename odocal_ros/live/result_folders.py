@@ -107,7 +107,7 @@ class ResultFolders:
 
 
 def _age(name: str) -> tuple[str, int]:
-    """Return by what names of results are sorted: their time, and which of that second."""
+    """Return the sort key of result names: their time, and the number within that second."""
     when, count = RESULT_NAME.findall(name)[0]
     return when, int(count or 1)
 
@@ -117,7 +117,7 @@ def _target(link: Path) -> str:
 
 
 def _point(link: Path, name: str) -> None:
-    """Move the link in one step: whoever follows it finds the old or the new."""
+    """Move the link in one step: readers find the old or the new folder."""
     other = link.with_name(f'.{LATEST}-{uuid.uuid4().hex}')
     other.symlink_to(name)
     other.replace(link)

@@ -27,7 +27,7 @@ from odocal_ros.live.worker import Worker
 from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 
-# judgement: of the Imu's time, so that a fast replay is looked at as often
+# judgement: of the IMU's time, so that a fast replay is looked at as often
 LOOK_PERIOD_NS = 5 * 10**9
 # tuned by benchmarks/live_load.py: of one core, what looking may cost in the long run; with it and
 # all else the node takes less than three fifths of a typed subscriber of 455 messages a second
@@ -42,10 +42,10 @@ class RunningEstimate:
     """
     Keeps the newest forecast of the leg that is recorded, None without one.
 
-    Of a leg that a gap cuts, each quantity is of the part that tells it better: both count.
+    Of a leg that a gap cuts, each quantity is from the better section: both count.
 
     The callback thread only collects blocks; cells and prediction are made in the worker, one look
-    at a time. ``end`` makes a look that is under way give up at its next step, so that the result
+    at a time. ``end`` stops a running update at its next step, so that the result
     of the leg need not wait for it. What fails here is a note in the log, never more.
     """
 
@@ -80,11 +80,11 @@ class RunningEstimate:
 
     @property
     def forecast(self) -> Forecast | None:
-        """Return what is foreseen of the leg."""
+        """Return the forecast of the leg."""
         return better(self._earlier, self._newest)
 
     def _forget(self) -> None:
-        """Let a look that is under way give up, and forget what was seen."""
+        """Stop a running update, and discard its data."""
         self._over.set()
         self._newest = self._before = None
         self._faults = ()
@@ -111,14 +111,14 @@ class RunningEstimate:
 
     def faults(self, silent_s: float = 0.0) -> tuple[Reason, ...]:
         """
-        Return what is wrong with the leg so far, one reason of a code, the gravest first.
+        Return the problems of the leg so far, one reason per code, the gravest first.
 
-        silent_s : for how long the Imu has said nothing while others did.
+        silent_s : for how long the IMU has said nothing while others did.
         """
         if self._gaps is None:
             return ()
-        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there, figures are of the better '
-                      'part') for r in self._gaps.reasons(silent_s)]
+        cut = [Reason(Code.LEG_CUT, f'{r.text}: the leg is cut there; values are those of the '
+                      'better section') for r in self._gaps.reasons(silent_s)]
         seen = (*cut, *self._faults, *(self._newest.faults if self._newest else ()))
         first = {r.code: r for r in reversed(seen)}
         order = list(Verdict)
@@ -146,7 +146,7 @@ class RunningEstimate:
         self._pause_until = time.monotonic() + seconds / LOOK_SHARE if self._warm else 0.0
         self._warm = True
         if failure is not None:
-            self._log.debug(f'nothing is foreseen of the leg: {one_line(failure)}')
+            self._log.debug(f'no forecast for the leg: {one_line(failure)}')
 
 
 def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], start_ns: int,
@@ -155,7 +155,7 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
     """
     Return forecast, faults, the seconds of CPU it took and what went wrong; for the worker.
 
-    Without what is done ever less often as a leg grows: that is a small share by itself.
+    Without what is done ever less often as a leg grows: this is a small share anyway.
     """
     begin = time.thread_time()
     forecast: Forecast | None = None
@@ -167,7 +167,7 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
         found = faults_in_cells(leg, config)
         forecast = forecast_of(leg, thinned.fix_rate(), config,
                              lambda: not over.is_set(), smoother)
-    except Exception as error:  # whatever is wrong with a look, the leg goes on
+    except Exception as error:  # an error of the running estimate does not end the leg
         failure = error
     finally:
         screened_in_cells.cache_clear()      # of this leg nobody asks again

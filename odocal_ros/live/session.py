@@ -44,7 +44,7 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeptLeg:
-    """A leg that counts; of parts where the Imu had a gap."""
+    """A leg that counts; of parts where the IMU had a gap."""
 
     leg_id: int
     start_ns: int
@@ -78,12 +78,12 @@ class Session:
 
     @property
     def busy(self) -> bool:
-        """Return whether a leg runs or is computed: no setting may change then."""
+        """Return True while a leg runs or is computed: settings cannot change then."""
         return self.state in (State.RECORDING, State.COMPUTING)
 
     @property
     def open_leg(self) -> bool:
-        """Return whether there is a leg that is neither kept nor dropped."""
+        """Return True if there is a leg that is neither kept nor dropped."""
         closed = self.state in (State.COMPUTING, State.FAILED) and self.event == 'stopped'
         return self.state is State.RECORDING or closed
 
@@ -128,7 +128,7 @@ class Session:
         self._settle(self.calibration)
 
     def carry_on(self, carried: Carried | None, legs: int) -> None:
-        """Let go of the first kept legs: what they tell is carried on."""
+        """Release the first kept legs: their information is carried over."""
         self.carried, self.legs = carried, self.legs[legs:]
 
     def fail(self, trouble: str) -> None:
@@ -138,17 +138,18 @@ class Session:
     def cancel(self, lost: str = '') -> None:
         """Drop the open leg; ``lost``: why, where nobody asked for it."""
         if not self.open_leg:
-            raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept')
+            raise Refused('no leg is running: nothing to cancel; ~/undo_leg drops the last kept '
+                          'leg')
         self.event, self.lost = 'cancelled', lost
         self._settle(self.calibration)
 
     def begin_undo(self) -> list[KeptLeg]:
-        """Drop the last kept leg and return those left, which are to be combined anew."""
+        """Drop the last kept leg and return those left, which must be combined again."""
         if self.open_leg:
             raise Refused(f'leg {self.leg_id} is open: end it with ~/stop_leg or ~/cancel_leg '
-                          'before undoing an earlier one')
+                          'before ~/undo_leg')
         if not self.legs:
-            raise Refused('no leg to undo: none is kept')
+            raise Refused('no leg to undo')
         dropped = self.legs.pop()
         self._touch(dropped, 'undone')
         self.lost = ''

@@ -37,18 +37,18 @@ class SessionView:
     duration_s: float = 0.0
     max_speed: float = 0.0
     still_s: float = 0.0
-    two_wheels: bool = False                     # the right wheel is heard by itself
+    two_wheels: bool = False                     # the right wheel has its own topic
     ability: Ability | None = None               # of the leg that is recorded
     forecast: Forecast | None = None               # of the leg that is recorded or computed
     faults: tuple[Reason, ...] = ()              # of the leg that is recorded, gravest first
-    forecast_age_s: float = nan                   # since the way it is of
+    forecast_age_s: float = nan                   # since its newest sample
     computed: Stage = Stage()                    # how far the result of a leg is
     saved: str = ''
     lost: str = ''                               # a leg that nobody wanted dropped
     save_trouble: str = ''                       # why the newest result is in no folder
     journal: str = ''                            # folder of the newest leg's journal
     journal_trouble: str = ''                    # why it cannot be written
-    heard: bool = True                           # any message on any topic so far
+    received: bool = True                           # any message on any topic so far
 
     @property
     def state(self) -> str:
@@ -59,5 +59,5 @@ class SessionView:
 
     @property
     def lost_cause(self) -> bool:
-        """Return whether the leg that is recorded would be rejected as it is."""
+        """Return True if the current leg would be rejected now."""
         return any(r.code.gravity is Verdict.REJECTED for r in self.faults)

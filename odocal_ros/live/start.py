@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The commands calibrator and odometry: start a node, or say in one sentence what it needs."""
+"""The commands calibrator and odometry: start a node, or print the missing requirement."""
 
 from importlib import import_module
 import sys
@@ -27,9 +27,9 @@ def _run(command: str, module: str) -> int:
     try:
         main = import_module(module).main
     except ModuleNotFoundError as error:
-        print(f'{command}: a live node needs ROS 2 (Python module {error.name} is missing): '
-              "source /opt/ros/jazzy/setup.bash, or install odocal_ros with the extra 'ros' on "
-              'Python 3.11 or 3.12 (Linux x86-64); recorded bags need no ROS: odocal try BAG',
+        print(f'{command}: a live node needs ROS 2 (Python module {error.name} is missing). Run '
+              "'source /opt/ros/jazzy/setup.bash', or install odocal_ros with the extra 'ros' on "
+              'Python 3.11 or 3.12 (Linux x86-64). Recorded bags need no ROS: odocal try BAG',
               file=sys.stderr)
         return 2
     code: int = main()

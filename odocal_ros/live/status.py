@@ -100,11 +100,11 @@ def in_force(now: SessionView, name: str) -> float:
 
 
 def level(now: SessionView) -> Any:
-    """Return STALE before anything came, ERROR for what needs the operator, WARN for doubts."""
+    """Return STALE before any message, ERROR if action is required, WARN for cautions."""
     state = now.session.state
     if state in (State.FAILED, State.REJECTED) or now.lost_cause:
         return DiagnosticStatus.ERROR
-    if state is State.IDLE and not now.heard:
+    if state is State.IDLE and not now.received:
         return DiagnosticStatus.STALE
     doubtful = state is State.CALIBRATED and now.session.verdict() != Verdict.ACCEPTED.value
     doubtful = doubtful or bool(now.missing or now.clocks or now.journal_trouble
@@ -131,7 +131,7 @@ def sentence(now: SessionView, text: str, ok: dict[str, str]) -> str:
         'failed': f'Failed: {session.trouble}',
     }[now.state]
     if now.restored and session.state is State.IDLE:
-        seen += f', with the result restored of {now.restored}'
+        seen += f', including the result restored from {now.restored}'
     good = '' if session.state is State.RECORDING else quantities.words(ok)
     troubles = [f'{what}: {trouble}' for what, trouble in (
         ('the result is not saved', now.save_trouble),
@@ -148,24 +148,24 @@ def _computing(now: SessionView) -> dict[str, object]:
 
 
 def _changes(session: Session) -> list[str]:
-    """Return what is to be said of a scale that changed between legs."""
+    """Return the warning on a scale that changed between legs."""
     reasons = session.calibration.reasons if session.calibration else ()
     return [r.text for r in reasons if r.code is Code.SCALE_CHANGED]
 
 
 def _unused(session: Session) -> str:
-    """Return why the last leg that began by itself does not count."""
+    """Return the explanation why the last automatic leg is not used."""
     why = session.unused
     return f'a leg was not used: {why.code.name}: {why.text}' if why else ''
 
 
 def _automatic(now: SessionView) -> str:
-    """Return what leg.automatic is at, empty where it is off."""
+    """Return the state of leg.automatic, empty if it is off."""
     if not now.config.leg.automatic:
         return ''
     if now.session.state is not State.RECORDING:
         return 'waiting'
-    return 'leg' if now.session.by_itself else 'leg of the operator'
+    return 'leg' if now.session.by_itself else 'started by the operator'
 
 
 def _reason_codes(now: SessionView) -> str:

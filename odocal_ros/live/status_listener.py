@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from odocal_ros.outside.names import brief_line
 
 MOST_VALUES = 500      # judgement: keys of a status that are looked at; a calibrator sends 100
-# definition: of what is latched, said and heard alike
+# definition: of latched topics, publisher and subscriber
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -37,14 +37,14 @@ class StatusListener:
         self._status: DiagnosticArray | None = None
         self._hint: str | None = None
         name = f'/{node_name.strip("/")}'
-        self._node.create_subscription(DiagnosticArray, f'{name}/status', self._hear, LATCHED)
-        self._node.create_subscription(String, f'{name}/hint', self._hear_hint, LATCHED)
+        self._node.create_subscription(DiagnosticArray, f'{name}/status', self._receive, LATCHED)
+        self._node.create_subscription(String, f'{name}/hint', self._receive_hint, LATCHED)
 
-    def _hear(self, array: DiagnosticArray) -> None:
+    def _receive(self, array: DiagnosticArray) -> None:
         if array.status:
             self._status = array
 
-    def _hear_hint(self, message: String) -> None:
+    def _receive_hint(self, message: String) -> None:
         self._hint = brief_line(message.data)
 
     def __enter__(self) -> 'StatusListener':
@@ -56,7 +56,7 @@ class StatusListener:
         self._context.try_shutdown()
 
     def __iter__(self) -> Iterator[tuple[bytes, dict[str, str], str]]:
-        """Yield (level, key -> value, what to do) of each status, until told to end."""
+        """Yield (level, key -> value, what to do) of each status, until the end."""
         try:
             while self._context.ok():
                 self._executor.spin_once(timeout_sec=0.5)

@@ -35,13 +35,13 @@ from odocal_ros.settings.config import Config
 
 TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
           'fix': 'fix', 'fix_velocity': 'fix_velocity', 'heading': 'heading'}
-# physical: messages in five seconds of the highest rate believed, 4 kHz, 1 kHz and 100 Hz: a queue
+# physical: messages in five seconds of the highest expected rate, 4 kHz, 1 kHz and 100 Hz: a queue
 # that runs over is what loses them
 DEPTH = {'imu': 20_000, 'odometer': 5000, 'odometer_right': 5000, 'heading': 5000,
          'fix': 500, 'fix_velocity': 500}
-LABELS = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+LABELS = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
           'fix_velocity': 'GNSS velocity', 'heading': 'heading'}
-MOST_TOPICS_MEANT, NAMES_ALIKE = 2, 0.4      # judgement: of difflib, 1 for the same name
+MOST_TOPICS_MEANT, NAME_SIMILARITY = 2, 0.4      # judgement: of difflib, 1 for the same name
 QOS_NAMES = {ReliabilityPolicy.RELIABLE: 'reliable', ReliabilityPolicy.BEST_EFFORT: 'best effort'}
 
 
@@ -61,7 +61,7 @@ class Input:
         self.health = Health()
         self.trouble = ''
         self.sound = np.empty(0, bool)    # which rows of the last block can be reckoned with
-        self.frame = ''        # of the Imu's header, once a message has come
+        self.frame = ''        # of the IMU's header, once a message has come
         self.publishers: list[TopicEndpointInfo] = []
         self.meant: list[str] = []     # topics that others publish, where nobody does this one
         self._failed = 0
@@ -80,17 +80,17 @@ class Input:
         """Look at the clock, at who publishes the topic, else at what may be meant."""
         self.waiting.follow_clock()
         self.publishers = self._node.get_publishers_info_by_topic(self.topic)
-        self.meant = [] if self.publishers else self._alike()
+        self.meant = [] if self.publishers else self._same()
 
-    def _alike(self) -> list[str]:
+    def _same(self) -> list[str]:
         """Return topics that others publish with a type that would serve, the nearest first."""
         wanted, own = set(self.allowed or TYPES), {p.topic_name for p in self._node.publishers}
         names = [name for name, types in self._node.get_topic_names_and_types()
                  if wanted & set(types) and name not in own
                  and self._node.count_publishers(name)]
-        # of the many types that may be an odometer's only what is called alike
+        # of the many types that may be an odometer's only those with a similar name
         return difflib.get_close_matches(self.topic, names, MOST_TOPICS_MEANT,
-                                         0.0 if self.allowed else NAMES_ALIKE)
+                                         0.0 if self.allowed else NAME_SIMILARITY)
 
     def doubled(self) -> str:
         """Name those who publish the topic where they are several, else return nothing."""
@@ -100,8 +100,8 @@ class Input:
         who = ', '.join(sorted('not known yet' if 'UNKNOWN' in p.node_name
                                else f'{p.node_namespace.rstrip("/")}/{p.node_name}'
                                for p in self.publishers))
-        return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages mix; '
-                'stop all but one')
+        return (f'{self.topic} has {len(self.publishers)} publishers ({who}): their messages are '
+                'mixed; stop all but one')
 
     def find(self, config: Config) -> None:
         """Subscribe once the type is known."""
@@ -142,7 +142,7 @@ class Input:
 
     @staticmethod
     def _counts_increments(reader: Reader) -> bool:
-        # a lost increment is travel lost for good, so such a sender is asked to repeat itself
+        # a lost increment is travel lost for good, so such a topic is reliable
         return reader.form is not None and reader.form.quantity == 'increment'
 
     def take(self) -> tuple[list[bytes], list[int]]:
@@ -177,31 +177,31 @@ class Input:
         return pairs
 
     def flowing(self) -> bool:
-        """Return whether usable messages are coming."""
+        """Return True if usable messages arrive."""
         return self.health.flowing(self._steady_ns())
 
     def why(self) -> str:
-        """Return why nothing usable comes, for people; empty if it does."""
+        """Return the explanation why no usable message arrives, for people; empty if one does."""
         silent = self.health.silent_s(self._steady_ns())
         if self.flowing():
             return ''
         if self.trouble:
             return self.trouble
-        if self.health.heard_ns and not self.health.newest_ns:
-            return f'{self.topic}: all header stamps are zero; mend the driver'
+        if self.health.received_ns and not self.health.newest_ns:
+            return f'{self.topic}: all header stamps are zero; check the driver'
         if not self.publishers:
             return (f'no {LABELS[self.slot]} on {self.topic}: 0 publishers found'
-                    + (f', silent for {silent:.0f} s' if self.health.heard_ns else
+                    + (f', silent for {silent:.0f} s' if self.health.received_ns else
                        '; start the driver or remap ' + self.name)
                     + (f' (did you mean {" or ".join(self.meant)}?)' if self.meant else ''))
         foreign = {p.topic_type for p in self.publishers} - {self.msgtype}
-        if self.msgtype and foreign and not self.health.heard_ns:
-            return (f'{self.topic} is published as {", ".join(sorted(foreign))}, want '
+        if self.msgtype and foreign and not self.health.received_ns:
+            return (f'{self.topic} is published as {", ".join(sorted(foreign))}; required: '
                     f'{self.msgtype}')
         offers = ', '.join(sorted({QOS_NAMES.get(p.qos_profile.reliability, 'unknown QoS')
                                    for p in self.publishers}))
         many = f'{len(self.publishers)} publisher{"s" * (len(self.publishers) > 1)}'
-        if not self.health.heard_ns:
+        if not self.health.received_ns:
             return f'{self.topic}: {many} found ({offers}) but no message yet'
         return f'no {LABELS[self.slot]} on {self.topic} for {silent:.0f} s: {many} found'
 

@@ -13,7 +13,7 @@ Messages that wait, serialised, in the middleware's queue until they are taken.
 Waking the executor for every message is nine tenths of what a node costs at 1 kHz. So it is kept
 away from the subscription, and ``take`` asks rclpy's handle for what waits by ``take_message``, as
 the executor itself does. That is no documented part of rclpy: where it is missing, or answers in
-another way, the executor carries the messages from then on. Nothing changes then but the cost.
+another way, the executor takes the messages from then on. Only the CPU load changes.
 """
 
 from typing import Any, TypeAlias
@@ -25,7 +25,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and what the middleware tells
+Message: TypeAlias = tuple[bytes, dict[str, Any]]     # serialised, and the info of the middleware
 
 
 class Gate(MutuallyExclusiveCallbackGroup):
@@ -36,7 +36,7 @@ class Gate(MutuallyExclusiveCallbackGroup):
         self.is_open = False
 
     def can_execute(self, entity: object) -> bool:
-        """Return whether the executor may wait for the entity."""
+        """Return True if the executor can wait for the entity."""
         return self.is_open and bool(
             super().can_execute(entity))  # type: ignore[no-untyped-call]
 
@@ -75,15 +75,15 @@ class WaitingMessages:
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def take(self) -> list[Message]:
-        """Return what has come since the last call."""
+        """Return the messages since the last call."""
         if self._subscription is not None and not self._carried:
             try:
                 self._fetch(self._subscription)
             except (AttributeError, TypeError, ValueError) as error:
                 self._carried = self.gate.is_open = True
                 self._node.get_logger().warning(
-                    f'this rclpy has no take_message as it is known ({error}): its executor '
-                    'carries the messages, which costs several times as much')
+                    f'this rclpy has no usable take_message ({error}): the executor takes the '
+                    'messages, at several times the CPU load')
         pending, self._pending = self._pending, []
         return pending
 
@@ -91,7 +91,7 @@ class WaitingMessages:
         """
         Take what waits in the middleware's queue.
 
-        The executor takes one at a time of each topic, so that where it lags the Imu lags most.
+        The executor takes one at a time of each topic, so that where it lags the IMU lags most.
         """
         handle, kind = subscription.handle, subscription.msg_type
         with handle:

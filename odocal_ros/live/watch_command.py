@@ -22,7 +22,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument('node', nargs='?', default='/calibrator',
                         help='full name of the node (default: /calibrator)')
     parser.add_argument('--once', action='store_true',
-                        help='show the first status that comes and end')
+                        help='print the first status and exit')
 
 
 def run(args: Namespace) -> int:

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 from odocal_ros.live.memory import give_back
 
-# judgement: s that a node told to end waits, for a computation and for files: launch asks again,
+# judgement: s that a stopping node waits, for a computation and for files: launch asks again,
 # and harder, after 5 s
 JOB_GRACE_S, FILES_GRACE_S = 1.0, 4.0
 Job: TypeAlias = Callable[[], Any]
@@ -29,7 +29,7 @@ class Worker:
     Runs jobs one after the other in a thread of its own.
 
     ``poll`` hands their outcomes to the thread that asks, the executor's, so that nothing but
-    the job itself ever runs beside the callbacks. A node told to end waits for result files just
+    the job itself ever runs beside the callbacks. A stopping node waits for result files just
     asked for, report included, but not for a long computation.
     """
 
@@ -41,7 +41,7 @@ class Worker:
 
     @property
     def busy(self) -> bool:
-        """Return whether a job is under way or waits."""
+        """Return True if a job is running or waiting."""
         return self._jobs.unfinished_tasks > 0
 
     def submit(self, job: Job, then: Then) -> None:

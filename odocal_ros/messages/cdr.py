@@ -11,7 +11,7 @@
 Where the fields of a serialised message lie, without a ROS or rosbags import.
 
 Messages whose variable parts (strings, lists) have the same lengths have their fields at the
-same bytes: one message tells the layout of all of them.
+same bytes: one message gives the layout of all of them.
 """
 
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ class Layout:
     texts: dict[str, list[str]] = field(default_factory=dict)              # lists of strings
     fixed: list[tuple[int, int]] = field(default_factory=lambda: [(0, 2)])
     size: int = 4
-    told: list[bytes] = field(default_factory=list)      # what stands in the fixed places
+    values: list[bytes] = field(default_factory=list)      # what stands in the fixed places
     _runs: dict[tuple[str, ...], list[Run] | None] = field(default_factory=dict)
 
     @property
@@ -96,7 +96,7 @@ class Layout:
         return self.texts.get('name', [])
 
     def count(self, path: str) -> int:
-        """Return how many values a list has, 0 if it is not there."""
+        """Return the length of a list, 0 if it is missing."""
         return self.lists[path][2] if path in self.lists else 0
 
     def find(self, path: str) -> tuple[int, str] | None:
@@ -110,15 +110,15 @@ class Layout:
         return None
 
     def runs(self, paths: tuple[str, ...]) -> list[Run] | None:
-        """Return where values lie, those side by side as one; None where one is not there."""
+        """Return the offsets of values, adjacent ones merged; None if one is missing."""
         if paths not in self._runs:
             self._runs[paths] = _side_by_side([self.find(path) for path in paths])
         return self._runs[paths]
 
     def fits(self, raw: bytes) -> bool:
-        """Tell whether a message has this layout."""
+        """Return True if a message has this layout."""
         return self.size <= len(raw) and all(
-            raw[a:b] == told for (a, b), told in zip(self.fixed, self.told, strict=True))
+            raw[a:b] == values for (a, b), values in zip(self.fixed, self.values, strict=True))
 
 
 _before: dict[str, Layout] = {}      # by type, the last one found: most topics have no other
@@ -156,13 +156,13 @@ def layout_of(msgtype: str, raw: bytes) -> Layout | None:
         return None
     if layout.size > len(raw):
         return None     # longer is common: serialize_message leaves what lay behind the message
-    layout.told = [raw[a:b] for a, b in layout.fixed]
+    layout.values = [raw[a:b] for a, b in layout.fixed]
     _before[msgtype] = layout
     return layout
 
 
 def frame_of(msgtype: str, raw: bytes) -> str | None:
-    """Return the frame_id of one message; None where a layout does not tell it."""
+    """Return the frame_id of one message; None if the layout does not give it."""
     if SCHEMAS.get(msgtype, ())[:3] != _HEADER or layout_of(msgtype, raw) is None:
         return None
     at, length = FRAME_AT, int.from_bytes(raw[FRAME_AT - 4:FRAME_AT], 'little')

@@ -66,7 +66,7 @@ class Reader:
 
     @property
     def form(self) -> OdometerForm | None:
-        """Return what odometer values mean (certain once a message came); None for others."""
+        """Return the meaning of odometer values, final after one message; None for others."""
         return self._plan.form
 
     @property
@@ -138,7 +138,7 @@ class Reader:
         return values
 
     def _settled(self, raws: Sequence[bytes], deserialize: Deserialize) -> int:
-        """Let the plan see messages in order until it knows all; return how many told nothing."""
+        """Let the plan see messages in order until it knows all; return how many did not help."""
         for k, raw in enumerate(raws):
             view: View | None = cdr.layout_of(self.msgtype, raw) if self._plan.known else None
             if view is None:
@@ -157,7 +157,7 @@ class Reader:
             return MessageView(deserialize(raw))
         except OdocalError:
             raise
-        except Exception as error:   # rclpy and rosbags each have their own way to fail
+        except Exception as error:   # rclpy and rosbags raise different errors
             why = ' '.join(str(error).split())[:200]
             self.trouble = f'cannot be deserialised as {self.msgtype}: {why}'
             return None

@@ -34,7 +34,7 @@ class View(Protocol):
         """Return the list ``name`` (of joints), empty where there is none."""
 
     def count(self, path: str) -> int:
-        """Return how many values a list has, 0 if it is not there."""
+        """Return the length of a list, 0 if it is missing."""
 
 
 class MessageView:
@@ -49,7 +49,7 @@ class MessageView:
         return list(getattr(self.message, 'name', ()))
 
     def count(self, path: str) -> int:
-        """Return how many values a list has, 0 if it is not there."""
+        """Return the length of a list, 0 if it is missing."""
         try:
             return len(self.value(path))
         except (AttributeError, LookupError, TypeError):
@@ -57,7 +57,7 @@ class MessageView:
 
     def value(self, path: str) -> Any:
         """
-        Return what lies at a dotted path, with [i] in a list or [name] by the list ``name``.
+        Return the value at a dotted path, with [i] in a list or [name] by the list ``name``.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class MessageView:
         raise LookupError(f'no {key!r} among {", ".join(map(str, names)) or "no names"}')
 
     def fields(self) -> list[str]:
-        """Return the names of the message's fields, to tell people what there is."""
+        """Return the names of the message's fields, for error messages."""
         given = getattr(type(self.message), '__dataclass_fields__', None)
         if given is None and hasattr(self.message, 'get_fields_and_field_types'):
             given = self.message.get_fields_and_field_types()

@@ -44,8 +44,8 @@ class OdometerPlan:
     """
     What to take from the messages of an odometer topic, and what it means.
 
-    Some of it only the first message tells (does a JointState hold positions? which of its joints
-    are wheels? is a foreign field a whole number?); ``ready`` is asked with messages in order
+    The first message decides some of it (does a JointState hold positions? which of its joints
+    are wheels? is a foreign field a whole number?); ``ready`` is called with messages in order
     until it says yes.
     """
 
@@ -58,7 +58,7 @@ class OdometerPlan:
         self.stamped = 'string header.frame_id' in cdr.SCHEMAS.get(msgtype, ())
         self.columns: tuple[Column, ...] = ()
         self.form = OdometerForm('cumulative', self.odometer.wrap, 'm/pulse')
-        self.unclear = ''        # why the last message did not tell which values are wheels
+        self.unclear = ''        # why the last message did not determine the wheels
         self._check()
         self.choosing = self._listed() and not _base(self.field)[1] and not self.keys[0]
         if msgtype == JOINTS and not self.field:
@@ -76,29 +76,29 @@ class OdometerPlan:
         """Refuse what can be seen to fail before any message came."""
         if not self.known and not self.field and not self.two:
             raise BadData(
-                f'{self.slot}: {self.msgtype} is not read as an odometer by itself: set '
+                f'{self.slot}: {self.msgtype} is not a known odometer type: set '
                 f"odometer.field to the path of its value ('ros2 interface show {self.msgtype}' "
-                f'lists its fields), or give a topic of {", ".join(TYPES)}')
+                f'lists its fields), or use a topic of type {", ".join(TYPES)}')
         if self.field and not parts(self.field):
-            raise BadConfig(f'odometer.field: {self.field!r} is no path such as '
+            raise BadConfig(f'odometer.field: {self.field!r} is not a path such as '
                             'twist.linear.x, data[0] or position[joint]')
         if not self.known:
             return
         kinds = _kinds(self.msgtype)
         base, key = _base(self.field)
         if self.field and base not in kinds:
-            raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; it has '
+            raise BadData(f'odometer.field: {self.msgtype} has no value {self.field!r}; values: '
                           f'{", ".join(kinds)}')
         if self.two and not self._listed():
             raise BadConfig(f'odometer.left and odometer.right: {self.msgtype} holds one value '
                             f"({self.field}); use 'topic' for wheels on two topics")
         if self.odometer.field and self._listed() and not (
                 key or self.two or self.msgtype == JOINTS):
-            raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value of it, '
+            raise BadConfig(f'odometer.field: {self.field!r} is a list; name one value, such as '
                             f'{base}[0], or set odometer.left and odometer.right')
 
     def _listed(self) -> bool:
-        """Return whether the field is a list of values, of which one or two are wanted."""
+        """Return True if the field is a list from which one or two values must be selected."""
         base, _ = _base(self.field)
         return self.known and (not base or '[' in _kinds(self.msgtype)[base])
 
@@ -120,7 +120,7 @@ class OdometerPlan:
         return False
 
     def _choose(self, field: str, view: View) -> None:
-        """Find the wheels in a message, and settle; else note why they cannot be told."""
+        """Select the wheels of a message; if they are unclear, store the reason."""
         found = choose(view.names, view.count(field))
         if isinstance(found, str):
             self.unclear = found
@@ -139,7 +139,7 @@ class OdometerPlan:
         self.form = replace(self.form, sides=found.sides, chosen=found.about)
 
     def _learn(self, view: MessageView) -> None:
-        """Settle a foreign type by its first message."""
+        """Determine a foreign type from its first message."""
         value = None
         for key in self.keys:
             path = self._path(self.field, key)
@@ -150,7 +150,7 @@ class OdometerPlan:
                               f'its fields are {", ".join(view.fields())}') from None
             if not isinstance(value, (Integral, float, np.floating)):
                 raise BadData(f'odometer.field: {path!r} of {self.msgtype} is not a number but '
-                              f'{type(value).__name__}; name one value, as in path.to.value[0]')
+                              f'{type(value).__name__}; name one value, such as path.to.value[0]')
         self.stamped = hasattr(view.message, 'header')
         self._settle(self.field, 'int64' if isinstance(value, Integral) else 'float64')
 
@@ -166,7 +166,7 @@ class OdometerPlan:
         return _kinds(self.msgtype)[_base(field)[0]].split('[')[0]
 
     def _meaning(self, field: str, kind: str = '') -> OdometerForm:
-        """Return what the values of a field mean."""
+        """Return the meaning of the values of a field."""
         bits = 0
         if self.known:
             kind = self._kind(field)
@@ -193,7 +193,7 @@ class OdometerPlan:
         base, own = _base(field)
         if not self.known or '[' not in _kinds(self.msgtype)[base]:
             return lambda view: (path,)
-        key = key or own        # never by way of the path: a joint may have any name
+        key = key or own        # never through the path: a joint may have any name
 
         def pick(view: View) -> Sequence[str] | None:
             n = view.count(base)
@@ -203,11 +203,11 @@ class OdometerPlan:
         return pick
 
     def missing(self, view: View) -> str:
-        """Say why a message holds no value, for people."""
+        """Return the explanation why a message has no value, for people."""
         if self.unclear and not self.columns:
             return self.unclear
         wanted = ' and '.join(key for key in self.keys if key) or self.field or 'any position'
-        names = f', its names are {", ".join(view.names)}' if view.names else ''
+        names = f'; names: {", ".join(view.names)}' if view.names else ''
         return f'no {wanted} in a {self.msgtype}{names}'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> list[tuple[str, Samples]]:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Messages of the Imu, GNSS and heading: where the values lie in each type, and what they mean."""
+"""Messages of the IMU, GNSS and heading: where the values lie in each type, and what they mean."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -52,8 +52,8 @@ class SensorPlan:
         return True
 
     def missing(self, view: View) -> str:
-        """Say why a message holds no value, for people."""
-        return 'the fields of a message are not all there'
+        """Return the explanation why a message has no value, for people."""
+        return 'a message is incomplete'
 
     def build(self, received_ns: Ints, columns: list[NDArray[Any]]) -> Pairs:
         """Return (slot, block) pairs."""
@@ -94,8 +94,8 @@ def _fix(stamps: Ints, received: Ints, position: Floats, covariance: Floats, kno
 def _velocity(stamps: Ints, received: Ints, velocity_n: Floats,
               *covariance: Floats) -> VelocitySamples:
     variance = covariance[0] if covariance else np.zeros_like(velocity_n)
-    told = (variance > 0) & (variance < 1e12)       # else unknown
-    return VelocitySamples(stamps, received, velocity_n, np.where(told, variance, 0.0))
+    known = (variance > 0) & (variance < 1e12)       # else unknown
+    return VelocitySamples(stamps, received, velocity_n, np.where(known, variance, 0.0))
 
 
 # format: of sensor_msgs/Imu, whose covariances are 3 x 3, row by row
@@ -116,9 +116,9 @@ SENSORS: dict[tuple[str, str], tuple[Sequence[Column], Build]] = {
 
 
 def sensor_plan(slot: str, msgtype: str) -> SensorPlan:
-    """Return what to take from messages of a type for a slot; BadData: it cannot serve."""
+    """Return the fields that a slot uses of a message type; raise BadData for other types."""
     if (slot, msgtype) not in SENSORS:
         types = [other for own, other in SENSORS if own == slot]
-        raise BadData(f'{slot}: messages of type {msgtype} cannot serve; give a topic of '
+        raise BadData(f'{slot}: messages of type {msgtype} cannot be used; give a topic of type '
                       f'{" or ".join(types)}')
     return SensorPlan(slot, *SENSORS[slot, msgtype])

@@ -44,7 +44,7 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None,
         table = raws.table(rows)
         for _ in range(MAX_LAYOUTS):
             layout = cdr.layout_of(msgtype, table[0].tobytes())
-            alike = _alike(table, layout.fixed if layout else [(0, table.shape[1])])
+            alike = _same(table, layout.fixed if layout else [(0, table.shape[1])])
             whole = bool(alike.all())
             if layout is None:
                 odd.append(rows[alike])
@@ -61,8 +61,8 @@ def tables(msgtype: str, raws: Sequence[bytes]) -> Iterator[tuple[Layout | None,
         yield None, np.sort(np.concatenate(odd)), np.empty((0, 0), np.uint8)
 
 
-def _alike(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
-    """Tell which messages of one length equal the first one in the bytes that make a layout."""
+def _same(table: Table, fixed: Sequence[tuple[int, int]]) -> Bools:
+    """Return a mask of messages of one length whose layout bytes equal those of the first."""
     alike = np.ones(len(table), bool)
     for start, stop in fixed:
         part = table[:, start:stop]

@@ -10,9 +10,9 @@
 """
 Which values of a message are the wheels, where no setting names them.
 
-Joints are told by their names: a wheel says so, a steering or an arm joint too. A left and a right
-one make a pair; of several axles the one that does not steer, else the rear one. What names do not
-tell is not guessed: two values of unknown sides give their mean, more give a refusal.
+Joints are selected by name: wheels, steering and arm joints have typical names. A left and a right
+one make a pair; of several axles the one that does not steer, else the rear one. Without
+typical names nothing is guessed: two values of unknown sides give their mean, more give a refusal.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class Choice:
 
 def choose(names: Sequence[str], count: int) -> Choice | str:
     """
-    Return the wheels among the values of a message, or why they cannot be told.
+    Return the wheels among the values of a message, or why they are unclear.
 
     names : of the values, as sent; may be fewer than there are, or none.   count : of values.
     """
@@ -54,38 +54,39 @@ def choose(names: Sequence[str], count: int) -> Choice | str:
     if not keys:
         return 'the list is empty'
     if len(set(keys)) < len(keys):
-        return f'two joints of one name in {_listed(keys)}'
+        return f'two joints with the same name in {_listed(keys)}'
     found = _by_name(names) if names else tuple(keys)
     if len(keys) == 1:
         if not found:
-            return f'its only joint, {keys[0]}, is no wheel by its name; odometer.field names it'
+            return (f'its only joint, {keys[0]}, does not have a wheel name; select it with '
+                    'odometer.field')
         return Choice((keys[0],), True, '')
     if isinstance(found, Choice):
         return found
     if len(found) == 1:
-        return Choice((found[0],), True, f'of the joints {_listed(keys)}: only {found[0]} is '
-                      'taken, by their names')
+        return Choice((found[0],), True, f'joints {_listed(keys)}: only {found[0]} is used, '
+                      'selected by name')
     if len(found) == 2:
         what = 'joints' if names else 'values'
         first, second = found
-        return Choice((first, second), False, f'of the {what} {_listed(keys)}: the mean of '
-                      f'{first} and {second} is taken; which is left and which is right nothing '
-                      'tells: below, the left one is the first')
+        return Choice((first, second), False, f'{what} {_listed(keys)}: the mean of {first} and '
+                      f'{second} is used. Left and right cannot be decided from the data; below, '
+                      'the first is called left')
     what = f'the joints {_listed(keys)}' if names else f'a list of {count} values'
-    return (f'which of {what} are the wheels is not clear: name two by odometer.left and '
-            f'odometer.right{"" if names else " (indices from 0)"}, or one by odometer.field; '
-            'odocal inspect shows how each of them moves')
+    return (f'the wheels among {what} are not clear: set odometer.left and '
+            f'odometer.right{"" if names else " (indices from 0)"}, or odometer.field for one; '
+            'odocal inspect shows how each value moves')
 
 
 def sided(choice: Choice, side: str) -> str:
-    """Return the key of the wheel on one side, 'left' or 'right'; '' where that is not told."""
+    """Return the key of the wheel on one side, 'left' or 'right'; '' if that is unclear."""
     if len(choice.keys) == 1:
         return choice.keys[0]
     return choice.keys[side == 'right'] if choice.sides else ''
 
 
 def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
-    """Return the pair that names tell, else all that may be wheels."""
+    """Return the pair selected by name, else all possible wheels."""
     low = {name: name.lower() for name in names}
     free = [n for n in names if not any(w in low[n] for w in NO_WHEEL)]
     rolls = [n for n in free if any(w in low[n] for w in WHEEL)]
@@ -104,7 +105,7 @@ def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
     steered = {_axle(_place(n)[1]) for n in names if any(w in low[n] for w in STEER)} - {''}
     fixed = [p for p in pairs if steered and _axle(places[p[0]][1]) not in steered]
     rear = [p for p in pairs if _axle(places[p[0]][1]) == 'rear']
-    for some, why in ((fixed, ', of the axle that does not steer'), (rear, ', of the rear axle')):
+    for some, why in ((fixed, ', axle that does not steer'), (rear, ', rear axle')):
         if len(some) == 1:
             return Choice(some[0], True, _taken(names, some[0], why))
     single = [n for n in rolls if _axle(places[n][1]) == 'rear']
@@ -112,9 +113,9 @@ def _by_name(names: Sequence[str]) -> Choice | tuple[str, ...]:
 
 
 def _taken(names: Sequence[str], pair: tuple[str, str], why: str) -> str:
-    rest = '' if len(names) == 2 else f'of the joints {_listed(names)}: '
-    return f'{rest}{pair[0]} is taken for the left wheel and {pair[1]} for the right one, by ' \
-           f'their names{why}'
+    rest = '' if len(names) == 2 else f'joints {_listed(names)}: '
+    return (f'{rest}{pair[0]} is used as left wheel, {pair[1]} as right wheel (selected by '
+            f'name{why})')
 
 
 def _words(name: str) -> list[str]:
@@ -129,7 +130,7 @@ def _words(name: str) -> list[str]:
 
 
 def _place(name: str) -> tuple[str, tuple[str, ...]]:
-    """Return the side that a name tells ('' none or both), and what is left of the name."""
+    """Return the side in a name ('' none or both), and the rest of the name."""
     sides, rest = set(), []
     for word in _words(name):
         axle, side = _letters(word)

@@ -63,7 +63,7 @@ class Alignment:
 
     @property
     def heading_separable(self) -> bool:
-        """Tell whether the heading knows nothing of the odometer's direction."""
+        """Return True if the heading is independent of the direction of the odometer."""
         return self.heading_source != 'course'
 
     @property
@@ -90,7 +90,7 @@ class Level:
 
 
 class Grade(Protocol):
-    """What the errors of an Imu are like (``settings.grades.Grade``), 1 sigma, SI."""
+    """What the errors of an IMU are like (``settings.grades.Grade``), 1 sigma, SI."""
 
     @property
     def level_bias(self) -> float: ...
@@ -134,7 +134,7 @@ def level_at_rest(t: Floats, w_b: Floats, f_b: Floats, span: Floats | tuple[floa
     Parameters
     ----------
     t, w_b, f_b : (n,), (n, 3), (n, 3) arrays
-        Imu rows, s, rad/s, m/s^2.
+        IMU rows, s, rad/s, m/s^2.
     span : (2,)
         Begin and end of the standstill, s.
     grade : Grade
@@ -174,7 +174,7 @@ def level_in_motion(t: Floats, f_b: Floats, q_0b: Floats, speed: Floats, latitud
     Parameters
     ----------
     t, f_b : (n,), (n, 3) arrays
-        Imu rows of the stretch: s, m/s^2.
+        IMU rows of the stretch: s, m/s^2.
     q_0b : (n, 4) array
         Attitude against the first row, from the gyro.
     speed : (2,) array

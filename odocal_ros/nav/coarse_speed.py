@@ -24,7 +24,7 @@ import numpy as np
 from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.nav.gaps import MISSING_INTERVALS
 
-LEAST_CROSSING = 0.02      # judgement: of a cell, sigma of a crossing: what speeds do beside
+LEAST_CROSSING = 0.02      # judgement: of a cell, minimum sigma of a crossing
 LEAST_CELLS = 3.0          # judgement: cells that the values must span
 # judgement: |mean of exp(2 pi i u / q)| of distinct values u on a grid of q
 GRID_COHERENCE = 0.9
@@ -63,22 +63,22 @@ class CoarseSpeed:
 
     @property
     def truncation(self) -> float:
-        """Return by how much all values may be too small: half a step, where they are cut."""
+        """Return the possible truncation of all values: half a step."""
         return self.step / 2
 
     def mirrored(self, sign: Floats) -> 'CoarseSpeed':
-        """Return the speed with signs (n,) of its own."""
+        """Return the speed times signs (n,)."""
         return replace(self, value=self.value * sign)
 
     @cached_property
     def most(self) -> float:
-        """Return how far a speed may be from the line between rows, bends in between too."""
+        """Return the maximum deviation of a speed from the line between rows, with bends."""
         change = np.abs(np.diff(self.value))
         return self.step + (float(np.percentile(change, 95)) / 4 if len(change) else 0.0)
 
     def way_variance(self, t: Floats) -> Floats:
         """
-        Return the variance of the way between n times, s, by rounding: (n - 1,) scale units^2.
+        Return the variance of travel between n times, s, by rounding: (n - 1,) scale units^2.
 
         A run of one value has one error, uniform in its cell, which a cruise does not average: as
         much white noise as adds up to the same over the run.
@@ -129,7 +129,7 @@ class CoarseSpeed:
 
 def _rates(t: Floats, edge: Floats, q: float) -> Floats:
     """
-    Return how fast a speed may change at its crossings (m,): the faster of both sides.
+    Return the limit of the speed change at its crossings (m,): the faster of both sides.
 
     As fast as three quarters of the drive's do at least: a small step between two cruises is made
     as quickly as a large one, though no other edge is near to show it; and by its own neighbours
@@ -202,7 +202,7 @@ def _coherence(u: Ints, size: int) -> Floats:
 
 def _may_be_grid(u: Ints) -> bool:
     """
-    Return whether a grid may be among distinct cells u, by a tenth of the work.
+    Return True if distinct cells u can contain a grid: a quick test of a tenth of them.
 
     One of GRID_COHERENCE c is within half a step of these frequencies, so at most pi / 4 either
     side of it in phase: there (c - sqrt(1 - c^2)) / sqrt(2) is left of it at least.

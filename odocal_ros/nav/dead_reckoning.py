@@ -134,18 +134,18 @@ def rough_scale(travel: Travel, t_fix: Floats, fixes_n: Floats, sigma: float) ->
     """
     Return metres per unit of travel from distances between fixes, None where nothing moves.
 
-    The way is cut into equal pieces, as short as they may be for the fixes to be 20 m and eight
-    sigmas apart, and the median of the pieces taken: good to some per cent though fixes stray,
+    The path is cut into equal sections, as short as possible with fixes 20 m and eight
+    sigmas apart, and the median of the pieces taken: good to a few per cent despite outliers,
     for thresholds and for scales that have no nominal value.
     """
     inside = (t_fix >= travel.t[0]) & (t_fix <= travel.t[-1]) if len(travel.t) else []
     if not np.any(inside):
         return None
     s, p = travel.at(t_fix[inside]), fixes_n[inside, :2]
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
+    path_length = np.append(0.0, np.cumsum(np.abs(np.diff(s))))
     pieces = len(s) // 2
-    while pieces and way[-1] > 0:
-        k = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], pieces + 1)))
+    while pieces and path_length[-1] > 0:
+        k = np.unique(np.searchsorted(path_length, np.linspace(0.0, path_length[-1], pieces + 1)))
         chord, run = np.hypot(*np.diff(p[k], axis=0).T), np.abs(np.diff(s[k]))
         onward = run > 0
         if onward.any() and np.median(chord[onward]) >= max(20.0, 8 * sigma):

@@ -8,11 +8,11 @@
 # the License.
 
 """
-Speeds that a sender holds until they have changed by a step, as many buses do to save messages.
+Speeds that are repeated until they have changed by a step, as on many buses.
 
-A value after a change is right. Until the next one the speed lies within a step beyond it, on the
-side that it changed to: half a step is taken for it, and its error, that of a cell, is no noise.
-Zeros are taken as they are, for a vehicle that stands is not held in motion.
+The value after a change is correct. Until the next change the speed is within one step of it, in
+the direction of the change: half a step is added, and the error is uniform over the step, not
+noise. Zeros are used unchanged: at standstill the vehicle does not move.
 """
 
 from dataclasses import dataclass, replace
@@ -23,31 +23,31 @@ import numpy as np
 from odocal_ros.data.arrays import Floats
 from odocal_ros.nav.coarse_speed import CoarseSpeed, LEAST_CROSSING, SpeedInstants
 
-# judgement: of the rows that move, those that repeat the one before, at least
+# judgement: minimum share of moving rows that repeat the one before
 HELD_SHARE = 0.3
-# statistical: changes to know a step by. Of speeds that change by anything the least of 50 is a
-# fifth of their tenth percentile; of held ones both are a step and what the speed gains in a row
+# statistical: changes needed to estimate a step. If changes have any size, the smallest of 50 is a
+# fifth of their tenth percentile; if speeds are held, both are one step plus the change in one row
 FEWEST_CHANGES, LEAST_OVER_TENTH = 50, 0.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeldSpeed(CoarseSpeed):
-    """A speed held until it has changed by ``step``; ``value``: the middle of where it may be."""
+    """A speed held until it has changed by ``step``; ``value``: centre of its interval."""
 
-    sent: Floats             # (n,) as it was sent
+    sent: Floats             # (n,) as published
 
     @property
     def truncation(self) -> float:
-        """Return by how much all values may be too small: not at all."""
+        """Return the truncation of all values: 0."""
         return 0.0
 
     def mirrored(self, sign: Floats) -> 'HeldSpeed':
-        """Return the speed with signs (n,) of its own."""
+        """Return the speed times signs (n,)."""
         return replace(self, value=self.value * sign, sent=self.sent * sign)
 
     @cached_property
     def instants(self) -> SpeedInstants:
-        """Return the speeds at changes, which are right but for how they are sampled."""
+        """Return the speeds at changes, which are correct except for sampling."""
         v = self.sent
         row = np.flatnonzero((np.diff(v, prepend=v[:1]) != 0) & (v != 0))
         sigma = np.full(len(row), LEAST_CROSSING * self.step)
@@ -55,7 +55,7 @@ class HeldSpeed(CoarseSpeed):
 
 
 def held_speed(t: Floats, value: Floats) -> HeldSpeed | None:
-    """Return the speed of a sender that holds it, by its rows (n,); None if it does not."""
+    """Return the held speed from rows (n,); None if the speed is not held."""
     change = np.diff(value)
     size = np.abs(change[(value[1:] != 0) & (value[:-1] != 0)])
     changes = size[size > 0]

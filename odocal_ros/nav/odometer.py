@@ -46,12 +46,12 @@ class Travel:
         return np.interp(t, self.t, self.s)
 
     def mirrored(self, spans: Floats) -> 'Travel':
-        """Return it with what was counted in spans, (m, 2) s, counted the other way."""
-        def way(t: Floats) -> Floats:
+        """Return it with the counts in spans, (m, 2) s, reversed."""
+        def sign(t: Floats) -> Floats:
             return np.where(((t[:, None] >= spans[:, 0]) & (t[:, None] < spans[:, 1])).any(axis=1),
                             -1.0, 1.0)
-        step = np.diff(self.s, prepend=self.s[:1]) * way(self.t)
-        coarse = self.coarse and self.coarse.mirrored(way(self.coarse.t))
+        step = np.diff(self.s, prepend=self.s[:1]) * sign(self.t)
+        coarse = self.coarse and self.coarse.mirrored(sign(self.coarse.t))
         return replace(self, s=self.s[:1] + np.cumsum(step), coarse=coarse)
 
 
@@ -97,7 +97,7 @@ def travel(t: Floats, value: Values, form: OdometerForm, reversed_counts: bool =
 
 
 def _coarse(t: Floats, value: Floats) -> CoarseSpeed | None:
-    """Return what a speed's steps are; of a fine grid that is held, that it is held."""
+    """Return the steps of a speed; a held speed takes precedence over a finer grid."""
     coarse, held = coarse_speed(t, value), held_speed(t, value)
     return held if held and (coarse is None or coarse.step < held.step / 2) else coarse
 
@@ -120,7 +120,7 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
                    name: str) -> tuple[Floats, tuple[Reason, ...]]:
     """Return steps of a counter as floats, rollover undone, resets bridged; and what was found."""
     whole = np.issubdtype(value.dtype, np.integer)
-    raw = step = np.diff(value)                    # integers wrap at 2^64 by themselves
+    raw = step = np.diff(value)                    # integers wrap at 2^64
     if whole and 0 < modulus < 2**63:
         half = modulus // 2
         step = (raw + half) % modulus - half
@@ -132,20 +132,20 @@ def _counter_steps(t: Floats, value: Values, modulus: int,
         first = int(np.argmax(resets))
         step, count = _bridged(t, step, resets), int(resets.sum())
         jump = value[first + 1].item() - value[first].item()
-        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {jump:+.6g} at '
-                           f't = {t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
-                           'reset, not motion; bridged at the speed beside it'),)
+        reasons += (Reason(Code.COUNTER_RESET, f'{name} jumps by {jump:+.6g} at t = '
+                           f'{t[first + 1]:.2f} s ({count} such step{"s" * (count > 1)}): a '
+                           'reset, not motion; interpolated from the adjacent speed'),)
     rolled &= ~resets
     if rolled.any():
         first, count = int(np.argmax(rolled)), int(rolled.sum())
         reasons += (Reason(Code.COUNTER_ROLLOVER, f'{name} rolled over {count} '
-                           f'time{"s" * (count > 1)} (modulus {modulus}), first at '
-                           f't = {t[first + 1]:.2f} s; undone'),)
+                           f'time{"s" * (count > 1)} (modulus {modulus}), first at t = '
+                           f'{t[first + 1]:.2f} s; corrected'),)
     return step, reasons
 
 
 def _resets(t: Floats, step: Floats, whole: bool) -> Bools:
-    """Tell which steps no wheel can make: far above the drive's speed, alone or in pairs."""
+    """Return a mask of impossible steps: far above the speed of the drive, single or in pairs."""
     dt = np.diff(t)
     if len(step) < FEWEST_STEPS or not step.any():
         return np.zeros(len(step), bool)

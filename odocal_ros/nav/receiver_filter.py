@@ -8,21 +8,21 @@
 # the License.
 
 """
-What a receiver's filter makes of its fixes, by one unknown ``square``, s^2.
+Filter of a receiver: error of its fixes, described by one unknown ``square``, s^2.
 
-Above zero: the mean of the past, weighted exp(-age / tau) / tau, square = tau^2. A stamp's delay
-is the mean age; what is computed here is the rest, the smoothed place at t + tau less the place
-at t. Below zero: a filter of position and velocity, square = -2 tau^2, which follows a steady
-velocity without delay and overshoots where it changes: e'' + sqrt(2) e' / tau + e / tau^2 = -p''.
-Of small tau both are p'' square / 2, a series that does not end soon: of 0.6 s in town its next
-terms are decimetres.
+Above zero: the mean of past positions, weighted by exp(-age / tau) / tau, square = tau^2. The
+delay of a stamp is the mean age; this module computes the rest, the smoothed position at t + tau
+minus the position at t. Below zero: a filter of position and velocity, square = -2 tau^2, which
+follows a constant velocity without delay and overshoots where it changes:
+e'' + sqrt(2) e' / tau + e / tau^2 = -p''. For small tau both are p'' square / 2, the first term
+of a series that converges slowly: at 0.6 s in town its next terms are decimetres.
 """
 
 import numpy as np
 
 from odocal_ros.data.arrays import Floats, Ints
 
-# s^2, judgement: nearer to zero, as much in proportion
+# s^2, judgement: the error is proportional to ``square`` below
 LEAST_LAG2 = 1e-4
 
 
@@ -32,7 +32,7 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
     Return the errors of filtered positions, (k, 3) m, and their derivatives by ``square``.
 
     t, place, velocity : (n,) s, (n, 3) m and m/s, rising; cubics lie between.
-    at : (k,) s, mean age of what a fix holds taken off its stamp.   square : s^2, as above.
+    at : (k,) s, stamps minus the mean age of the content of a fix.   square : s^2, as above.
     """
     def off(square: float) -> Floats:
         if square > 0:
@@ -49,7 +49,7 @@ def smoothing(t: Floats, place: Floats, velocity: Floats, at: Floats, square: fl
 
 
 def _bends(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return (n - 1, 1) lengths of the intervals, (n - 1, 3) p'' / 2 at their begin, p''' / 6."""
+    """Return (n - 1, 1) lengths of the intervals, (n - 1, 3) p'' / 2 at their start, p''' / 6."""
     T = np.diff(t)[:, None]
     mean = np.diff(place, axis=0) / T
     return (T, (3 * mean - 2 * velocity[:-1] - velocity[1:]) / T,
@@ -59,12 +59,12 @@ def _bends(t: Floats, place: Floats, velocity: Floats) -> tuple[Floats, Floats, 
 def odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share: float,
                    log_time: float) -> tuple[Floats, Floats, Floats]:
     """
-    Return the errors of a receiver by its own odometer, and derivatives by share and log_time.
+    Return fix errors from the receiver's own odometer, and derivatives by share and log_time.
 
-    It is ``share`` times the motion until ``at``, weighted exp(-age / time): satellites take the
-    places of its odometer back within that time.
+    The error is ``share`` times the motion until ``at``, weighted by exp(-age / time): satellites
+    correct the position of its odometer within that time.
 
-    t, place, velocity, at : as for ``smoothing``.   share : relative error of its odometer.
+    t, place, velocity, at : as for ``smoothing``.   share : relative scale error of its odometer.
     log_time : logarithm of s.
     """
     track, time, step = _Track(t, place, velocity), np.exp(log_time), 1e-3    # of the logarithm
@@ -74,41 +74,40 @@ def odometer_error(t: Floats, place: Floats, velocity: Floats, at: Floats, share
 
 
 def _late(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float) -> Floats:
-    """Return the smoothed places at ``at + tau`` less those at ``at``, (k, 3)."""
+    """Return the smoothed positions at ``at + tau`` minus the positions at ``at``, (k, 3)."""
     track = _Track(t, place, velocity)
     return track.smoothed(at + tau, tau) - track.at(at)
 
 
 class _Track:
-    """Cubics between places and velocities, steady beyond both ends, and means of their past."""
+    """Cubics between positions and velocities, extrapolated linearly, and means of their past."""
 
     def __init__(self, t: Floats, place: Floats, velocity: Floats) -> None:
-        beyond = 10.0       # s that the way goes on at its last velocity
+        beyond = 10.0       # s of extrapolation at the last velocity
         self.t = np.append(t, t[-1] + beyond)
         self.place = np.concatenate([place, place[-1:] + beyond * velocity[-1:]])
         self.velocity = np.concatenate([velocity, velocity[-1:]])
         self.T, self.bend, self.twist = _bends(self.t, self.place, self.velocity)
 
     def _cubic(self, at: Floats) -> tuple[Ints, Floats, Floats]:
-        """Return intervals (k,), times in them (k, 1) and places (k, 3)."""
+        """Return intervals (k,), times in them (k, 1) and positions (k, 3)."""
         k = np.clip(np.searchsorted(self.t, at, side='right') - 1, 0, len(self.T) - 1)
         s = (at - self.t[k])[:, None]
         return k, s, self.place[k] + s * (
             self.velocity[k] + s * (self.bend[k] + s * self.twist[k]))
 
     def at(self, at: Floats) -> Floats:
-        """Return the places at ``at``, (k, 3)."""
+        """Return the positions at ``at``, (k, 3)."""
         return self._cubic(at)[2]
 
     def smoothed(self, at: Floats, tau: float) -> Floats:
         """
-        Return the mean of the past of ``at``, weighted exp(-age / tau), (k, 3).
+        Return the mean of the positions before ``at``, weighted by exp(-age / tau), (k, 3).
 
-        On a cubic it is one too, p - tau p' + tau^2 p'' - tau^3 p''', and what is left of before
-        dies away.
+        On a cubic it is the cubic p - tau p' + tau^2 p'' - tau^3 p''' plus a decaying transient.
         """
         T, bend, twist = self.T, self.bend, self.twist
-        # where two cubics meet, their answers differ by jumps of p'' and p'''
+        # where two cubics meet, their responses differ by jumps of p'' and p'''
         first = tau**2 * (2 * bend - 6 * tau * twist)
         last = tau**2 * (2 * bend + 6 * (T - tau) * twist)
         left = np.concatenate([-first[:1], last[:-1] - first[1:]])
@@ -125,7 +124,7 @@ def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float)
     """
     Return the error at ``at`` of a filter of position and velocity, (k, 3).
 
-    On a cubic it is tau^2 (-p'' + sqrt(2) tau p'''), and what is left of before swings out.
+    On a cubic it is tau^2 (-p'' + sqrt(2) tau p''') plus a decaying oscillation.
     """
     T, bend, twist = _bends(t, place, velocity)
 
@@ -136,7 +135,7 @@ def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float)
     swing = _swing(np.append(0.0, T[:-1, 0]), tau)
     first, last = forced(slice(None), np.zeros_like(T)), forced(slice(None), T)
     left = -first
-    left[1:] += last[:-1]       # error and its derivative go on where two cubics meet
+    left[1:] += last[:-1]       # error and its derivative are continuous where two cubics meet
     for m in range(1, len(T)):
         left[m] += swing[m] @ left[m - 1]
     k = np.clip(np.searchsorted(t, at, side='right') - 1, 0, len(T) - 1)
@@ -147,8 +146,8 @@ def _tracked(t: Floats, place: Floats, velocity: Floats, at: Floats, tau: float)
 
 
 def _swing(s: Floats, tau: float) -> Floats:
-    """Return what is left after s of an error and its derivative: (k, 2, 2)."""
-    w = np.sqrt(0.5) / tau      # rate of decay and frequency, of a damping of sqrt(1/2)
+    """Return transition matrices of an error and its derivative over s: (k, 2, 2)."""
+    w = np.sqrt(0.5) / tau      # decay rate and frequency at a damping of sqrt(1/2)
     decay, sine, cosine = np.exp(-w * s), np.sin(w * s), np.cos(w * s)
     out: Floats = decay[:, None, None] * np.stack([
         np.stack([cosine + sine, sine / w], -1), np.stack([-2 * w * sine, cosine - sine], -1)], 1)

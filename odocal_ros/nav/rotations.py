@@ -146,7 +146,7 @@ def rpy_from_matrix(C: ArrayLike) -> Floats:
     locked = level < 1e-12
     yaw = np.where(locked, arctan2(-C[..., 0, 1], C[..., 1, 1]),
                    arctan2(C[..., 1, 0], C[..., 0, 0]))
-    # roll is what is left once this yaw is undone: near the lock its error then mends the yaw's
+    # roll is what is left once this yaw is undone: near the lock its error cancels that of the yaw
     s, c = np.sin(yaw), np.cos(yaw)
     roll = np.where(locked, 0.0, arctan2(s * C[..., 0, 2] - c * C[..., 1, 2],
                                          c * C[..., 1, 1] - s * C[..., 0, 1]))

@@ -21,7 +21,7 @@ from odocal_ros.nav.odometer import Travel
 REST_GRID = 0.1       # s, judgement: grid of the detector
 REST_WINDOW = 0.5     # s, judgement: each side
 REST_TRAVEL = 0.03    # m, judgement: travel in the window that still counts as standing
-REST_TURN = 0.02      # rad/s, judgement: wander of the gyro that still counts as standing
+REST_TURN = 0.02      # rad/s, judgement: drift of the gyro that still counts as standing
 MOST_BIAS = 0.12      # rad/s, each axis, physical: no gyro at rest says more (cheap phones: 0.1)
 
 
@@ -33,7 +33,7 @@ def standstills(t_imu: Floats, w_b: Floats, travel: Travel, metres_per_unit: flo
     Parameters
     ----------
     t_imu, w_b : (n,), (n, 3) arrays
-        Imu times, s, and turn rates, rad/s, bias and all.
+        IMU times, s, and turn rates, rad/s, bias and all.
     travel : Travel
         Odometer travel.
     metres_per_unit : float
@@ -81,8 +81,8 @@ def _spans(quiet: Bools, edges: Floats, shortest: float) -> Floats:
 
 
 def _still_wheels(middle: Floats, travel: Travel, metres_per_unit: float) -> Bools:
-    """Tell where travel in the window is that of one that stands."""
-    # range of the travel in the window by a few probes, so that rocking to and fro is seen
+    """Return a mask of windows with the travel of a vehicle at rest."""
+    # range of the travel in the window by a few probes, so that rocking is detected
     probes = [travel.at(middle + x) for x in np.linspace(-REST_WINDOW, REST_WINDOW, 5)]
     reach = np.max(probes, axis=0) - np.min(probes, axis=0)
     still: Bools = reach * metres_per_unit <= _allowed(travel, metres_per_unit)
@@ -107,10 +107,10 @@ def _gyro(edges: Floats, t_imu: Floats, w_b: Floats) -> tuple[Floats, Bools]:
 
 def _not_turning(rate: Floats, quiet: Bools, edges: Floats, shortest: float) -> Bools:
     """
-    Tell where the gyro reads what it reads at rest.
+    Return a mask of windows in which the gyro reads as at rest.
 
     A vehicle that turns on the spot at an even rate holds wheels (their mean) and gyro as steady
-    as one that stands. The slowest of the steady stretches is taken for rest: its reading is the
+    as one that stands. The slowest of the steady intervals is the standstill: its reading is the
     bias, and the others must agree with it.
     """
     means = [np.median(rate[(edges[:-1] >= a) & (edges[1:] <= b)], axis=0)

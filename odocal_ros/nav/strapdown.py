@@ -72,7 +72,7 @@ def _increments(t: Floats, w_b: Floats, first: int, last: int,
 
 def _bow(h: Floats, rise: Floats) -> tuple[Floats, Floats]:
     """
-    Return what a cubic has over its chord in each inner interval, zero where uneven: (3, m - 2).
+    Return the excess of a cubic over its chord in each inner interval: (3, m - 2).
 
     bow : how far the middle lies under the middle of the chord.
     twist : how much less the middle slope, times the interval, rises than the chord.

@@ -48,7 +48,7 @@ class Row:
 
     @property
     def agrees(self) -> bool:
-        """Tell whether the figure is what the truth allows; one not given is no error."""
+        """Return True if the value agrees with the truth; a missing value is not an error."""
         if self.value is None:
             return True
         if self.accept is not None:
@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     try:
         if len(argv) != 2:
-            raise BadUsage('want two files: calibration.json truth.yaml')
+            raise BadUsage('required: two files: calibration.json truth.yaml')
         found = rows(*(_read(Path(name)) for name in argv))
         if not found or found[0].value is None:
             raise BadUsage(f'{argv[0]}: no scale factor to compare; see its reasons')
@@ -135,7 +135,7 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
     except (ValueError, yaml.YAMLError) as error:
         raise BadUsage(f'{path}: {" ".join(str(error).split())}') from None
     if not isinstance(content, dict) or path.suffix == '.json' and 'result' not in content:
-        raise BadUsage(f'{path}: not the file meant; want calibration.json and truth.yaml')
+        raise BadUsage(f'{path}: wrong file; required: calibration.json and truth.yaml')
     return content
 
 

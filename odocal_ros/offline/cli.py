@@ -21,23 +21,24 @@ from odocal_ros.errors import OdocalError
 from odocal_ros.offline.say import warn
 
 COMMANDS = {
-    'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate from it, open the report'),
+    'try': ('odocal_ros.offline.try_bag', 'inspect a bag, calibrate, open the report'),
     'replay': ('odocal_ros.offline.replay', 'calibrate from recorded bags'),
-    'fleet': ('odocal_ros.fleet.command', 'calibrate many vehicles from many bags, on many cores'),
-    'inspect': ('odocal_ros.offline.inspect_bag', 'tell what a bag holds and what it lacks'),
+    'fleet': ('odocal_ros.fleet.command', 'calibrate many vehicles from many bags in parallel'),
+    'inspect': ('odocal_ros.offline.inspect_bag', 'show the content of a bag and what is missing '
+                'for a calibration'),
     'simulate': ('odocal_ros.offline.simulate', 'write a bag with known truth'),
     'paper': ('odocal_ros.offline.paper', 'reproduce tables 1-4 of the two-point paper'),
     'patent': ('odocal_ros.offline.patent', 'compute the embodiment of CN104359492A'),
-    'plan': ('odocal_ros.offline.plan', 'predict the sigmas of a drive not yet driven'),
-    'watch': ('odocal_ros.live.watch_command', 'show what a running node is at, with bars'),
-    'doctor': ('odocal_ros.offline.doctor', 'what is installed: one screen to paste'),
-    'compare': ('odocal_ros.offline.compare', 'change between calibrations against their sigmas'),
+    'plan': ('odocal_ros.offline.plan', 'predict the uncertainties of a planned drive'),
+    'watch': ('odocal_ros.live.watch_command', 'show the progress of a running node'),
+    'doctor': ('odocal_ros.offline.doctor', 'show the installation, for bug reports'),
+    'compare': ('odocal_ros.offline.compare', 'compare calibrations: changes in sigmas'),
 }
 OK, REJECTED, WRONG_USE, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 130    # definition: exit codes
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line instead of a page of usage."""
+    """Print errors in one line instead of the whole usage."""
 
     def error(self, message: str) -> NoReturn:
         """Raise what the door turns into one line and exit code 2."""
@@ -49,8 +50,8 @@ class _Usage(OdocalError):
 
 
 def _parser(names: set[str]) -> argparse.ArgumentParser:
-    parser = _Parser(prog='odocal', description="Calibrate a vehicle's odometer against IMU "
-                     'and GNSS: scale factor and yaw mounting angle, with honest sigmas.')
+    parser = _Parser(prog='odocal', description="Calibrate a vehicle's odometer against IMU and "
+                     'GNSS: scale factor and yaw mounting angle, with reliable uncertainties.')
     parser.add_argument('--version', action='version', version=f'odocal_ros {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', parser_class=_Parser)
     for name, (module, help_line) in COMMANDS.items():
@@ -65,7 +66,7 @@ def _parser(names: set[str]) -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run a command line; return its exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    if sys.stdout is None:       # closed by whoever started us
+    if sys.stdout is None:       # closed by the parent process
         sys.stdout = open(os.devnull, 'w', encoding='utf-8')     # noqa: SIM115 until exit
     for stream in (sys.stdout, sys.stderr):      # a terminal without ± shows ? instead
         if hasattr(stream, 'reconfigure'):
@@ -77,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
             parser.print_help()
             return WRONG_USE
         code: int = args.run(args)
-        sys.stdout.flush()       # here, where a full disk can still be told
+        sys.stdout.flush()       # here, where a full disk can still be reported
         return code
     except OdocalError as error:
         text = f'{error}' if isinstance(error, _Usage) else f'odocal: {error}'
@@ -95,8 +96,8 @@ def main(argv: list[str] | None = None) -> int:
         warn(f'odocal: {what}: {error.strerror or error}')
         return WRONG_USE
     except MemoryError:
-        warn('odocal: memory ran out; close other programs, or replay a part: a shorter bag or '
-             '--leg A:B')
+        warn('odocal: out of memory; close other programs, or replay a shorter bag or a section '
+             '(--leg A:B)')
         return WRONG_USE
     except Exception as error:     # noqa: BLE001 a person gets a line and a file, never a trace
         return _internal(error)

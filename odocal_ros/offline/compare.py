@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""odocal compare: tell whether the vehicle has changed since earlier calibrations."""
+"""odocal compare: changes of the vehicle since earlier calibrations."""
 
 import argparse
 import json
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.description = (
-        'Show each value with its change since the first calibration and since the one before, '
-        'in its unit and in sigmas. A change counts beyond 3 sigma. Exit code 0: no change that '
-        'counts; 1: changed, or nothing to judge; 2: wrong use or an unreadable file.')
+        'Show each value and its change since the first and since the previous calibration, in '
+        'its unit and in sigmas. A change is significant beyond 3 sigma. Exit code 0: no '
+        'significant change; 1: changed, or nothing to compare; 2: wrong use or an unreadable '
+        'file.')
     parser.add_argument('files', nargs='+', metavar='CALIBRATION',
                         help='calibration.json or its folder, the oldest first; two or more')
     parser.add_argument('--json', action='store_true', help='print the changes as JSON')
@@ -56,7 +57,7 @@ def _screen(found: 'Comparison') -> list[str]:
     for change in found.changes:
         rows = [(str(e.index + 1), value_text(e.estimate), _cell(change, e.to_first, stored),
                  _cell(change, e.to_previous, stored)) for e in change.entries]
-        rows.insert(0, ('', 'value', 'since the first', 'since the one before'))
+        rows.insert(0, ('', 'value', 'since the first', 'since the previous'))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines += ['', label(change.parameter)] + [
             f'{row[0]:>3}  ' + '  '.join(f'{cell:<{w}}' for cell, w in zip(

@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
     width = max(len(name) for name, _ in rows)
     say('\n'.join(f'{name:<{width}}  {text}' for name, text in rows))
     lacking = [name for name, text in rows if text == MISSING]
-    say(f'lacking: {", ".join(lacking)}; install again with pip or rosdep' if lacking
-        else 'all that is needed is there')
+    say(f'missing: {", ".join(lacking)}; reinstall with pip or rosdep' if lacking
+        else 'all required packages found')
     return 1 if lacking else 0
 
 
@@ -64,9 +64,9 @@ def _version(name: str, absent: str = MISSING) -> str:
 
 
 def _ros() -> list[tuple[str, str]]:
-    """Return how ROS is there."""
+    """Return the state of the ROS installation."""
     if find_spec('rclpy') is None:
-        return [('rclpy', 'none: no node here, bags can be replayed')]
+        return [('rclpy', 'none: the node cannot run here, bags can be replayed')]
     # in a process of its own, where a broken one breaks nothing
     found = subprocess.run([sys.executable, '-c', PROBE], capture_output=True, text=True)
     if found.returncode:

@@ -22,12 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('bag', metavar='BAG', help='bag folder or file')
     add('--json', action='store_true', help='print everything as JSON')
-    add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')
+    add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in SLOTS:
         add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'look at this topic as {slot.replace("_", " ")}')
+            help=f'use this topic as {slot.replace("_", " ")}')
 
 
 def run(args: argparse.Namespace) -> int:

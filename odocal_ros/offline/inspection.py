@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Look through a bag once and gather all that ``odocal inspect`` tells, as plain values."""
+"""Look through a bag once and gather the content of ``odocal inspect``, as plain values."""
 
 from collections.abc import Sequence
 from datetime import datetime, UTC
@@ -62,7 +62,7 @@ class _Tap:
 
 def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> dict[str, Any]:
     """
-    Return what a bag holds, as for ``odocal inspect --json``.
+    Return the content of a bag, as for ``odocal inspect --json``.
 
     Times are seconds from the bag's first message, angles rad, the rest SI.
     """
@@ -91,8 +91,8 @@ def inspect(bag: Bag, path: str, config: Config, overrides: dict[str, str]) -> d
         for reason in dict.fromkeys(findings)]
     found['open'] = left_open(bag.topics, config, overrides)
     found['command'] = command(path, bag.topics, config, overrides, mapping, extra)
-    told: dict[str, Any] = _plain(found)
-    return told
+    plain: dict[str, Any] = _plain(found)
+    return plain
 
 
 def _plain(value: Any) -> Any:
@@ -124,7 +124,7 @@ def _taps(bag: Bag, config: Config,
 
 
 def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[str, Any]:
-    """Return what is known of one topic."""
+    """Return the findings on one topic."""
     seconds = (bag.end_ns - bag.start_ns) * 1e-9
     facts: dict[str, Any] = {'name': info.name, 'type': info.msgtype, 'count': info.count,
                    'rate_hz': info.count / seconds if seconds > 0 else None}
@@ -153,7 +153,7 @@ def _topic(bag: Bag, info: TopicInfo, tap: _Tap | None, trouble: str) -> dict[st
 
 def _wheels(taps: dict[str, _Tap], mapping: dict[str, str], config: Config,
             topics: list[dict[str, Any]]) -> list[str]:
-    """Tell how each joint or entry of an odometer moves; return the settings for the wheels."""
+    """Return the travel of each joint or entry of an odometer, and the settings for the wheels."""
     options: list[str] = []
     open_ = not (config.odometer.left or config.odometer.right or config.odometer.field)
     listed = [(tap, tap.values, facts) for facts in topics
@@ -204,16 +204,17 @@ def _together(taps: dict[str, _Tap], mapping: dict[str, str]) -> LegRecorder:
 
 
 def _lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Say what a calibration would miss."""
+    """Return the reasons for data that a calibration would miss."""
     lacking = [Reason(code, f'no topic for the {word}') for slot, code, word in (
-        ('imu', Code.NO_IMU, 'Imu'), ('odometer', Code.NO_ODOMETER, 'odometer'),
+        ('imu', Code.NO_IMU, 'IMU'), ('odometer', Code.NO_ODOMETER, 'odometer'),
         ('fix', Code.NO_FIX, 'fixes')) if slot not in mapping]
     drive = found['drive']
     if not drive:
         return lacking
     legs = found['legs']
     if not found['standstills']:
-        slowest = f': its slowest second is {drive["slowest"]:.2f} m/s' * (drive['slowest'] > 0)
+        slowest = (f': its lowest speed (mean over 1 s) is {drive["slowest"]:.2f} '
+                   'm/s') * (drive['slowest'] > 0)
         lacking.append(Reason(Code.NO_STANDSTILL, f'the vehicle is never at rest{slowest}'))
     elif legs and not any(abs(leg['start'] - stop) < 1.0
                           for leg in legs for _, stop in found['standstills']):
@@ -221,29 +222,31 @@ def _lacking(found: dict[str, Any], mapping: dict[str, str], config: Config) -> 
                               f'at {found["standstills"][0][0]:.1f} s'))
     short = [leg for leg in legs if leg['way'] < config.leg.min_distance]
     loops = [leg for leg in legs if leg not in short and closed(leg)]
-    for some, code, said in ((short, Code.LEG_TOO_SHORT, '{way:.0f} m long'), (
-            loops, Code.CHORD_TOO_SHORT, 'a loop: {way:.0f} m of way, {chord:.0f} m from start '
-            'to end')):
+    for some, code, said in ((short, Code.LEG_TOO_SHORT, 'path length {way:.0f} m'), (
+            loops, Code.CHORD_TOO_SHORT, 'a loop: path length {way:.0f} m, {chord:.0f} m from '
+            'start to end')):
         if some:
             many = '' if len(some) == 1 else f'{len(some)} of {len(legs)} legs, as '
             lacking.append(Reason(code, many + 'the leg {start:.1f}:{stop:.1f} s is '.format(
                 **some[0]) + said.format(**some[0])))
     if 0 < drive['fastest'] < config.leg.min_speed:
-        lacking.append(Reason(Code.SPEED_TOO_LOW, f'never faster than {drive["fastest"]:.1f} m/s'))
+        lacking.append(Reason(Code.SPEED_TOO_LOW, 'highest speed (mean over 1 s) '
+                              f'{drive["fastest"]:.1f} m/s; the limit is '
+                              f'{config.leg.min_speed:g} m/s'))
     return lacking + _heading(found, mapping, config)
 
 
 def _heading(found: dict[str, Any], mapping: dict[str, str], config: Config) -> list[Reason]:
-    """Say where a heading could come from, if from nowhere good."""
+    """Return the reason for a missing or poor heading, with possible sources."""
     if 'heading' in mapping or math.isfinite(config.alignment.heading):
         return []
     facts = next(t for t in found['topics'] if t['name'] == mapping['imu'])['imu']
     if not facts['orientation']:
-        why = 'no heading topic, and the Imu sends no orientation'
+        why = 'no heading topic, and the IMU publishes no orientation'
     elif facts['yaw_sigma'] is None:
-        why = 'no heading topic, and the orientation of the Imu comes without a covariance'
+        why = 'no heading topic, and the IMU orientation has no covariance'
     elif facts['yaw_sigma'] > config.verdict.max_yaw_sigma:
-        why = (f'the only heading is the orientation of the Imu with a sigma of '
+        why = ('the only heading is the IMU orientation with an uncertainty of '
                f'{math.degrees(facts["yaw_sigma"]):.1f} deg')
     else:
         return []

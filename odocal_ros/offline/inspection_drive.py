@@ -59,19 +59,19 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
     inputs, reasons = screen(leg, config)
     findings += [r for r in reasons if r.code is not Code.NO_FIX or 'fix' in found['mapping']]
     if len(inputs.t_imu) < 3 or len(inputs.travel.t) < 2:
-        findings.append(Reason(Code.CLOCKS_DIFFER, 'Imu, odometer and fixes share no time: their '
-                               'stamps do not overlap'))
+        findings.append(Reason(Code.CLOCKS_DIFFER, 'the stamps of IMU, odometer and fixes do not '
+                               'overlap in time'))
         return []
     base = (first - bag.start_ns) * 1e-9
     options, w_i, f_i = _units(inputs, config, findings)
     drive = survey_drive(inputs, config)
-    way, chord = way_and_chord(drive.t_fix, drive.fixes_n)
+    path_length, chord = way_and_chord(drive.t_fix, drive.fixes_n)
     driven = _driven(inputs, drive)
-    scale = way / driven if way > 50 and driven else drive.scale
+    scale = path_length / driven if path_length > 50 and driven else drive.scale
     # speeds by the scale that is shown
     truer = scale / drive.scale if scale and drive.scale else 1.0
     found['drive'] = {
-        'way': way, 'chord': chord, 'fix_sigma': drive.sigma,
+        'way': path_length, 'chord': chord, 'fix_sigma': drive.sigma,
         'rough_scale': scale, 'scale_unit': inputs.scale_unit,
         'slowest': drive.slowest * truer, 'fastest': drive.fastest * truer,
         'usable_fixes': len(drive.t_fix), 'travel': driven}
@@ -85,7 +85,7 @@ def look(bag: Bag, recorder: LegRecorder, config: Config, found: dict[str, Any],
 
 
 def _driven(inputs: Inputs, drive: Drive) -> float:
-    """Return the travel, to and fro, between the first and the last fix (else all), in units."""
+    """Return the travel between the first and the last fix (else all), in units."""
     t, s = inputs.travel.t, inputs.travel.s
     if len(drive.t_fix) > 1:
         inside = (t > drive.t_fix[0]) & (t < drive.t_fix[-1])
@@ -96,7 +96,7 @@ def _driven(inputs: Inputs, drive: Drive) -> float:
 
 def _units(inputs: Inputs, config: Config,
            findings: list[Reason]) -> tuple[list[str], Floats, Floats]:
-    """Judge the Imu's units; return options for replay, rates in rad/s and forces, frame i."""
+    """Judge the IMU's units; return options for replay, rates in rad/s and forces, frame i."""
     findings += with_axes(
         imu_sanity(inputs.usual_f_b, inputs.w_b, inputs.C_bi, config.imu)[0], inputs)
     w_i, f_i = inputs.w_b, inputs.f_b
@@ -113,7 +113,7 @@ def _units(inputs: Inputs, config: Config,
 
 def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config,
           found: dict[str, Any], findings: list[Reason]) -> list[str]:
-    """Tell how the Imu sits and whether its gyro turns with the course."""
+    """Return the IMU orientation, and whether its gyro turns with the course."""
     m = mounting(inputs.t_imu, w_i, f_i, inputs.travel, drive.scale or 1.0)
     set_already = bool(np.any(config.imu.mounting_rpy))
     agrees = m.C_bi is not None and np.allclose(
@@ -135,7 +135,7 @@ def _axes(inputs: Inputs, w_i: Floats, f_i: Floats, drive: Drive, config: Config
 
 def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: int,
           config: Config, found: dict[str, Any]) -> list[str]:
-    """Tell the legs that replay would take, and better ones where the two-point method needs."""
+    """Return the legs that replay would use, and better ones for the two-point method."""
     if not len(drive.t_fix):
         return []
     base = (first - bag.start_ns) * 1e-9
@@ -143,8 +143,9 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
     def described(start_ns: int, stop_ns: int, **more: bool) -> dict[str, Any]:
         start, stop = (start_ns - first) * 1e-9, (stop_ns - first) * 1e-9
         here = (drive.t_fix >= start) & (drive.t_fix <= stop)
-        way, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here])
-        return {'start': base + start, 'stop': base + stop, 'way': way, 'chord': chord} | more
+        path_length, chord = way_and_chord(drive.t_fix[here], drive.fixes_n[here])
+        return {'start': base + start, 'stop': base + stop, 'way': path_length,
+                'chord': chord} | more
 
     marks = marked_legs(bag)
     stops = stops_of(inputs, first, config)
@@ -168,7 +169,7 @@ def _legs(bag: Bag, recorder: LegRecorder, inputs: Inputs, drive: Drive, first: 
 
 
 def closed(leg: dict[str, Any]) -> bool:
-    """Tell whether a leg ends where it began: by its chord over its way."""
+    """Return True if a leg ends where it starts: ratio of chord to path length."""
     return bool(leg['chord'] < 0.2 * leg['way'])
 
 

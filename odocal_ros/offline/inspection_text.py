@@ -26,7 +26,7 @@ def text(found: dict[str, Any]) -> str:
     blocks = [_head(found), _topics(found, roles)]
     blocks += [_details(topic, roles) for topic in found['topics']
                if 'timing' in topic or 'moves' in topic]
-    blocks += [_drive(found), _findings(found), _way_on(found)]
+    blocks += [_drive(found), _findings(found), _length_text(found)]
     return '\n\n'.join('\n'.join(block) for block in blocks if block)
 
 
@@ -55,11 +55,11 @@ def _short(msgtype: str) -> str:
 
 
 def _details(topic: dict[str, Any], roles: dict[str, str]) -> list[str]:
-    """Return what one input shows, one thought a line."""
+    """Return the description of one input, one statement per line."""
     points = [*_of_imu(topic), *_of_odometer(topic), *_of_fix(topic), *_of_timing(topic)]
     if topic.get('trouble'):
         points.append(topic['trouble'])
-    if topic['name'] not in roles and not any('odd:' in p for p in points):
+    if topic['name'] not in roles and not any('warning:' in p for p in points):
         points = points[:2]      # of topics not used, a look is enough
     return [one_line(topic['name']), *(line for point in points for line in _wrapped(point, 2))]
 
@@ -70,17 +70,18 @@ def _of_imu(topic: dict[str, Any]) -> Iterator[str]:
         return
     unit = imu['force_unit']
     if not imu['gravity']:
-        yield 'no specific force: no accelerometer, or one that is not sent'
+        yield 'no specific force: no accelerometer, or its data is not published'
         yield from _orientation(imu)
         return
-    way = {'+z': 'z-up', '-z': 'looks z-down'}.get(
+    orientation = {'+z': 'z-up', '-z': 'looks z-down'}.get(
         imu['gravity_axis'], 'mounted on its side')
     yield (f'gravity {imu["gravity"]:.3f} {"" if unit == "unknown" else unit} on '
-           f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): {way}')
+           f'{imu["gravity_axis"]} ({math.degrees(imu["tilt_from_axis"]):.1f} deg off): '
+           f'{orientation}')
     if unit != 'm/s^2':
-        yield 'odd: specific force is not in m/s^2' + (' but in g' if unit == 'g' else '')
+        yield 'warning: specific force is not in m/s^2' + (' but in g' if unit == 'g' else '')
     if imu['not_finite']:
-        yield f'odd: {imu["not_finite"]} messages hold NaN or Inf'
+        yield f'warning: {imu["not_finite"]} messages hold NaN or Inf'
     yield from _orientation(imu)
 
 
@@ -89,9 +90,9 @@ def _orientation(imu: dict[str, Any]) -> Iterator[str]:
         yield 'no orientation' + (
             ' (covariance -1)' if imu['orientation_refused'] > 0.5 else ' (never set)')
     elif imu['yaw_sigma'] is None:
-        yield 'orientation filled, its covariance unknown'
+        yield 'has an orientation, covariance unknown'
     else:
-        yield f'orientation filled, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
+        yield f'has an orientation, yaw sigma {math.degrees(imu["yaw_sigma"]):.2f} deg'
 
 
 def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
@@ -101,16 +102,16 @@ def _of_odometer(topic: dict[str, Any]) -> Iterator[str]:
     odometer = topic.get('odometer')
     if not odometer:
         return
-    what = {'cumulative': 'counts on', 'increment': 'counts since the message before',
+    what = {'cumulative': 'counts on', 'increment': 'counts since the previous message',
             'rate': 'speed'}[odometer['quantity']]
     unit = {'m/pulse': 'pulses', 'm/rad': 'rad', '1': 'm'}[odometer['scale_unit']]
     unit += '/s' * (odometer['quantity'] == 'rate')
     if odometer['least'] is None:
-        yield 'odd: no value is a number'
+        yield 'warning: no valid value'
         return
     yield f'{what}: {odometer["least"]:.6g} to {odometer["most"]:.6g} {unit}'
     if odometer['not_finite']:
-        yield f'odd: {odometer["not_finite"]} messages hold NaN or Inf'
+        yield f'warning: {odometer["not_finite"]} messages hold NaN or Inf'
 
 
 def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
@@ -128,9 +129,9 @@ def _of_fix(topic: dict[str, Any]) -> Iterator[str]:
         if fix['sigma'] and fix['covariance_known'] < topic['count'] else ''
     yield f'{status}; {sigma}{partly}'
     if fix['positions'] < topic['count']:
-        yield f'odd: {topic["count"] - fix["positions"]} of them without a position'
+        yield f'warning: {topic["count"] - fix["positions"]} of them without a position'
     if fix['position_step'] and fix['position_step'] > 0.05:
-        yield f'positions come in steps of {fix["position_step"]:.2f} m'
+        yield f'position resolution {fix["position_step"]:.2f} m'
 
 
 def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
@@ -138,20 +139,21 @@ def _of_timing(topic: dict[str, Any]) -> Iterator[str]:
     if not timing:
         return
     if timing['headerless']:
-        yield 'no header: stamped by its arrival (bag time)'
+        yield 'no header: arrival time (bag time) is used as stamp'
     elif abs(timing['header_to_bag']) > 0.5e-3:
         where = 'after' if timing['header_to_bag'] > 0 else 'before'
         yield (f'recorded {abs(timing["header_to_bag"]):.3f} s {where} its header stamp '
                f'(spread {timing["header_to_bag_spread"]:.3f} s)')
     odd = [f'{timing[key]} {what}' for key, what in (
-        ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the stamp before them'),
-        ('backward_steps', 'with an earlier stamp than the one before')) if timing[key]]
+        ('zero_stamps', 'without a stamp'), ('repeated_stamps', 'with the stamp of the previous '
+                                             'message'),
+        ('backward_steps', 'with an earlier stamp than the previous message')) if timing[key]]
     if odd:
-        yield f'odd: {", ".join(odd)} of {topic["count"]} messages'
+        yield f'warning: {", ".join(odd)} of {topic["count"]} messages'
     if timing['gap_count']:
         longest = max(timing['gaps'], key=lambda gap: gap['length'])
-        yield (f'odd: {timing["gap_count"]} gap{"s" * (timing["gap_count"] > 1)}, the longest '
-               f'{longest["length"]:.2f} s at {longest["at"]:.2f} s')
+        yield (f'warning: {timing["gap_count"]} gap{"s" * (timing["gap_count"] > 1)}, the '
+               f'longest {longest["length"]:.2f} s at {longest["at"]:.2f} s')
 
 
 def _drive(found: dict[str, Any]) -> list[str]:
@@ -160,13 +162,14 @@ def _drive(found: dict[str, Any]) -> list[str]:
         return []
     lines = ['drive (seconds from the first message)']
     if drive['usable_fixes']:
-        lines.append(f'  {drive["way"]:.0f} m by the fixes, {drive["chord"]:.0f} m from the first '
-                     f'to the last; {drive["slowest"]:.1f} to {drive["fastest"]:.1f} m/s')
+        lines.append(f'  path length {drive["way"]:.0f} m from the fixes, {drive["chord"]:.0f} m '
+                     f'from first to last; speed {drive["slowest"]:.1f} to '
+                     f'{drive["fastest"]:.1f} m/s')
     if drive['rough_scale'] and drive['scale_unit'] != '1':
         lines.append(f'  about {drive["rough_scale"]:.4g} {drive["scale_unit"]}')
     stops = found['standstills']
     shown = ', '.join(f'{a:.1f} to {b:.1f}' for a, b in stops[:8]) + ', ...' * (len(stops) > 8)
-    lines += _wrapped(f'standstills: {shown} s' if stops else 'standstills: none, never at rest',
+    lines += _wrapped(f'standstills: {shown} s' if stops else 'standstills: none',
                       2)
     lines += _legs(found['legs'])
     if len(found['each_stop']) > 1:
@@ -180,42 +183,43 @@ def _legs(legs: list[dict[str, Any]]) -> list[str]:
     """Return a line for each leg, of many a table."""
     if not legs:
         return []
-    whose = 'marked by the node' if legs[0]['marked'] else 'that replay takes'
-    few = 3    # legs told in a line each
+    whose = 'marked by the node' if legs[0]['marked'] else 'used by replay'
+    few = 3    # legs listed in a line each
     if len(legs) <= few:
         return [f'  leg {whose}: {_leg(leg)}' for leg in legs]
-    return [f'  {len(legs)} legs {whose}, s and m', f'    {"leg":>3}{"from":>10}{"to":>10}'
-            f'{"way":>8}{"start to end":>14}'] + [
+    return [f'  {len(legs)} legs {whose}, s and m', '    '
+            f'{"leg":>3}{"from":>10}{"to":>10}{"length":>8}{"start to end":>14}'] + [
         f'    {i:>3}{leg["start"]:>10.1f}{leg["stop"]:>10.1f}{leg["way"]:>8.0f}'
         f'{leg["chord"]:>14.0f}' for i, leg in enumerate(legs, 1)]
 
 
 def _leg(leg: dict[str, Any]) -> str:
-    return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, way {leg["way"]:.0f} m, '
-            f'start to end {leg["chord"]:.0f} m')
+    return (f'{leg["start"]:.1f} to {leg["stop"]:.1f} s, path length {leg["way"]:.0f} m, start '
+            f'to end {leg["chord"]:.0f} m')
 
 
 def _mounting(mounting: dict[str, Any]) -> list[str]:
     if mounting['rpy'] is None:
-        told = 'gravity and driving do not tell how the Imu sits; set imu.mounting_rpy yourself'
-        return _wrapped(f'axes: {told}', 2)
+        text = ('the IMU orientation cannot be estimated from gravity and driving; set '
+                'imu.mounting_rpy manually')
+        return _wrapped(f'axes: {text}', 2)
     rpy = ', '.join(f'{math.degrees(x):.0f}' for x in mounting['rpy'])
     if mounting['assumed_forward']:
-        how = 'level from gravity; forward is taken as x, the drive does not show it'
+        how = 'level from gravity; the drive does not determine forward, x is assumed'
     else:
         sure = math.degrees(mounting['forward_sigma'])
-        how = (f'forward seen to {sure:.0f} deg (1 sigma) in how the vehicle speeds up and turns, '
-               f'{math.degrees(mounting["off"]):.1f} deg off in all')
-    told = 'imu.mounting_rpy is to be' if mounting['needed'] else 'imu.mounting_rpy is right:'
-    return _wrapped(f'axes: {told} [{rpy}] deg ({how})', 2)
+        how = (f'forward direction from accelerations and turns, uncertainty {sure:.0f} deg (1 '
+               f'sigma); remaining misalignment {math.degrees(mounting["off"]):.1f} deg')
+    text = 'set imu.mounting_rpy to' if mounting['needed'] else 'imu.mounting_rpy is correct:'
+    return _wrapped(f'axes: {text} [{rpy}] deg ({how})', 2)
 
 
 def _findings(found: dict[str, Any]) -> list[str]:
     if not found['findings']:
-        return ['nothing is lacking for a calibration']
+        return ['all data for a calibration is available']
     lines = []
-    for only, title in ((None, 'to know before calibrating'), (
-            'two_point', 'of the two-point method alone (the others do without)')):
+    for only, title in ((None, 'before calibrating'), (
+            'two_point', 'affects the two-point method only')):
         some = [reason for reason in found['findings'] if reason['only'] == only]
         lines += [title] * bool(some)
         for reason in some:
@@ -223,10 +227,10 @@ def _findings(found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _way_on(found: dict[str, Any]) -> list[str]:
+def _length_text(found: dict[str, Any]) -> list[str]:
     lines = []
     if found['open']:
-        lines += _wrapped(f'replay needs help: {found["open"]}', 0)
+        lines += _wrapped(f'replay needs options: {found["open"]}', 0)
     if found['command']:
         lines += ['try', f'  {found["command"]}']
     return lines

@@ -19,7 +19,7 @@ CLOCK = '{desc:<26} {elapsed}'
 
 class Phase:
     """
-    A phase of the work, as a context; called with the share done, if there is one to tell.
+    A phase of the work, as a context; called with the fraction done, if known.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Phase:
     def __enter__(self) -> 'Phase':
         if self._shown:
             from tqdm import tqdm
-            columns, rows = get_terminal_size()     # 80, 24 where the terminal tells none
+            columns, rows = get_terminal_size()     # 80, 24 if the terminal gives none
             self._bar = tqdm(total=1.0, desc=self._title, leave=False, file=sys.stderr,
                              bar_format=CLOCK, mininterval=0.0,
                              ncols=columns, nrows=rows)
@@ -47,7 +47,7 @@ class Phase:
         return self
 
     def __call__(self, share: float | None, title: str = '') -> None:
-        """Tell the share done, None if unknown, and what comes now if it has its own name."""
+        """Set the fraction done, None if unknown, and the name of the next phase if it has one."""
         if self._shown:
             self._bar.bar_format = CLOCK if share is None else BAR
             if title:
@@ -62,6 +62,6 @@ class Phase:
             self._bar.close()
 
     def _tick(self) -> None:
-        tick_s = 0.5    # the clock of a phase goes on while nothing is told
+        tick_s = 0.5    # the clock of a phase runs without reports
         while not self._over.wait(tick_s):
             self._bar.refresh()

@@ -26,39 +26,38 @@ NOISE = {'white': 0.0, 'correlated': 60.0}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add('--scenario', metavar='NAME', help='drive of a scenario: paper, straight, out_and_back or '
-        'town')
-    add('--duration', type=float, metavar='S', help='seconds of the scenario')
-    add('--gpx', metavar='FILE', help='drive of a GPX track (one without times at --speed)')
-    add('--bag', metavar='BAG', help='drive of a recorded bag, with its own fix figures')
-    add('--distance', type=float, metavar='M', help='drive of so many metres, with --speed')
+    add('--scenario', metavar='NAME', help='scenario: paper, straight, out_and_back or town')
+    add('--duration', type=float, metavar='S', help='duration of the scenario, s')
+    add('--gpx', metavar='FILE', help='GPX track (needs --speed if it has no times)')
+    add('--bag', metavar='BAG', help='recorded bag, with its own fix accuracy and rate')
+    add('--distance', type=float, metavar='M', help='length of a drive, m, with --speed')
     add('--speed', type=float, metavar='M/S', help='speed of the drive')
-    add('--standstill', type=float, metavar='S', help='rest before the start and at the end '
-        '(default 30)')
-    add('--turns', type=int, metavar='N', help='turns of 90 deg on the way, left and right by '
-        'turns (default 0)')
+    add('--standstill', type=float, metavar='S', help='standstill at start and end, s (default '
+        '30)')
+    add('--turns', type=int, metavar='N', help='number of 90 deg turns, alternating left and '
+        'right (default 0)')
     add('--acceleration', type=float, default=1.0, metavar='M/S2', help='default 1')
     add('--imu-grade', metavar='GRADE', help='consumer, industrial, tactical or navigation')
     add('--heading-source', metavar='SOURCE', help='auto, gyrocompass, imu_orientation, '
         'heading_topic, course or fixed (default: fixed with --heading-sigma-deg, else auto)')
-    add('--heading-sigma-deg', type=float, metavar='DEG', help='how well the heading is known')
+    add('--heading-sigma-deg', type=float, metavar='DEG', help='uncertainty of the heading')
     add('--fix-sigma', type=float, metavar='M', help='horizontal error of a fix, each axis '
         '(default 1.5)')
-    add('--fix-noise', choices=tuple(NOISE), help='do fix errors stay alike for a minute or '
-        'change from fix to fix (default correlated: what receivers do)')
-    add('--fix-rate', type=float, metavar='HZ', help='fixes a second (default 5)')
+    add('--fix-noise', choices=tuple(NOISE), help='fix errors: correlated (60 s, typical of '
+        'receivers) or white (default correlated)')
+    add('--fix-rate', type=float, metavar='HZ', help='fix rate, Hz (default 5)')
     add('--rtk', action='store_true', help='fixes of 0.02 m')
-    add('--pulse', type=float, metavar='M', help='metres a pulse, for the quantisation (default '
-        '0; of --bag, its own)')
-    add('--sway', type=float, metavar='M/S', help='velocity to the side and up while driving, 1 '
-        'sigma, white at 10 Hz (default 0.05: an ordinary road)')
-    add('--slip-walk', type=float, metavar='M/SQRT(S)', help='slip of the wheels while driving '
-        '(default 0.01)')
-    add('--config', metavar='FILE', help='ROS parameter file, as replay takes it')
+    add('--pulse', type=float, metavar='M', help='metres per pulse, for the quantisation '
+        '(default 0; --bag: from the bag)')
+    add('--sway', type=float, metavar='M/S', help='sideways and vertical velocity while driving, '
+        '1 sigma, white at 10 Hz (default 0.05: ordinary road)')
+    add('--slip-walk', type=float, metavar='M/SQRT(S)', help='wheel slip while driving (default '
+        '0.01)')
+    add('--config', metavar='FILE', help='ROS parameter file, as for replay')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in SLOTS:
-        add(f'--{slot}-topic', metavar='TOPIC', help=f'of --bag, topic of the {slot}')
+        add(f'--{slot}-topic', metavar='TOPIC', help=f'with --bag: topic of the {slot}')
     add('--json', action='store_true', help='print JSON, nothing else')
 
 
@@ -88,8 +87,8 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
         asked['imu.grade'] = args.imu_grade
     if args.heading_sigma_deg is not None:
         if not (math.isfinite(args.heading_sigma_deg) and 0 < args.heading_sigma_deg <= 180):
-            raise BadUsage(f'--heading-sigma-deg {args.heading_sigma_deg:g}: want more than 0, '
-                           'up to 180')
+            raise BadUsage(f'--heading-sigma-deg {args.heading_sigma_deg:g}: required: more than '
+                           '0, up to 180')
         asked['alignment.heading_sigma'] = math.radians(args.heading_sigma_deg)
         asked.setdefault('alignment.heading_source', 'fixed')
     if args.heading_source:
@@ -100,10 +99,10 @@ def _config(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _figures(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the error figures that are asked for."""
+    """Return the requested error parameters."""
     from odocal_ros.library.what_helps import RTK
     if args.rtk and args.fix_sigma is not None:
-        raise BadUsage('--rtk and --fix-sigma both give the error of a fix; give one')
+        raise BadUsage('--rtk and --fix-sigma exclude each other')
     asked = {'fix': RTK if args.rtk else args.fix_sigma, 'fix_rate': args.fix_rate,
              'quantum': args.pulse, 'sway': args.sway, 'slip': args.slip_walk}
     return {name: value for name, value in asked.items() if value is not None}

@@ -35,18 +35,17 @@ def _head(before: Plan, sigmas: Sigmas) -> list[str]:
     two_point, a = before.two_point, before.two_point.alignment
     stands = [f'standing {time_span(s)}' if s else 'in motion' for s in two_point.standing]
     tau = sigmas.correlation_time
-    noise = f'alike for {tau:g} s' if tau else 'white'
+    noise = f'correlation time {tau:g} s' if tau else 'white'
     lines = [f'{length(two_point.distance)} in {time_span(two_point.duration)}, {stands[0]} at '
              f'the start mark, {stands[1]} at the end mark, {length(two_point.chord)} apart',
-             f'Imu {sigmas.config.imu.grade}, heading by {a.heading_source} '
+             f'IMU grade {sigmas.config.imu.grade}, heading from {a.heading_source} '
              f'({math.degrees(a.heading_sigma):.3g} deg), fixes {sigmas.fix:g} m at '
              f'{sigmas.fix_rate:.3g} Hz, {noise}']
     if 'smoother' in before.methods:
         slip, road = 1000 * sigmas.slip, 1000 * sigmas.sway / math.sqrt(SWAY_RATE)
         own = ' needs no heading;' if a.heading_source in ('course', 'gyrocompass') else ''
         white = f'; fixes {100 * WHITE_SHARE:.0f} % white' if tau else ''
-        lines.append(f'smoother:{own} wheels slip {slip:.2g} mm, slide and bounce {road:.2g} mm '
-                     f'in a second{white}')
+        lines.append(f'smoother:{own} wheel slip {slip:.2g} mm/√s, sway {road:.2g} mm/√s{white}')
     return lines
 
 
@@ -55,11 +54,11 @@ def _methods(before: Plan) -> list[str]:
     for name, method in before.methods.items():
         shown = [_shown(p, method.estimates[p].sigma) for p in PARAMETERS]
         lines.append(f'  {name:<20}{shown[0]:>14}{shown[1]:>16}{shown[2]:>16}')
-    return [*lines, f'  (the result: {_result(before)})']
+    return [*lines, f'  (result: {_result(before)})']
 
 
 def _result(before: Plan) -> str:
-    """Say which method will give which value."""
+    """Return the line that names the method of each value."""
     by: dict[str | None, list[str]] = {}
     for parameter in PARAMETERS:
         by.setdefault(before.by(parameter), []).append(WORDS[parameter])
@@ -95,8 +94,8 @@ def _helps(before: Plan, found: list[Change]) -> list[str]:
     lines = []
     for parameter in (SCALE, YAW):
         best, word = ranked(found, before, parameter), WORDS[parameter]
-        lines.append(f'  what would help the {word} most' if best else
-                     f'  nothing tried would help the {word}')
+        lines.append(f'  largest improvements of the {word}' if best else
+                     f'  no tested change improves the {word}')
         lines += [f'    {c.text:<58}{_shown(parameter, before.sigma(parameter)):>10} -> '
                   f'{_shown(parameter, c.sigma(parameter))}' for c in best[:4]]
     return lines

@@ -19,7 +19,7 @@ from textwrap import fill
 from typing import Any, TYPE_CHECKING
 
 from odocal_ros.errors import BadUsage
-from odocal_ros.library.hearer import Hearer
+from odocal_ros.library.listener import Listener
 from odocal_ros.offline.say import say, warn
 from odocal_ros.outside.names import one_line
 
@@ -37,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('bags', nargs='+', metavar='BAG', help='bag folder or file; several: legs of one vehicle')
     add_calibration_arguments(parser)
-    add('--holdout', action='store_true', help='keep the last fifth of each leg back and check '
-        'the correction on it')
+    add('--holdout', action='store_true', help='exclude the last fifth of each leg from the fit '
+        'and check the correction on it')
     add('--output', metavar='DIR', help='folder for the results (default ./odocal_<bag>)')
-    add('--export', metavar='FILES', default='', help='time series beside the results, by commas: '
+    add('--export', metavar='FILES', default='', help='time series files, separated by commas: '
         'trajectory.tum, states.csv, residuals.parquet, track.kml, debug.mcap, drive.rrd ...')
     add('--force', action='store_true', help='replace an existing calibration.json')
     add('--json', action='store_true', help='print calibration.json on stdout, nothing else')
@@ -50,22 +50,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options that say how bags are calibrated, of one vehicle or of a fleet."""
     add = parser.add_argument
-    add('--config', metavar='FILE', help='ROS parameter file, the very YAML the node takes')
+    add('--config', metavar='FILE', help='ROS parameter file, the same YAML as for the node')
     add('--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
         help='any setting by its parameter name; repeatable')
     for slot in SLOTS:
         add(f'--{slot.replace("_", "-")}-topic', metavar='TOPIC', dest=f'{slot}_topic',
-            help=f'topic of the {slot.replace("_", " ")}; found by its type where there is one')
+            help=f'topic of the {slot.replace("_", " ")}; default: the only topic of a fitting '
+            'type')
     add('--leg', action='append', default=[], metavar='A:B',
         help='seconds from the first message (or since 1970), A/B for ISO 8601 dates, or '
         'each-stop; repeatable')
     add('--method', choices=('auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'),
-        help='method whose figures are the result; wheels: another name for smoother')
+        help='method that gives the result; wheels: alias of smoother')
     add('--accept', action='append', default=[], metavar='NAME=LOW:HIGH',
-        help='pass or fail: value plus and minus 2 sigma within limits, as '
-        'yaw_mounting_angle_deg=-0.5:0.5; repeatable; prints a line of JSON a vehicle')
-    add('--strict', action='store_true', help='a caution is not good enough: it exits with 1, '
-        'and does not pass')
+        help='acceptance limits for value plus and minus 2 sigma, such as '
+        'yaw_mounting_angle_deg=-0.5:0.5; repeatable; prints one line of JSON per vehicle')
+    add('--strict', action='store_true', help='a caution exits with 1 and does not pass')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,7 +84,8 @@ def run(args: argparse.Namespace) -> int:
     calibration = calibrate_bag(args.bags, asked_topics(args), config, args.leg,
                                 holdout=args.holdout, hearer=_Screen(args))
     for name, trace in traces(calibration.result.legs):
-        warn(f'odocal: method {name} broke; please report it with {trace_file(trace)}')
+        warn(f'odocal: method {name} failed with an internal error; please report it with '
+             f'{trace_file(trace)}')
     code = _report(calibration, output, args)
     if series:
         exported = calibration.export(*(output / name for name in series))
@@ -92,16 +93,16 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def output_folder(asked: str | None, bag: str, force: bool) -> Path:
+def output_folder(name: str | None, bag: str, force: bool) -> Path:
     """Return the folder for the results; BadUsage if it holds one and ``force`` is false."""
-    output = Path(asked or f'odocal_{one_line(Path(bag).stem)}')
+    output = Path(name or f'odocal_{one_line(Path(bag).stem)}')
     if (output / 'calibration.json').exists() and not force:      # before the work
-        raise BadUsage(f'{output}/calibration.json is there already; give --force to replace it, '
+        raise BadUsage(f'{output}/calibration.json already exists; give --force to replace it, '
                        'or another --output')
     return output
 
 
-class _Screen(Hearer):
+class _Screen(Listener):
     """Shows on the terminal how it goes."""
 
     def __init__(self, args: argparse.Namespace) -> None:
@@ -141,7 +142,7 @@ def asked_topics(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _styled(stream: Any) -> bool:
-    """Tell whether a stream is a terminal that takes colours."""
+    """Return True if a stream is a terminal with colours."""
     return stream.isatty() and 'NO_COLOR' not in os.environ and os.environ.get('TERM') != 'dumb'
 
 
@@ -149,7 +150,7 @@ def _size(stream: Any) -> tuple[int, int | None]:
     """Return the columns, 98 at most, and the rows of a terminal; no rows for what is none."""
     if not stream.isatty():
         return 98, None
-    columns, rows = get_terminal_size()      # 80, 24 where it tells none
+    columns, rows = get_terminal_size()      # 80, 24 if it gives none
     return max(40, min(98, columns)), rows
 
 
@@ -164,14 +165,14 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
         with screen.phase('writing the results'):
             written = results.write(args.force)
         if worse := replacing(old, output):
-            screen.note(f'{output}: a better calibration was replaced, as --force asks: {worse}')
+            screen.note(f'{output}: --force replaced a better calibration: {worse}')
         gone = None if args.quiet or args.json else _show(calibration.result, args)
         with screen.phase('drawing the report'):
             trouble = results.draw()
         if gone:
             raise gone
         if trouble:
-            screen.note(f'{results.report[0]}: not drawn: {trouble}')
+            screen.note(f'{results.report[0]}: could not be drawn: {trouble}')
         if args.json:
             json.dump(calibration.to_dict(), sys.stdout, indent=2)
             say('')
@@ -181,7 +182,7 @@ def _report(calibration: 'Calibration', output: Path, args: argparse.Namespace) 
 
 
 def _exit_code(calibration: 'Combined', config: 'Config', args: argparse.Namespace) -> int:
-    """Return 0 for what is good enough, after telling of limits what there is to tell."""
+    """Return 0 for a good result, after printing the decision on limits."""
     from odocal_ros.offline.cli import OK, REJECTED
     from odocal_ros.output.acceptance import accept_line, accept_words
     from odocal_ros.pipeline.acceptance import accept, Decision
@@ -204,7 +205,7 @@ def _show(calibration: 'Combined', args: Any) -> OSError | None:
     try:
         say(screen(calibration, _styled(sys.stdout), columns, rows and rows - 9))
         if args.holdout:
-            say('\ntrack against fixes: on the last fifth of each leg, held back from the fit')
+            say('\ntrack against fixes: last fifth of each leg, excluded from the fit')
         sys.stdout.flush()
     except OSError as error:
         return error

@@ -10,8 +10,8 @@
 """
 The command ``ros2 odocal``: the command ``odocal`` as an extension of ros2cli.
 
-ros2cli makes an instance of the class that the entry point names and calls the two methods. It is
-not derived from ros2cli's class, so that this room needs no ROS.
+ros2cli creates an instance of the class in the entry point and calls its two methods. The class is
+not derived from the base class of ros2cli, so this module needs no ROS.
 """
 
 import argparse
@@ -26,7 +26,7 @@ class OdocalCommand:
     EXTENSION_POINT_VERSION = '0.1'
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
-        """Declare that all words after the command are odocal's own."""
+        """Declare that all arguments after the command belong to odocal."""
         parser.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND ...',
                             help=f'a command of odocal and its options; {cli_name} COMMAND --help')
         parser.epilog = 'commands:\n' + '\n'.join(

@@ -31,31 +31,31 @@ NUMBERS = {
     'odometer_rate': ('HZ', 'rate of the odometer (default 50)'),
     'fix_rate': ('HZ', 'rate of /fix (default 5)'),
     'heading_rate': ('HZ', 'rate of /heading (default 10)'),
-    'gyro_scale_error': ('X', 'by which the gyro reads too much, relative (default 0)'),
-    'accel_scale_error': ('X', 'by which the accelerometer does (default 0)'),
+    'gyro_scale_error': ('X', 'gyro scale error, relative (default 0)'),
+    'accel_scale_error': ('X', 'accelerometer scale error, relative (default 0)'),
     'scale': ('K', 'true scale factor, m/pulse, m/rad or 1'),
     'nominal_scale': ('K0', 'scale factor as configured'),
     'speed_noise': ('M/S', 'white noise of --odometer speed'),
-    'odometer_delay': ('S', 'seconds by which odometer stamps are late'),
-    'wheel_difference': ('X', 'right scale over left, less 1 (default 0.004)'),
+    'odometer_delay': ('S', 'delay of odometer stamps, s'),
+    'wheel_difference': ('X', 'right scale divided by left scale, minus 1 (default 0.004)'),
     'track_width': ('M', 'distance between the two wheels (default 1.6)'),
     'slip_events': ('N', 'wheel spins per hour of motion'),
     'slip_size': ('M', 'metres lost in each spin (default 0.1)'),
-    'start_slip': ('SHARE', 'share of the way by which a wheel spins after each start'),
-    'start_slip_time': ('S', 'how long after each start (default 5)'),
+    'start_slip': ('SHARE', 'wheel spin after each start, as a fraction of travel'),
+    'start_slip_time': ('S', 'duration of this spin, s (default 5)'),
     'sway': ('M/S', 'sideways and vertical velocity while moving, 1 sigma, white at 10 Hz'),
     'fix_sigma': ('M', 'horizontal error of fixes, 1 sigma; up: twice (default 1.5, rtk 0.02)'),
-    'fix_correlation_time': ('S', 'of --fix-noise correlated (default 60)'),
-    'fix_delay': ('S', 'seconds by which fix stamps are late'),
-    'outliers': ('SHARE', 'share of the fixes that are far off, 0 to 0.5'),
-    'outlier_size': ('M', 'how far off they are (default 20)'),
-    'velocity_sigma': ('M/S', 'the receiver sends its velocity on /fix_velocity, 1 sigma an axis'),
+    'fix_correlation_time': ('S', 'correlation time of --fix-noise correlated (default 60)'),
+    'fix_delay': ('S', 'delay of fix stamps, s'),
+    'outliers': ('SHARE', 'fraction of outliers among the fixes, 0 to 0.5'),
+    'outlier_size': ('M', 'size of outliers (default 20)'),
+    'velocity_sigma': ('M/S', 'publish the GNSS velocity on /fix_velocity; 1 sigma per axis'),
     'velocity_rate': ('HZ', 'rate of /fix_velocity (default 10)'),
-    'velocity_correlation_time': ('S', 'of its errors (default 0: white)'),
-    'velocity_delay': ('S', 'seconds by which its stamps are late'),
-    'velocity_lag': ('S', 'seconds over which the receiver smooths it'),
-    'velocity_scale_error': ('X', 'by which it is too large, relative (default 0)'),
-    'velocity_outliers': ('SHARE', 'share of it that is far off, 0 to 0.5'),
+    'velocity_correlation_time': ('S', 'correlation time of its errors (default 0: white)'),
+    'velocity_delay': ('S', 'delay of its stamps, s'),
+    'velocity_lag': ('S', 'time constant of its smoothing'),
+    'velocity_scale_error': ('X', 'relative scale error; positive: too large (default 0)'),
+    'velocity_outliers': ('SHARE', 'fraction of outliers in it, 0 to 0.5'),
     'height': ('M', 'ellipsoidal height at the start (default 50)'),
 }
 DEGREES = {
@@ -66,8 +66,8 @@ DEGREES = {
     'slope': 'steepest slope of the road (default 0: level)',
     'latitude': 'latitude of the start (default 40)',
     'longitude': 'longitude of the start (default 116)',
-    'orientation_sigma': 'the Imu sends its orientation, with a heading error of this size',
-    'heading_sigma': 'a topic /heading is sent, with an error of this size',
+    'orientation_sigma': 'publish the IMU orientation with a heading error of this size',
+    'heading_sigma': 'publish the topic /heading with an error of this size',
 }
 LEVER_ARMS = ('imu_lever_arm', 'antenna_lever_arm', 'odometer_lever_arm')
 
@@ -78,9 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--scenario', required=True, metavar='NAME',
         help='paper, straight, out_and_back, town, motorway or yard')
     add('--out', required=True, metavar='BAG', help='bag to write; truth.yaml and '
-        'calibrator.yaml go beside it')
-    add('--seed', type=int, metavar='N', help='of all random numbers (default 1); each is '
-        'driven on a day of its own')
+        'calibrator.yaml are written to the same folder')
+    add('--seed', type=int, metavar='N', help='seed of all random numbers (default 1); each seed '
+        'gives another date')
     add('--imu-grade', metavar='GRADE',
         help='consumer, industrial, tactical, navigation or perfect')
     add('--odometer', metavar='KIND', help='counts (Int64, default), speed (TwistStamped) or '
@@ -99,23 +99,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add(_flag(name), type=float, nargs=3, metavar=('X', 'Y', 'Z'),
             help='m forward, left, up of the rear axle')
     add('--mounting-rpy-deg', type=float, nargs=3, metavar=('R', 'P', 'Y'),
-        help='nominal rotation from the Imu frame to forward-left-up')
-    add('--vehicle', choices=('real', 'clean'), help='draw a vehicle by seed and Imu grade: with '
-        'all that real sensors do (docs/zoo.md), or with none of it')
+        help='nominal rotation from the IMU frame to forward-left-up')
+    add('--vehicle', choices=('real', 'clean'), help='random vehicle by seed and IMU grade: real '
+        'has all sensor effects (docs/zoo.md), clean has none')
     add('--effect', action='append', metavar='NAME', dest='effects',
-        help='draw a vehicle with this effect alone; repeatable')
+        help='random vehicle with only this effect; repeatable')
     add('--real', action='append', default=[], metavar='NAME=VALUE', dest='figures',
-        help='a single figure of a real sensor, SI and radians; repeatable')
+        help='one parameter of a real sensor, SI and radians; repeatable')
     add('--known-heading-sigma-deg', type=float, metavar='DEG',
         help='put a heading of this accuracy into calibrator.yaml')
     add('--storage', default='mcap', metavar='KIND', help='mcap (default), sqlite3 or rosbag1')
     add('--compression', default='none', metavar='KIND',
         help='none (default), message, file or storage (mcap chunks)')
-    add('--fleet', type=int, metavar='N', help='so many vehicles of three models instead, with '
-        'tyres changed, Imus moved and counters broken: --out is their folder')
-    add('--bags', type=int, default=10, metavar='N', help='of each vehicle of --fleet, one a week '
-        '(default 10)')
-    add('--force', action='store_true', help='replace the bag and the files beside it')
+    add('--fleet', type=int, metavar='N', help='simulate this number of vehicles of three '
+        'models, with changed tyres, moved IMUs and broken counters; --out is their folder')
+    add('--bags', type=int, default=10, metavar='N', help='bags per vehicle of --fleet, one per '
+        'week (default 10)')
+    add('--force', action='store_true', help='replace the bag and the files written with it')
     add('--quiet', action='store_true', help='print nothing but errors')
 
 
@@ -128,7 +128,8 @@ def _span(text: str) -> tuple[float, float]:
     try:
         return float(begin), float(end)
     except ValueError:
-        raise argparse.ArgumentTypeError(f'{text}: want A:B, two numbers of seconds') from None
+        raise argparse.ArgumentTypeError(f'{text}: required: A:B, two numbers of '
+                                         'seconds') from None
 
 
 def options_of(args: argparse.Namespace) -> 'SimOptions':
@@ -145,7 +146,7 @@ def options_of(args: argparse.Namespace) -> 'SimOptions':
             given[name] = tuple(getattr(args, name))
     # drives of two seeds are two drives, not one time driven twice
     seed = given.get('seed', SimOptions.seed)
-    days = 3650    # then the days of the seeds begin anew
+    days = 3650    # then the days of the seeds repeat
     given['start_ns'] = SimOptions.start_ns + (seed - 1) % days * DAY_NS
     if args.mounting_rpy_deg is not None:
         given['mounting_rpy'] = tuple(math.radians(a) for a in args.mounting_rpy_deg)
@@ -163,10 +164,10 @@ def _with_figures(args: argparse.Namespace, given: dict[str, Any]) -> 'SimOption
     if not (args.vehicle or args.effects):
         return SimOptions(**given, real=Real(**figures))
     if 'odometer' in given:
-        raise BadUsage(f'--odometer {given["odometer"]}: a drawn vehicle has an odometer of its '
-                       'own; leave it away, or take --effect coarse_speed')
+        raise BadUsage(f'--odometer {given["odometer"]}: a random vehicle has its own odometer; '
+                       'omit this option, or use --effect coarse_speed')
     if args.vehicle == 'clean' and args.effects:
-        raise BadUsage('--vehicle clean has no --effect; leave one of them away')
+        raise BadUsage('--vehicle clean excludes --effect; omit one of them')
     effects = () if args.vehicle == 'clean' else args.effects
     seed = given.pop('seed', SimOptions.seed)
     grade = given.pop('imu_grade', DEFAULTS.get(args.scenario, {}).get('imu_grade', 'consumer'))
@@ -181,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
         return simulate_fleet(args, options_of(args))
     known = args.known_heading_sigma_deg
     if known is not None and not 0 <= known <= 180:
-        raise BadUsage(f'--known-heading-sigma-deg {known:g}: want 0 to 180')
+        raise BadUsage(f'--known-heading-sigma-deg {known:g}: required: 0 to 180')
     from odocal_ros.bagio.write import drive_topics
     from odocal_ros.library.simulate import beside, simulate
     from odocal_ros.sim.truth import topic_arguments

@@ -40,10 +40,10 @@ def simulate_fleet(args: argparse.Namespace, options: 'SimOptions') -> int:
     out = Path(args.out)
     most = 100_000    # vehicles
     if not (1 <= args.fleet <= most and 1 <= args.bags <= 1000):
-        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: want 1 to {most} vehicles with '
-                       '1 to 1000 bags each')
+        raise BadUsage(f'--fleet {args.fleet} --bags {args.bags}: required: 1 to {most} vehicles '
+                       'with 1 to 1000 bags each')
     if (out / MANIFEST).exists() and not args.force:
-        raise BadUsage(f'{out / MANIFEST} is there already; give --force to replace the fleet, or '
+        raise BadUsage(f'{out / MANIFEST} already exists; give --force to replace the fleet, or '
                        'another --out')
     vehicles = fleet_of(args.fleet, args.bags, options.seed)
     rows, truth = [], []
@@ -74,7 +74,7 @@ def _bag(args: argparse.Namespace, out: Path, number: int, vehicle: 'FleetVehicl
     config = f'{vehicle.model.name}.yaml'
     if number < len(MODELS) and not bag:      # one of each model
         _yaml(out / config, {'/**/calibrator': {'ros__parameters': settings(drive, None)}},
-              f'What an operator of a {vehicle.model.name} would know.')
+              f'Settings of the operator of a {vehicle.model.name}.')
     return {'vehicle': vehicle.name, 'bag': name, 'config': config, 'model': vehicle.model.name,
             'odometer_km': f'{vehicle.odometer_km[bag]:.1f}'}, drive
 

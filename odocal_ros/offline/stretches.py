@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""How a recording was driven: way, stops, straight stretches."""
+"""Path length, stops and straight sections of a recording."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class Drive:
     """
     A recording seen as a drive.
 
-    scale : m per unit of travel, rough; None where fixes do not tell.
+    scale : m per unit of travel, rough; None if the fixes do not determine it.
     stops : (k, 2) s, begin and end of standstills.
     sigma : m, of a fix, horizontally, as sent.    white : m, what differs from fix to fix.
     t_fix, fixes_n : (n,), (n, 3) s and m, usable fixes, east-north-up about the first.
@@ -70,18 +70,18 @@ def straight_stretches(inputs: Inputs, drive: Drive, shortest: float) -> list[tu
     travel = np.abs(inputs.travel.at(t[None]) - inputs.travel.at(t[:, None]))
     chord = np.hypot(*(p[None] - p[:, None]).transpose(2, 0, 1))
     far = chord >= shortest
-    # the rough scale cuts corners; the straightest stretches tell it best
+    # the rough scale cuts corners; the straightest sections determine it best
     ratio = chord[far] / np.maximum(travel[far], 1e-12)
     best = float(np.percentile(ratio, 95)) if len(ratio) else 0.0
-    way = travel * max(drive.scale, min(best, 1.2 * drive.scale))
-    # chord over way: a stretch at least this straight suits the two-point method
+    path_length = travel * max(drive.scale, min(best, 1.2 * drive.scale))
+    # chord over path length: a section at least this straight suits the two-point method
     straight = 0.97
     # fixes are off by sigma at both ends: what that hides is given, not demanded
-    fit = np.triu((chord >= straight * way - drive.sigma) & (way >= shortest)
-                  & (chord <= way / straight + 4 * drive.sigma))
+    fit = np.triu((chord >= straight * path_length - drive.sigma) & (path_length >= shortest)
+                  & (chord <= path_length / straight + 4 * drive.sigma))
     found: list[tuple[float, float]] = []
     while fit.any():
-        i, j = np.unravel_index(np.argmax(np.where(fit, way, 0)), fit.shape)
+        i, j = np.unravel_index(np.argmax(np.where(fit, path_length, 0)), fit.shape)
         found.append((float(t[i]), float(t[j])))
         fit[:j + 1, i:] = False            # whatever overlaps it
     return found

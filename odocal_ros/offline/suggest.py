@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Which topics a bag's inputs most likely are, and the replay command that says so."""
+"""Most likely topics of the inputs of a bag, and the replay command with these topics."""
 
 
 from odocal_ros.bagio.read import TopicInfo
@@ -21,7 +21,7 @@ COUNTER_WORDS = ('pulse', 'tick', 'encoder', 'odom', 'wheel', 'count')
 
 def likely_mapping(topics: dict[str, TopicInfo], config: Config,
                    overrides: dict[str, str]) -> tuple[dict[str, str], Config]:
-    """Return slot -> topic, the likeliest where several could be meant; and settings it needs."""
+    """Return slot -> most likely topic, and the settings that this mapping needs."""
     chosen = {slot: named(topics, slot, topic) for slot, topic in overrides.items()}
     free = candidates(topics, 'odometer', config, chosen)
     sides = [next((t for t in free if side in t), '') for side in ('left', 'right')]
@@ -35,7 +35,7 @@ def likely_mapping(topics: dict[str, TopicInfo], config: Config,
 
 
 def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
-    """Sort the likelier topic first: the usual name, counters before speeds, more messages."""
+    """Return a sort key: counters before speeds, usual names, more messages first."""
     usual = {'imu': 'imu/data', 'fix': '/fix', 'odometer': '/odometer'}.get(slot, slot)
     kinds = [i for i, part in enumerate(('Int', 'JointState', '')) if part in info.msgtype]
     worded = any(word in info.name.lower() for word in COUNTER_WORDS)
@@ -43,27 +43,27 @@ def _rank(slot: str, info: TopicInfo) -> tuple[int | str, ...]:
             not worded if 'odometer' in slot else 0, -info.count, info.name)
 
 
-# why a topic is before another, by the first element of their ranks that differs
-WHY = ('it counts, where others send speeds', 'it has the usual name',
-       'it is named like an odometer', 'it has the most messages', 'it is the first by name')
+# reasons for a topic, by the first element of the ranks that differs
+WHY = ('it is a counter, other candidates are speeds', 'it has the usual name',
+       'its name is that of an odometer', 'it has the most messages', 'it is the first by name')
 
 
 def others(topics: dict[str, TopicInfo], slot: str, config: Config,
            mapping: dict[str, str]) -> list[str]:
-    """Return the topics that could be a slot's beside the one in ``mapping``, likeliest first."""
+    """Return the other candidates for a slot, the most likely first."""
     taken = {s: t for s, t in mapping.items() if s != slot}
     return sorted(set(candidates(topics, slot, config, taken)) - {mapping[slot]},
                   key=lambda name: _rank(slot, topics[name]))
 
 
 def why_before(topics: dict[str, TopicInfo], slot: str, topic: str, other: str) -> str:
-    """Return why ``topic`` is suggested for a slot and not ``other``."""
+    """Return the reason for suggesting ``topic`` for a slot instead of ``other``."""
     pairs = zip(_rank(slot, topics[topic]), _rank(slot, topics[other]), strict=True)
     return next(why for why, (own, its) in zip(WHY, pairs, strict=True) if own != its)
 
 
 def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str]) -> str:
-    """Return what replay would say without options: which topics it cannot choose; '' if none."""
+    """Return the topics that replay cannot choose without options; '' if none."""
     try:
         choose_topics(topics, config, overrides)
     except BadUsage as error:
@@ -73,7 +73,7 @@ def left_open(topics: dict[str, TopicInfo], config: Config, overrides: dict[str,
 
 def command(path: str, topics: dict[str, TopicInfo], config: Config, overrides: dict[str, str],
             mapping: dict[str, str], extra: list[str]) -> str:
-    """Return the replay that the findings suggest; '' where an input is missing."""
+    """Return the suggested replay command; '' if an input is missing."""
     if not {'imu', 'odometer', 'fix'} <= mapping.keys():
         return ''
     words = ['odocal', 'replay', path]

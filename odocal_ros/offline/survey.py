@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the samples of a topic tell about themselves: timing, units, quality; plain numbers."""
+"""Timing, units and quality of the samples of a topic, as plain numbers."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ def timing(samples: FixSamples | ImuSamples | OdometerSamples, start_ns: int,
 
 
 def imu(samples: ImuSamples) -> dict[str, Any]:
-    """Return what an Imu topic shows of gravity, units and orientation."""
+    """Return gravity, units and orientation of an IMU topic."""
     samples = oriented(samples)
     f_i = samples.f_i[~beyond('f_i', samples.f_i)]
     w_i = samples.w_i[~beyond('w_i', samples.w_i)]
@@ -84,7 +84,7 @@ def imu(samples: ImuSamples) -> dict[str, Any]:
 
 
 def odometer(samples: OdometerSamples, form: OdometerForm) -> dict[str, Any]:
-    """Return what an odometer topic counts."""
+    """Return the values that an odometer topic counts."""
     finite = samples.value[~beyond('value', samples.value)]
     return {'quantity': form.quantity, 'scale_unit': form.scale_unit, 'modulus': form.modulus,
             'first': _number(finite[:1]), 'last': _number(finite[-1:]),

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""odocal try: inspect a bag, replay it as inspect suggests, open the report."""
+"""odocal try: inspect a bag, replay it with the suggested options, open the report."""
 
 import argparse
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ LABELS = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odomete
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options: those of replay that say how to calibrate, and --no-browser."""
+    """Declare the options: the calibration options of replay, and --no-browser."""
     add = parser.add_argument
     add('bag', metavar='BAG', help='bag folder or file')
     replay.add_calibration_arguments(parser)
@@ -48,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
     if not found['command']:
         from odocal_ros.offline.inspection_text import text
         say(text(found))
-        raise BadData(f'{args.bag}: {_missing(found)}; for a topic of another type give its '
-                      'option, such as --odometer-topic TOPIC')
+        raise BadData(f'{args.bag}: {_missing(found)}; if a topic has another type, select it '
+                      'with its option, such as --odometer-topic TOPIC')
     options = [*_suggested(found['command'], bool(args.leg)), *_own_options(args)]
-    say('\n'.join(_told(found, choices, options)))
+    say('\n'.join(_overview(found, choices, options)))
     parser = argparse.ArgumentParser()
     replay.add_arguments(parser)
     code = replay.run(parser.parse_args([args.bag, *options] + ['--force'] * args.force))
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class _Choice:
-    """A topic that was taken where several could be meant."""
+    """The selected topic of a slot with several candidates."""
 
     slot: str
     topic: str
@@ -71,14 +71,14 @@ class _Choice:
     why: str
 
     def words(self) -> str:
-        """Return the choice as a line for people."""
+        """Return the choice as a printed line."""
         from odocal_ros.library.topics import OPTION
         return (f'{LABELS[self.slot]}: {self.topic}, because {self.why}; other candidates: '
                 f'{", ".join(self.others)} ({OPTION[self.slot]})')
 
 
 def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
-    """Return what inspect finds with the topics chosen, and the choices."""
+    """Return the result of inspect with the selected topics, and the choices."""
     from odocal_ros.bagio.read import open_bag
     from odocal_ros.offline.inspection import inspect
     from odocal_ros.settings.config import Config, with_settings
@@ -93,7 +93,7 @@ def _look(args: argparse.Namespace) -> tuple[dict[str, Any], list[_Choice]]:
 
 
 def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str]) -> list[_Choice]:
-    """Return the likeliest topic of each slot that has several candidates."""
+    """Return the most likely topic of each slot with several candidates."""
     from odocal_ros.offline.suggest import likely_mapping, others, why_before
     mapping, config = likely_mapping(bag.topics, config, topics)
     found = []
@@ -105,9 +105,9 @@ def _choices(bag: 'Bag', config: 'Config', topics: dict[str, str]) -> list[_Choi
 
 
 def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
-    """Return the choice of a person at the terminal; an empty line takes the first."""
+    """Return the choice of the user at the terminal; an empty line selects the first."""
     names = [choice.topic, *choice.others]
-    say(f'{len(names)} topics could be the {LABELS[choice.slot]}:')
+    say(f'{len(names)} candidate topics for the {LABELS[choice.slot]}:')
     for number, name in enumerate(names, 1):
         info = bag.topics[name]
         say(f'  {number}  {name}  {info.msgtype}, {info.count} messages')
@@ -122,7 +122,7 @@ def _asked(bag: 'Bag', choice: _Choice) -> _Choice:
             return choice
         if answer.isdecimal() and 1 < int(answer) <= len(names):
             names.insert(0, names.pop(int(answer) - 1))
-            return _Choice(choice.slot, names[0], names[1:], 'you chose it')
+            return _Choice(choice.slot, names[0], names[1:], 'you selected it')
         say(f'enter a number from 1 to {len(names)}')
 
 
@@ -132,14 +132,14 @@ def _missing(found: dict[str, Any]) -> str:
 
 
 def _suggested(command: str, without_legs: bool) -> list[str]:
-    """Return the options of the replay that inspect suggests, each followed by its value."""
+    """Return the replay options that inspect suggests, each followed by its value."""
     words = shlex.split(command)[3:]
     pairs = zip(words[::2], words[1::2], strict=True)
     return [word for pair in pairs if not (without_legs and pair[0] == '--leg') for word in pair]
 
 
 def _own_options(args: argparse.Namespace) -> list[str]:
-    """Return the options of the user that inspect does not repeat in its suggestion."""
+    """Return the options given by the user that are not part of the suggestion."""
     words = []
     for option, given in (('--config', [args.config]), ('--set', args.settings),
                           ('--leg', args.leg), ('--method', [args.method]),
@@ -149,8 +149,8 @@ def _own_options(args: argparse.Namespace) -> list[str]:
     return words + ['--strict'] * args.strict
 
 
-def _told(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> list[str]:
-    """Return what was chosen and why, as lines for people."""
+def _overview(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> list[str]:
+    """Return the selected topics, settings and legs with reasons, as printed lines."""
     from odocal_ros.settings.config import SETTINGS
     chosen = {choice.slot: choice.words() for choice in choices}
     lines = ['topics']
@@ -170,13 +170,13 @@ def _told(found: dict[str, Any], choices: list[_Choice], options: list[str]) -> 
 
 
 def _why_mounting(mounting: dict[str, Any] | None) -> str:
-    """Return how the axes of the IMU were found; '' where they were not."""
+    """Return the source of the IMU orientation; '' if it is not estimated."""
     if not mounting or not mounting['needed']:
         return ''
     if mounting['assumed_forward']:
-        return 'up is known from gravity; x is assumed to be forward'
-    return ('up is known from gravity, forward from accelerations and turns, '
-            f'to {math.degrees(mounting["forward_sigma"]):.0f} deg (1 sigma)')
+        return 'up is measured from gravity; x is assumed to be forward'
+    return ('up is measured from gravity, forward from accelerations and turns '
+            f'(1 sigma: {math.degrees(mounting["forward_sigma"]):.0f} deg)')
 
 
 def _wrapped(line: str) -> list[str]:
@@ -186,12 +186,12 @@ def _wrapped(line: str) -> list[str]:
 
 
 def _open(report: Path, never: bool) -> None:
-    """Show the report in a browser, where there is a display."""
+    """Show the report in a browser if there is a display."""
     import webbrowser
     if never or not report.exists():
         return
-    # without one, a text browser would take over the terminal
+    # without a display, a text browser would take over the terminal
     display = sys.platform != 'linux' or any(
         os.environ.get(name) for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'))
     if not (display and webbrowser.open(report.resolve().as_uri())):
-        say(f'no browser could be started: open {report.resolve()}')
+        say(f'no browser can be started; open {report.resolve()}')

@@ -50,7 +50,7 @@ class Values:
 
     def facts(self, imu: tuple[Ints, Floats] | None = None) -> list[dict[str, Any]]:
         """
-        Return what each value of the most frequent list does.
+        Return the motion of each value of the most frequent list.
 
         imu : (t_ns, rate), stamps and the turn rate to the left, rad/s; None where there is none.
         """
@@ -66,15 +66,15 @@ class Values:
             return []
         t = (stamp_ns - stamp_ns[0]) * 1e-9
         s = _travelled(t, value, field)
-        way, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
+        path_length, span = np.abs(np.diff(s, axis=0)).sum(axis=0), np.ptp(s, axis=0)
         turns = 4 * np.pi    # rad, range of an angle from which on it turns without bound
-        alike = 0.3    # of the largest way: what a wheel of the same vehicle rolls at least
+        alike = 0.3    # of the largest travel: minimum travel of a wheel of the same vehicle
         rolls = (span > (turns if self.msgtype == JOINTS else 0)) & (span > alike * span.max())
         sides = _sides(t, s, rolls, imu and ((imu[0] - stamp_ns[0]) * 1e-9, imu[1]))
         unit = 'rad' if self.msgtype == JOINTS else 'counts'
         return [{'key': key, 'field': field, 'unit': unit, 'way': float(w), 'span': float(d),
                  'rolls': bool(r), 'side': side}
-                for key, w, d, r, side in zip(keys, way, span, rolls, sides, strict=True)]
+                for key, w, d, r, side in zip(keys, path_length, span, rolls, sides, strict=True)]
 
 
 def _travelled(t: Floats, value: Floats, field: str) -> Floats:
@@ -90,10 +90,10 @@ def _travelled(t: Floats, value: Floats, field: str) -> Floats:
 
 def _sides(t: Floats, s: Floats, rolls: Bools,
            imu: tuple[Floats, Floats] | None) -> list[str]:
-    """Return 'left' or 'right' of each wheel that the gyro tells: the outer one runs farther."""
+    """Return 'left' or 'right' of each wheel that matches the gyro: the outer travels farther."""
     k = len(rolls)
     none = [''] * k
-    cell = 0.5    # s, in which sides are told by the gyro
+    cell = 0.5    # s, cells in which the gyro determines the sides
     # by damaged stamps a recording may last for years
     grid = np.arange(t[0], t[-1], cell) if t[-1] - t[0] < MOST_DAYS * 86400 else np.empty(0)
     if imu is None or rolls.sum() < 2 or len(grid) < 10 or len(imu[0]) < 3:
@@ -106,17 +106,17 @@ def _sides(t: Floats, s: Floats, rolls: Bools,
     with np.errstate(invalid='ignore', divide='ignore'):
         step = step / scale
     others = step[rolls].mean(axis=0)
-    clear = 0.5    # correlation with the gyro from which on a side is told
+    clear = 0.5    # limit of the correlation with the gyro for a side
     for j in np.flatnonzero(rolls):
         more = step[j] - others
         power = float(np.sqrt((more @ more) * (turn @ turn)))
-        told = float(more @ turn) / power if power else 0.0
-        none[j] = 'right' if told > clear else 'left' if told < -clear else ''
+        correlation = float(more @ turn) / power if power else 0.0
+        none[j] = 'right' if correlation > clear else 'left' if correlation < -clear else ''
     return none
 
 
 def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Return the settings for the two wheels that data tell; none where they do not."""
+    """Return the settings for the two wheels found in the data; none otherwise."""
     sides = {side: [f['key'] for f in facts if f['side'] == side] for side in ('left', 'right')}
     if [len(keys) for keys in sides.values()] != [1, 1]:
         return ()
@@ -124,9 +124,10 @@ def suggested(facts: list[dict[str, Any]]) -> tuple[str, ...]:
 
 
 def in_words(facts: list[dict[str, Any]]) -> list[str]:
-    """Return what each value does, for people, a line each."""
+    """Return the motion of each value, for people, one line each."""
     def one(f: dict[str, Any]) -> str:
-        side = f', the {f["side"]} wheel by the gyro' if f['side'] else ''
-        kind = f'a wheel by its way{side}' if f['rolls'] else 'no wheel'
-        return f'{f["key"]} moves {f["way"]:.6g} {f["unit"]} in a range of {f["span"]:.6g}: {kind}'
+        side = f'; {f["side"]} side (matches gyro)' if f['side'] else ''
+        kind = f'a wheel{side}' if f['rolls'] else 'no wheel'
+        return (f'{f["key"]} travels {f["way"]:.6g} {f["unit"]} within a range of '
+                f'{f["span"]:.6g}: {kind}')
     return [one(f) for f in facts]

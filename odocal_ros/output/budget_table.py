@@ -17,7 +17,8 @@ from odocal_ros.calib.result import MethodResult
 from odocal_ros.output.figures import two_digits
 
 COLUMNS = ('scale_factor', 'yaw_mounting_angle', 'pitch_mounting_angle')
-LABELS = {'legs': "the legs' own errors"}
+LABELS = {'legs': 'errors of single legs', 'gyro_by_force': 'gyro g-sensitivity',
+          'slow_fix_errors': 'correlated fix errors', 'body_lean': 'body roll and pitch'}
 HEAD = ('scale, ppm', 'yaw, deg', 'pitch, deg')
 NAME, WIDTHS = 24, (13, 15, 15)      # judgement: with 'shared' within 80 columns
 
@@ -30,6 +31,11 @@ def largest_source(method: MethodResult | None, name: str) -> tuple[str, float]:
     parts = {s.name: float((s.effects[row]**2).sum()) for s in method.sources}
     largest, whole = max(parts, key=lambda source: parts[source], default=''), sum(parts.values())
     return (largest, parts[largest] / whole) if whole else ('', 0.0)
+
+
+def source_label(name: str) -> str:
+    """Return the printed name of an error source."""
+    return LABELS.get(name, name.replace('_', ' '))
 
 
 def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: float,
@@ -66,16 +72,16 @@ def budget_lines(table: dict[str, dict[str, Any]] | None, scale: float, shown: f
         shares = [row.get(p, 0.0)**2 / whole if whole and p not in hidden else 0.0
                   for p, whole in zip(COLUMNS, wholes, strict=True)]
         if max(shares) < shown:
-            small.append(name)
+            small.append(source_label(name))
             continue
         cells = ['-' if share < shown else
                  f'{two_digits(row[p] * factor.get(p, math.degrees(1.0)))} {share:>4.0%}'
                  for p, share in zip(COLUMNS, shares, strict=True)]
-        lines.append(f'  {LABELS.get(name, name).replace("_", " "):<{NAME}}' + ''.join(
+        lines.append(f'  {source_label(name):<{NAME}}' + ''.join(
             f'{cell:>{columns}}' for cell, columns in zip(cells, WIDTHS, strict=True))
             + (shared if row.get('shared') else ''))
     if not (small and small_too):
         return lines
     rest = f'under {shown:.1%}: '.replace('.0%', '%').replace('%', ' %') + ', '.join(small)
-    return lines + textwrap.wrap(rest.replace('_', ' '), width - 2, initial_indent='  ',
+    return lines + textwrap.wrap(rest, width - 2, initial_indent='  ',
                                  subsequent_indent='    ')

@@ -40,11 +40,12 @@ def controllers(calibration: Calibration, config: Config,
     if not blocks:
         return {}
     lines = [head(calibration, content).rstrip(),
-             '# for ros2_controllers: take the block of your controller into its parameter file,',
-             '# under the name that your controller has there; the wheel calibrated must be one',
-             '# that the controller drives. The multipliers are against odometer.nominal_scale:',
-             '# with others in force during the drive, multiply those by these.',
-             '# Older releases name the radius rear_wheels_radius or rear_wheel_radius.']
+             '# for ros2_controllers: copy the block of your controller into its parameter file,',
+             '# under the name of your controller; the calibrated wheel must be one',
+             '# that the controller drives. The multipliers are relative to '
+             'odometer.nominal_scale:',
+             '# if other multipliers were active during the drive, multiply them by these.',
+             '# Older releases call the radius rear_wheels_radius or rear_wheel_radius.']
     text = '\n'.join(lines) + '\n'
     return {CONTROLLERS: text + ''.join(parameters(v, name) for name, v in blocks.items())}
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What positioning systems with a wheel input want to be told of the wheel."""
+"""Wheel settings for positioning systems with a wheel input."""
 
 import textwrap
 from typing import Any
@@ -31,7 +31,7 @@ def devices(calibration: Calibration, config: Config, content: dict[str, Any]) -
     lines = [head(calibration, content).rstrip(),
              '# for receivers and inertial systems that count the wheel themselves; the pulse is '
              'that of the',
-             '# counter calibrated: a device that counts other edges wants a multiple',
+             '# counter calibrated: a device that counts other edges needs a multiple',
              f'# one pulse: {micrometres} um; {inverse(scale)}']
     for where, setting in _settings(scale.value, config.wheels.pulses_per_revolution):
         lines += ['', *textwrap.wrap(where, 98, initial_indent='# ', subsequent_indent='# ')]
@@ -55,5 +55,5 @@ def _settings(scale: float, pulses: float) -> list[tuple[str, str]]:
         ('OxTS, NAVconfig, advanced tools, tab Wheel speed input: pulses per metre',
          f'Pulses per metre = {per_metre}'),
         ('NovAtel SPAN, firmware up to 7.06: ticks per revolution, circumference m, spacing of '
-         'ticks m. Later firmware (DMICONFIG) is told no size and finds it itself.'
+         'ticks m. Later firmware (DMICONFIG) takes no size; it estimates it.'
          + ('' if wheel else ' Needs a whole number in wheels.pulses_per_revolution.'), wheel)]

@@ -71,7 +71,7 @@ def as_json(calibration: Calibration, config: Config, inputs: list[dict[str, Any
         left['acceptance'] = acceptance.as_dict()
     if calibration.carried:
         from odocal_ros.calib.smoother.state import ACCEL, CONSTANTS, GYRO
-        imu_keeps = 0.1    # of what is believed of them: by how much warmth and time change them
+        imu_keeps = 0.1    # of their prior: changes by temperature and time
         left['imu'] = calibration.carried.only(
             (*CONSTANTS[GYRO], *CONSTANTS[ACCEL]), imu_keeps).as_dict()
         if config.leg.automatic:
@@ -144,7 +144,7 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
     """
     Write the result files and return their paths, calibration.json first, the report last.
 
-    ``tell`` is given a sentence when the report cannot be drawn.
+    ``tell`` receives a sentence if the report cannot be drawn.
 
     Raises
     ------
@@ -158,13 +158,13 @@ def write_results(calibration: Calibration, config: Config, directory: Path,
     with results.said_when_interrupted():
         written = results.write(force)
         if why := results.draw():
-            tell(f'{results.report[0]}: not drawn: {why}')
+            tell(f'{results.report[0]}: could not be drawn: {why}')
     return written + results.report
 
 
 class Results:
     """
-    The files of a calibration on their way to a folder, which is exchanged as a whole.
+    The files of a calibration to be written to a folder, which is replaced as a whole.
 
     The report takes seconds to draw: it is added, and the numbers do not wait for it.
     """
@@ -187,7 +187,7 @@ class Results:
         return [self.directory / name for name in texts]
 
     def draw(self) -> str:
-        """Add the report, if one is asked for; return why it cannot be drawn."""
+        """Add the report, if requested; return why it cannot be drawn."""
         if not self.has_report:
             return ''
         page, why = report_or_why(*self._of)

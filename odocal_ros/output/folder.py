@@ -8,10 +8,10 @@
 # the License.
 
 """
-A result folder: exchanged as a whole, so that it never holds parts of two calibrations.
+A result folder: replaced as a whole, so that it never mixes two calibrations.
 
 Files are written into a sibling, and one rename puts it in the place of the folder. Where that
-cannot be (a mount, a folder that holds other things too), files are exchanged one by one, the
+cannot be (a mount, a folder that holds other things too), files are replaced one by one, the
 main file taken away first and put there last: it vouches for the others.
 """
 
@@ -48,7 +48,7 @@ class ResultFolder:
 
     @property
     def written(self) -> bool:
-        """Return whether what stands there is what was put there."""
+        """Return True if the content of the folder is unchanged since it was written."""
         with suppress(OSError):
             return self._main_file == _which(self.place / self._main)
         return False
@@ -119,7 +119,7 @@ class ResultFolder:
                            'or --force to replace it')
 
     def _exchangeable(self) -> bool:
-        """Return whether the folder is ours alone, and nobody of this process is in it."""
+        """Return True if the folder is private and unused by this process."""
         if not self.place.is_dir():
             return True
         return self.place != Path.cwd() and all(
@@ -153,7 +153,7 @@ def _which(path: Path) -> tuple[int, int]:
 
 
 def _swap(one: Path, other: Path) -> None:
-    """Exchange two folders in one step where the system can, else in two."""
+    """Swap two folders in one step if the system can, else in two."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
     names = [os.fsencode(path) for path in (one, other)]
     if rename is not None:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The Imu's frame in the files for TF: as set, else as its messages say, where ROS takes that."""
+"""The IMU's frame in the files for TF: as set, else as its messages say, where ROS takes that."""
 
 from dataclasses import replace
 
@@ -21,16 +21,16 @@ IMU_FRAME = 'imu_link'      # REP-145, where nobody names one
 
 def framed(calibration: Calibration, config: Config, frame: str) -> tuple[Calibration, Config]:
     """
-    Return both with the Imu's frame in force.
+    Return both with the IMU's frame in force.
 
-    frame : of the Imu's headers, as somebody sent it; a note tells where it is not taken.
+    frame : of the IMU's headers, as somebody sent it; a note says if it is not used.
     """
     if config.frames.imu or not frame:
         return calibration, config
     taken = frame.lstrip('/')       # as ROS 1 wrote it
     taken = taken if is_frame(taken) else IMU_FRAME
     if taken != frame:
-        note = Reason(Code.FRAME_REPLACED, f"the Imu's messages name the frame "
-                      f"'{one_line(frame[:60])}', which TF does not take; {taken} is written")
+        note = Reason(Code.FRAME_REPLACED, 'the frame of the IMU messages, '
+                      f"'{one_line(frame[:60])}', is not valid in TF; {taken} is written")
         calibration = replace(calibration, reasons=(*calibration.reasons, note))
     return calibration, with_settings(config, {'frames.imu': taken})

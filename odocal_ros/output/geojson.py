@@ -27,8 +27,8 @@ from odocal_ros.settings.config import Config
 TRACK = 'track.geojson'
 MOST = 5000          # judgement: points of a feature: maps draw no more
 ABOUT = ('For QGIS, Foxglove, geojson.io and other maps. corrected: dead reckoning with the '
-         'values found; as_configured: with the values before; fixes: of the receiver; both '
-         'tracks begin at the start mark')
+         'calibrated values; as_configured: with the previous values; fixes: of the receiver; '
+         'both tracks start at the start mark')
 PLACES = 8     # judgement: 1e-8 deg: 1 mm
 
 

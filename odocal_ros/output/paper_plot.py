@@ -17,7 +17,7 @@ import numpy as np
 from odocal_ros.output.pictures import new_figure, save_figure
 from odocal_ros.paper.tables import PaperTables
 
-# Okabe and Ito's colours, told apart by colour-blind eyes too
+# Okabe and Ito's colours, distinguishable with colour blindness
 STYLES = {'phi_U0': ('#0072B2', '-'), 'all': ('#000000', '--'), 'eps_z': ('#D55E00', '-'),
           'phi_E0': ('#009E73', '-'), 'phi_N0': ('#CC79A7', '-'), 'eps_x': ('#E69F00', '-'),
           'eps_y': ('#56B4E9', '--')}
@@ -45,8 +45,8 @@ def draw(tables: PaperTables, path: Path) -> None:
     upper, lower = right.subplots(2, 1, sharex=True)
     _growth(upper, lower, tables)
     figure.legend(*upper.get_legend_handles_labels(), loc='outside lower center', ncols=4,
-                  frameon=False, fontsize=9, title='Source of error, and the yaw error that the '
-                  'pipeline ends with (estimate - truth)', title_fontsize=9)
+                  frameon=False, fontsize=9, title='Error source and final yaw error of the '
+                  'pipeline (estimate - truth)', title_fontsize=9)
     save_figure(figure, path)
 
 
@@ -86,8 +86,8 @@ def _growth(upper: Any, lower: Any, tables: PaperTables) -> None:
     upper.annotate('gyro noise of the whole drive, 1 σ', (395, tables.noise_deg * 1.15),
                    fontsize=8, color='0.35')
     upper.set(yscale='log', ylabel='yaw error, deg', ylim=(1e-7, 0.3),
-              title='Yaw mounting error, were the leg to end then '
-                    '(lines: error model, dots: pipeline)')
+              title='Yaw mounting error if the leg ended at this time (lines: error model, dots: '
+              'pipeline)')
     lower.set(yscale='log', ylabel='across the track, m', xlabel='time since the standstill, s',
               ylim=(1e-5, 30), title='Position error of dead reckoning', xlim=(0, 640))
     for axes in (upper, lower):

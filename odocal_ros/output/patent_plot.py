@@ -38,7 +38,7 @@ def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
     levels = (np.arange(LEVELS[0]) - LEVELS[0] // 2) * RADIUS_STEP * mm
     mesh = axes.pcolormesh(levels, levels, table.grid.T, shading='nearest', cmap='viridis',
                            norm='log')
-    figure.colorbar(mesh, ax=axes, label='mean distance of track and fixes, m')
+    figure.colorbar(mesh, ax=axes, label='mean distance between track and fixes, m')
     edge, beyond = 1.2 * levels[-1], []
     for name, (marker, colour) in MARKS.items():
         rows = [r for r in table.rows if r.name.startswith(name) and (
@@ -52,7 +52,7 @@ def _valley(figure: Any, axes: Any, table: Embodiment) -> None:
     axes.set(title='All 441 combinations', xlabel='left radius error, mm', aspect='equal',
              ylabel='right radius error, mm', xlim=(-edge, edge), ylim=(-edge, edge))
     if beyond:
-        axes.text(0.02, 0.02, f'beyond the picture: {", ".join(beyond)}', fontsize=8,
+        axes.text(0.02, 0.02, f'outside the plot: {", ".join(beyond)}', fontsize=8,
                   transform=axes.transAxes)
     figure.legend(*axes.get_legend_handles_labels(), loc='outside lower left', ncols=6,
                   facecolor='0.75', fontsize=9)
@@ -66,7 +66,8 @@ def _lines(axes: Any, table: Embodiment) -> None:
     for what, colour in (('max', '#56B4E9'), ('mean', '#0072B2')):
         axes.barh(at, [row.criteria[what] for row in table.rows], color=colour,
                   height=0.8 if what == 'max' else 0.45, label=what)
-    axes.set(xscale='log', xlabel='distance of track and fixes, m', title='Each line of the table')
+    axes.set(xscale='log', xlabel='distance between track and fixes, m',
+             title='Each line of the table')
     axes.set_yticks(at, names, fontsize=9)
     axes.invert_yaxis()
     axes.grid(axis='x', color='0.88', linewidth=0.6)

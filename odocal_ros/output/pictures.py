@@ -21,11 +21,11 @@ PICTURES = ('.png', '.svg', '.pdf')
 def check_picture(path: Path) -> None:
     """Refuse before computing what could not be drawn after it."""
     if path.suffix.lower() not in PICTURES:
-        raise BadUsage(f'--plot {path}: want a name that ends in {", ".join(PICTURES)}')
+        raise BadUsage(f'--plot {path}: required: a name that ends in {", ".join(PICTURES)}')
     if not path.parent.is_dir():
-        raise BadUsage(f'--plot {path}: there is no folder {path.parent}; make it first')
+        raise BadUsage(f'--plot {path}: no folder {path.parent}; create it first')
     if path.is_dir():
-        raise BadUsage(f'--plot {path}: is a folder, want a file')
+        raise BadUsage(f'--plot {path}: is a folder; required: a file')
     from importlib.util import find_spec
     if find_spec('matplotlib') is None:
         raise BadUsage('--plot needs matplotlib: pip install matplotlib (or apt install '

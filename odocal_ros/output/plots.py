@@ -34,7 +34,7 @@ from odocal_ros.output.plots_svg import (
     thinned,
 )
 
-PAUSE = {'no fix used': PINK, 'no Imu': RED, 'no odometer': GREEN}
+PAUSE = {'no fix used': PINK, 'no IMU': RED, 'no odometer': GREEN}
 STATUS = {-1: ('no fix (-1)', 'x', GREY), 0: ('fix (0)', 'o', BLUE),
           1: ('satellite based aid, SBAS (1)', 's', GREEN),
           2: ('ground based aid, GBAS or RTK (2)', '^', PINK)}
@@ -110,8 +110,8 @@ def _track(found: Evidence, name: str, before_word: str,
     figure, (ax,) = sheet(5.2)
     draw_track(ax, found, before_word, slips)
     key(figure, ax)
-    says = ('Dead reckoning over the fixes. Both tracks begin at the start mark; the line as '
-            'calibrated should cover the fixes.')
+    says = ('Dead reckoning over the fixes. Both tracks start at the start mark; the calibrated '
+            'track should cover the fixes.')
     return 'Track', says, svg(figure, f'{name}-track', says)
 
 
@@ -145,37 +145,38 @@ def _marks(ax: Any, found: Evidence, at: Callable[..., Any],
 def draw_residuals(ax: Any, found: Evidence) -> None:
     """Draw on axes dead reckoning less fix along and across, as calibrated."""
     factor, unit = lengths(found.distance[-1])
-    way = factor * found.fix_distance
-    _band(ax, way, found.fix_sigma)
+    path_length = factor * found.fix_distance
+    _band(ax, path_length, found.fix_sigma)
     rows = thinned(found.residual)
     for column, colour, word in zip(found.residual.T, (BLUE, RED), ('along', 'across'),
                                     strict=True):
-        ax.plot(way[rows], column[rows], '-', color=colour, linewidth=0.9, label=word)
-    ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning less fix, m')
+        ax.plot(path_length[rows], column[rows], '-', color=colour, linewidth=0.9, label=word)
+    ax.set(xlabel=f'distance driven, {unit}', ylabel='dead reckoning minus fix, m')
 
 
-def _band(ax: Any, way: Floats, sigma: Floats) -> None:
-    band = evenly(len(way))
-    ax.fill_between(way[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
+def _band(ax: Any, path_length: Floats, sigma: Floats) -> None:
+    band = evenly(len(path_length))
+    ax.fill_between(path_length[band], -sigma[band], sigma[band], color=BAND, linewidth=0,
                     label='± sigma of a fix')
     ax.axhline(0.0, color=GREY, linewidth=0.8)
     for edge in (-sigma[band], sigma[band]):      # seen through noise that fills the band
-        ax.plot(way[band], edge, '--', color='black', linewidth=0.6)
+        ax.plot(path_length[band], edge, '--', color='black', linewidth=0.6)
 
 
 def _residuals(found: Evidence, name: str, before_word: str) -> tuple[str, str, str]:
     factor, unit = lengths(found.distance[-1])
-    way = factor * found.fix_distance
+    path_length = factor * found.fix_distance
     figure, axes = sheet(5.2, 3)
     rows = thinned(found.residual)
     for ax, column, word in zip(axes, found.residual.T, ('along', 'across'), strict=False):
-        _band(ax, way, found.fix_sigma)
-        ax.plot(way[rows], column[rows], '-', color=BLUE, linewidth=0.9, label='as calibrated')
+        _band(ax, path_length, found.fix_sigma)
+        ax.plot(path_length[rows], column[rows], '-', color=BLUE, linewidth=0.9,
+                label='as calibrated')
         ax.set_ylabel(f'{word}, m')
     rows = thinned(found.residual_before)
     for column, dash, word in zip(found.residual_before.T, ('--', ':'), ('along', 'across'),
                                   strict=True):
-        axes[2].plot(way[rows], column[rows], dash, color=RED, linewidth=1.3,
+        axes[2].plot(path_length[rows], column[rows], dash, color=RED, linewidth=1.3,
                      label=f'{before_word}, {word}')
     axes[2].axhline(0.0, color=GREY, linewidth=0.8)
     axes[2].set(xlabel=f'distance driven, {unit}', ylabel=f'{before_word}, m')
@@ -183,8 +184,8 @@ def _residuals(found: Evidence, name: str, before_word: str) -> tuple[str, str, 
     figure.subplots_adjust(hspace=0.24)
     key(figure, axes[0])
     figure.align_ylabels(axes)
-    says = ('Dead reckoning less fix. Along > 0: it runs ahead of the fix; across > 0: it lies '
-            'to the left. A slope along is a wrong scale, a bow across a turning heading.')
+    says = ('Dead reckoning minus fix. Along > 0: ahead of the fix; across > 0: left of the fix. '
+            'A slope along indicates a scale error, a curve across a heading drift.')
     return 'Residuals', says, svg(figure, f'{name}-residuals', says)
 
 
@@ -202,13 +203,13 @@ def _sections(found: Evidence, name: str, scale_sigma: float | None) -> tuple[st
     ax.hlines(off * times, middle - half, middle + half, color=BLUE, linewidth=1.1)
     ax.errorbar(middle, off * times, part.sigma * times, fmt='o', color=BLUE, markersize=4.5,
                 capsize=3, linewidth=1.1, label='section, ± its sigma')
-    ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale less result, {word}')
+    ax.set(xlabel=f'distance driven, {unit}', ylabel=f'scale minus result, {word}')
     ax.set_xlim(0.0, factor * found.distance[-1])
     key(figure, ax)
-    says = ('Length by the fixes over length dead reckoned as calibrated, in equal parts of the '
-            'way; the bars are one sigma of what the fixes leave there. Slip, an odometer delay '
-            '(at starts and stops) or bad fixes show as sections that stand out. Errors of the '
-            'fixes that change more slowly than over a section are not in its bar.')
+    says = ('Length from the fixes divided by the calibrated dead-reckoned length, in sections '
+            'of equal path length. Bars: one sigma of the fixes. Slip, an odometer delay (at '
+            'starts and stops) or bad fixes appear as outlier sections. Bars do not include fix '
+            'errors that change more slowly than a section.')
     return 'Scale by section', says, svg(figure, f'{name}-sections', says)
 
 
@@ -224,8 +225,8 @@ def _motion(found: Evidence, name: str) -> tuple[str, str, str]:
     upper.set_ylabel('speed, km/h')
     lower.set(ylabel='turn rate, deg/s', xlabel='time since the start mark, s')
     figure.align_ylabels([upper, lower])
-    says = ('Speed by the odometer as calibrated (below zero: reversing) and turn rate by the '
-            'gyro (above zero: to the left), each over one second.')
+    says = ('Speed from the calibrated odometer (negative: reversing) and turn rate from the '
+            'gyro (positive: left), averaged over one second.')
     return 'Speed and turn rate', says, svg(figure, f'{name}-motion', says)
 
 
@@ -245,8 +246,8 @@ def _fixes(found: Evidence, name: str) -> tuple[str, str, str]:
     top = float(found.fix_sigma.max(initial=0.0))
     ax.set_ylim(0.0, 1.25 * top if top else 1.0)
     key(figure, ax)
-    says = ('Horizontal sigma of each axis, as stated (or gnss.default_sigma), by status. '
-            'Crosses at the foot: fixes that were not used.')
+    says = ('Horizontal sigma of each axis as published (or gnss.default_sigma), by status. '
+            'Crosses at the bottom: fixes not used.')
     return 'Fix quality', says, svg(figure, f'{name}-fixes', says)
 
 
@@ -262,6 +263,6 @@ def _biases(t: Floats, biases: Floats, name: str) -> tuple[str, str, str]:
     axes[1].set_xlabel('time since the start mark, s')
     key(figure, axes[0])
     figure.align_ylabels(axes)
-    says = ('Biases of the Imu as the smoother finds them along the drive. They wander with '
-            'temperature; a step, or a walk far beyond the grade, is another fault.')
+    says = ('IMU biases along the drive, estimated by the smoother. They drift with temperature; '
+            'a step, or a drift far beyond the grade, indicates a fault.')
     return 'Biases', says, svg(figure, f'{name}-biases', says)

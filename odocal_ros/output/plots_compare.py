@@ -16,7 +16,7 @@ from odocal_ros.output.plots_svg import BAND, BLUE, GREEN, GREY, PINK, RED, rela
 from odocal_ros.output.summary import ANGLES, DEG, known
 
 STYLES = (('o', BLUE), ('s', RED), ('^', GREEN), ('D', PINK), ('v', 'black'), ('P', GREY))
-MOST_LEGS = 40    # judgement: bars of a picture that can be told apart
+MOST_LEGS = 40    # judgement: bars that are distinguishable in a picture
 # title, (text, method, value, sigma) of what has one, band of the result: middle and half width
 Panel = tuple[str, list[tuple[str, str, float, float]], tuple[float, float] | None]
 
@@ -42,7 +42,7 @@ def _scale(calibration: Calibration,
              for text, method, e in all_of if e.value is not None and result.value]
     times, word = relative(max((abs(off) + sigma for _, _, off, sigma in found), default=0.0))
     band = (0.0, (result.sigma or 0.0) / abs(result.value) * times) if result.value else None
-    return f'scale less result, {word}', [
+    return f'scale minus result, {word}', [
         (text, method, off * times, sigma * times) for text, method, off, sigma in found], band
 
 
@@ -77,8 +77,8 @@ def _draw(panels: list[Panel], name: str, legs: int) -> tuple[str, str, str]:
         ax.set_yticks(range(len(points)), [text for text, *_ in points])
         ax.set_ylim(len(points) - 0.5, -0.5)
         ax.set_xlabel(title)
-    says = 'Each bar is one sigma to either side; the grey band is the result.' + (
+    says = 'Bars: one sigma to each side; grey band: the result.' + (
         ' Legs share some errors (heading source, lever arms), so bars may overlap more than '
-        'chance would have it.' if legs > 1 else '') + (
+        'random errors would.' if legs > 1 else '') + (
         f' Of {legs} legs, the newest {MOST_LEGS}.' if legs > MOST_LEGS else '')
     return 'Side by side', says, svg(figure, f'{name}-compared', says)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats, Ints
 
-# Okabe and Ito's colours, told apart by colour-blind eyes too; shapes and dashes tell in grey
+# Okabe and Ito's colours, distinguishable with colour blindness, by shapes in grey
 BLUE, RED, GREEN, PINK = '#0072B2', '#D55E00', '#009E73', '#CC79A7'
 GREY, BAND = '0.45', '0.90'
 Drawing = tuple[str, str, str]      # title, what it says, SVG
@@ -47,7 +47,7 @@ def sheet(height: float, rows: int = 1, sharex: bool = True,
     """
     Return a figure of ``height`` inch and its axes, one above the other, as an array.
 
-    heights : of the axes, in any unit; None: all alike.
+    heights : of the axes, in any unit; None: all equal.
     """
     from matplotlib.figure import Figure
     width = 5.6    # inch

@@ -37,7 +37,7 @@ def _of_legs(found: list[tuple[Reason, list[str]]]) -> list[Reason]:
     """Return the reasons of a code with their legs; of many that differ, the first one."""
     if not found[0][1][0]:
         return [found[0][0]]
-    few = 2    # reasons of a code that differ from leg to leg, told one by one
+    few = 2    # reasons of a code that differ from leg to leg, listed one by one
     if len(found) <= few:
         return [replace(reason, text=f'{_legs(numbers)}: {reason.text}')
                 for reason, numbers in found]
@@ -63,20 +63,20 @@ def _legs(numbers: list[str]) -> str:
 
 
 def bag_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:
-    """Return which legs are from which bag, nothing where there is but one."""
+    """Return the text that lists the legs of each bag, empty for a single bag."""
     of_bag: dict[str, list[str]] = {}
     for number, leg in enumerate(legs, 1):
         of_bag.setdefault(leg.bag, []).append(str(number))
     if len(of_bag) < 2:
         return []
-    told = '; '.join(f'{_legs(numbers)}: {bag}' for bag, numbers in of_bag.items())
-    return _wrapped(told, '  ', width)
+    listed = '; '.join(f'{_legs(numbers)}: {bag}' for bag, numbers in of_bag.items())
+    return _wrapped(listed, '  ', width)
 
 
 def reason_lines(reasons: tuple[Reason, ...], width: int, brief: bool = False) -> list[str]:
     """Return reasons with their remedies for a terminal; brief: of notes the codes alone."""
     lines = []
-    for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'take care'),
+    for verdict, title in ((Verdict.REJECTED, 'rejected because'), (Verdict.CAUTION, 'warnings'),
                            (Verdict.ACCEPTED, 'notes')):
         found = [r for r in shared(reasons) if r.code.gravity is verdict]
         if brief and found and verdict is Verdict.ACCEPTED:

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""report.html: one page that needs no network, for the eye that must believe a calibration."""
+"""report.html: one page that needs no network, for people."""
 
 from collections import Counter
 from datetime import datetime, UTC
@@ -28,7 +28,7 @@ from odocal_ros.settings.config import Config
 
 NAME = 'report.html'
 MOST_BYTES = 2_600_000     # judgement: of figures; a page stays under 3 MB with its tables
-TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Take care',
+TITLES = {Verdict.REJECTED: 'Rejected because', Verdict.CAUTION: 'Warnings',
           Verdict.ACCEPTED: 'Notes'}
 
 
@@ -43,7 +43,7 @@ def report_html(calibration: Calibration, config: Config, content: dict[str, Any
     config : Config
         Settings it was made with.
     content : dict
-        Of calibration.json, for what is told of bags and software.
+        Of calibration.json, for bags and software.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def _budgets(methods: dict[str, MethodResult]) -> list[tuple[str, dict[str, Any]
 
 def _drawn(calibration: Calibration) -> tuple[list[dict[str, Any]], list[Drawing], list[int]]:
     """
-    Return what is told of each leg, the figure of all, and the numbers of legs without figures.
+    Return the content of each leg, the figure of all, and the legs without figures.
 
     Of more legs than a page has room for, the newest have theirs.
     """
@@ -184,7 +184,7 @@ def _leg(number: int, leg: LegResult, figures: list[Drawing],
     return {'number': number, 'bag': leg.bag, 'verdict': leg.verdict.value,
             'start': _utc(leg.start_ns), 'stop': _utc(leg.stop_ns), 'figures': figures,
             'facts': (('distance', length(leg.distance)), ('duration', time_span(leg.duration)),
-                      ('Imu samples', leg.imu_samples), ('odometer messages', leg.pulses),
+                      ('IMU samples', leg.imu_samples), ('odometer messages', leg.pulses),
                       ('fixes', leg.fixes), ('fixes not used', leg.rejected_fixes)),
             'methods': tables.method_table(methods, (leg,)),
             'budgets': _budgets(methods) if several else [],
@@ -195,7 +195,7 @@ def _leg(number: int, leg: LegResult, figures: list[Drawing],
 
 
 def _smoothed(leg: LegResult) -> dict[str, Any]:
-    """Return what the smoother tells of a leg beside its values, empty without it."""
+    """Return further smoother results of a leg besides its values, empty without it."""
     method = leg.methods.get('smoother')
     return method.details if method else {}
 

@@ -23,7 +23,7 @@ from odocal_ros.output.verdicts import shown_verdict
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config, flat, SETTINGS
 
-LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'against nominal',
+LABELS = SOURCES | {'scale_factor': 'scale factor', 'scale_ratio': 'ratio to nominal',
                     'yaw_mounting_angle': 'yaw mounting angle',
                     'pitch_mounting_angle': 'pitch mounting angle',
                     'scale_factor_left': 'scale factor, left wheel',

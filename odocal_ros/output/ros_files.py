@@ -85,7 +85,7 @@ def _autoware(calibration: Calibration, config: Config, content: dict[str, Any])
 
 
 def _speed_factor(calibration: Calibration) -> float | None:
-    """Return what to multiply reported speeds by; pulses have one only against a nominal K0."""
+    """Return the factor for reported speeds; for pulses only with a nominal K0."""
     scale, ratio = (calibration.estimates.get(n) for n in ('scale_factor', 'scale_ratio'))
     if scale is not None and scale.unit == '1':
         return scale.value
@@ -100,7 +100,7 @@ def _velocity_converter(factor: float, frame: str) -> str:
 
 
 def _gyro_bias_i(calibration: Calibration, config: Config) -> Floats | None:
-    """Return the gyro bias in the Imu's own axes and unit as sent, (3,), None if unknown."""
+    """Return the gyro bias in the IMU's own axes and unit as sent, (3,), None if unknown."""
     found = [calibration.estimates.get(f'gyro_bias_{axis}') for axis in AXES]
     bias = [e.value for e in found if e is not None and e.value is not None]
     C_bi = next((leg.C_bi for leg in calibration.legs if leg.C_bi is not None), None)
@@ -136,16 +136,16 @@ def _transform(calibration: Calibration, config: Config,
     launch = ElementTree.Element('launch')
     ElementTree.SubElement(launch, 'node', pkg='tf2_ros', exec='static_transform_publisher',
                            name=name, args=for_launch(words))
-    told = about(calibration, content)
+    head = about(calibration, content)
     command = (for_comment(
-        f'{told}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
+        f'{head}\nThe attitude of {imu} on {base}. robot_localization takes it from TF, which '
         'this command publishes;\n'
         'it is not the yaw_offset of navsat_transform, which corrects a compass.')
         + f'ros2 run tf2_ros static_transform_publisher {for_shell(words)}\n')
     return {LAUNCH: '<?xml version="1.0"?>\n' + _xml(
-                launch, f'include it in the launch file of your vehicle\n{told}'),
+                launch, f'include it in the launch file of your vehicle\n{head}'),
             URDF: _xml(joint, f'put into your URDF in place of the joint that carries the IMU\n'
-                              f'{told}'),
+                              f'{head}'),
             COMMAND: command}
 
 

@@ -32,5 +32,5 @@ def search_lines(legs: tuple[LegResult, ...]) -> list[str]:
             lines.append(f'  {name:24}  {values["scale_left"]:10.6g}  '
                          f'{values["scale_right"]:10.6g}  {values["heading_deg"]:+9.4f}{how}')
         if found['left_and_right_held_together']:
-            lines.append('  the fixes do not tell left from right: their ratio is kept')
+            lines.append('  the fixes do not separate left and right: their ratio is kept')
     return lines

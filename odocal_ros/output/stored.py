@@ -23,7 +23,7 @@ from odocal_ros.reasons import Verdict
 from odocal_ros.settings.config import Config, flat
 
 T = TypeVar('T')
-# what the Imu's constants are of
+# what the IMU's constants are of
 SAME_IMU = ('imu.mounting_rpy', 'imu.gyro_scale', 'imu.accel_scale', 'imu.grade')
 
 
@@ -47,11 +47,11 @@ class Stored:
     budget: dict[str, dict[str, tuple[float, bool]]] = field(default_factory=dict)
     vehicle: str = ''
     carried: Carried | None = None      # what it leaves for legs to come, with leg.automatic
-    imu: Carried | None = None          # what it tells of the Imu
+    imu: Carried | None = None          # its information on the IMU
 
     @property
     def usable(self) -> bool:
-        """Return whether its values may be used."""
+        """Return True if its values can be used."""
         return self.verdict is not Verdict.REJECTED
 
     def value(self, name: str) -> float | None:
@@ -86,17 +86,17 @@ def read_stored(path: Path) -> Stored:
             from None
     except (ValueError, RecursionError) as error:      # of json, utf-8, or a value below
         why = (str(error).splitlines() or ['nested too deep'])[0]
-        raise BadUsage(f'{name}: no calibration.json as odocal writes it ({why})') from None
+        raise BadUsage(f'{name}: not a calibration.json of odocal ({why})') from None
 
 
 def _no_constant(text: str) -> None:
-    raise ValueError(f'{text} is no number')
+    raise ValueError(f'{text} is not a number')
 
 
 def stored_from(content: dict[str, Any], name: str) -> Stored:
     """Return the calibration of the content of a calibration.json; ValueError where it is none."""
     if not isinstance(content, dict):
-        raise ValueError('no object at the top')
+        raise ValueError('the top level is not an object')
     schema = content.get('schema')
     if schema != SCHEMA or isinstance(schema, bool):
         raise ValueError(f'schema is {str(schema)[:20]}, this version reads {SCHEMA}')
@@ -124,12 +124,12 @@ def stored_from(content: dict[str, Any], name: str) -> Stored:
 
 def known_imu(config: Config) -> Carried | None:
     """
-    Return what the result at ``imu.constants`` tells of the Imu, None where none is named.
+    Return the IMU information of the result at ``imu.constants``, None without one.
 
     Raises
     ------
     BadUsage
-        It cannot be read, tells nothing, or is of another vehicle or Imu.
+        It cannot be read, has no IMU constants, or is of another vehicle or IMU.
 
     """
     if not config.imu.constants:
@@ -142,11 +142,11 @@ def known_imu(config: Config) -> Carried | None:
     other = ['vehicle'] * (found.vehicle != config.vehicle) + [
         name for name in SAME_IMU if found.config.get(name) != _plain(here[name])]
     if other:
-        raise BadUsage(f'imu.constants: {found.name} is of another {" and ".join(other)}: the '
-                       'same Imu, mounted as it was, is wanted')
+        raise BadUsage(f'imu.constants: {found.name} has another {" and ".join(other)}: the same '
+                       'IMU with unchanged mounting is required')
     if found.imu is None:
-        raise BadUsage(f'imu.constants: {found.name} tells nothing of the Imu: no leg of it has a '
-                       'value by the smoother')
+        raise BadUsage(f'imu.constants: {found.name} contains no IMU constants: none of its legs '
+                       'has a result of the smoother')
     return found.imu
 
 
@@ -156,7 +156,7 @@ def _plain(value: Any) -> Any:
 
 def _part(content: dict[str, Any], key: str, kind: type[T]) -> T:
     if not isinstance(content.get(key), kind):
-        raise ValueError(f'{key!r} is missing or of the wrong kind')
+        raise ValueError(f'{key!r} is missing or has the wrong type')
     part: T = content[key]
     return part
 
@@ -167,7 +167,7 @@ def _estimate(entry: dict[str, Any], key: str) -> Estimate:
     value, sigma = (_number(entry[part], f'result.{key}.{part}') for part in ('value', 'sigma'))
     check_estimate(key, value, sigma)
     if entry['unit'] is not None and not isinstance(entry['unit'], str):
-        raise ValueError(f'result.{key}.unit is no text')
+        raise ValueError(f'result.{key}.unit is not text')
     return Estimate(value, sigma, entry['unit'] or '', str(entry.get('method') or ''))
 
 
@@ -188,7 +188,7 @@ def _number(value: float | None, what: str) -> float | None:
     try:
         if isinstance(value, bool) or not isinstance(value, (int, float)) \
                 or not math.isfinite(value):
-            raise ValueError(f'{what} is no number')
+            raise ValueError(f'{what} is not a number')
         return float(value)
     except OverflowError:
         raise ValueError(f'{what} is too large') from None

@@ -12,11 +12,11 @@
 from dataclasses import replace
 from datetime import datetime, UTC
 import math
-import re
+import textwrap
 
 from odocal_ros.calib.choice import leg_estimates
 from odocal_ros.calib.result import Calibration, Estimate, LegResult
-from odocal_ros.output.budget_table import budget_lines, LABELS, largest_source
+from odocal_ros.output.budget_table import budget_lines, largest_source, source_label
 from odocal_ros.output.figures import beyond_one, length, share, time_span, with_sigma
 from odocal_ros.output.reason_lines import bag_lines, reason_lines
 from odocal_ros.output.search_table import search_lines
@@ -24,7 +24,6 @@ from odocal_ros.output.track_table import track_lines
 from odocal_ros.output.verdicts import leg_verdicts, shown_verdict
 from odocal_ros.reasons import Verdict
 
-MOSTLY = 'mostly', 'above all'      # more than half of the variance, or the most of all
 WIDTH = 98    # judgement: columns
 DEG = math.degrees(1.0)    # definition
 ANGLES = {'yaw_mounting_angle': 'yaw', 'pitch_mounting_angle': 'pitch'}
@@ -33,7 +32,7 @@ ARMS = {'odometer_lever_arm': 'odometer at', 'antenna_lever_arm': 'antenna at'}
 BIASES = tuple(f'gyro_bias_{axis}' for axis in 'xyz')
 DEG_PER_HOUR = DEG * 3600    # definition
 COUNTS = {'m/pulse': 'pulses/m', 'm/rad': 'rad/m'}
-MEANING = {Verdict.ACCEPTED: 'fit for use', Verdict.CAUTION: 'usable, read the reasons first',
+MEANING = {Verdict.ACCEPTED: 'ready to use', Verdict.CAUTION: 'usable; read the reasons first',
            Verdict.REJECTED: 'do not use these values'}
 ORDER = list(Verdict)
 NONE = Estimate(None, None, '')
@@ -107,7 +106,7 @@ def known(estimates: dict[str, Estimate], name: str) -> Estimate:
 
 
 def inverse(scale: Estimate) -> str:
-    """Return a scale the other way round: pulses (or rad) per metre with sigma."""
+    """Return the inverse scale: pulses (or rad) per metre with sigma."""
     if not scale.value:
         return ''
     sigma = None if scale.sigma is None else scale.sigma / scale.value**2
@@ -134,15 +133,15 @@ def _head(calibration: Calibration, styled: bool) -> list[str]:
 def _values(calibration: Calibration, width: int) -> list[str]:
     estimates = calibration.estimates
     scale, ratio = (known(estimates, n) for n in ('scale_factor', 'scale_ratio'))
-    lines = [_line('scale factor', _scale_text(scale) + _mostly(calibration, 'scale_factor'))]
+    lines = [_line('scale factor', _scale_text(scale))]
     if scale.value and scale.unit in COUNTS:
         lines.append(_line('', inverse(scale)))
     if ratio.value is not None:
-        lines.append(_line('  against nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
+        lines.append(_line('  ratio to nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({beyond_one(ratio.value, ratio.sigma)})'))
     for name, word in ANGLES.items():
-        text = _angle_text(known(estimates, name), width) + _mostly(calibration, name)
-        lines.append(_line(f'{word} mounting', text))
+        lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
+    lines += _largest_errors(calibration, width)
     for name in estimates:
         estimate = known(estimates, name)
         if name not in ('scale_factor', 'scale_ratio', *ANGLES, *BIASES) \
@@ -150,7 +149,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
             text = _with_unit(estimate)
             if name == 'heading_error':
                 text = _angle_text(estimate, 0) + (
-                    '   heading and (reversed) mounting together' if width >= WIDTH else '')
+                    '   heading error minus yaw mounting' if width >= WIDTH else '')
             lines.append(_line(name.replace('_', ' '), text))
     lines += [_arm(estimates, name, word) for name, word in ARMS.items()]
     lines.append(_gyro_scale(calibration))
@@ -162,13 +161,12 @@ def _values(calibration: Calibration, width: int) -> list[str]:
         # + 0.0: no minus before a zero
         rpy = ', '.join(f'{round(angle * DEG, 3) + 0.0:.3f}'
                         for angle in calibration.imu_rotation_rpy)
-        lines.append(_line('Imu on the vehicle', f'roll, pitch, yaw {rpy} deg'))
-    return [line if len(line) <= width or width >= WIDTH
-            else re.split(f'   (?:{"|".join(MOSTLY)}) ', line)[0] for line in lines if line]
+        lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
+    return [line for line in lines if line]
 
 
 def _gyro_scale(calibration: Calibration) -> str:
-    """Return by what the gyro's turns are to be multiplied, '' where that is near 1."""
+    """Return the factor for the turn rates of the gyro, '' if it is near 1."""
     method = calibration.methods.get(known(calibration.estimates, 'scale_factor').method)
     error = method.details.get('gyro_scale_z') if method else None
     far_scale = 0.005    # of a gyro's scale from 1
@@ -185,14 +183,19 @@ def _arm(estimates: dict[str, Estimate], arm: str, word: str) -> str:
     return _line(f'{word} {", ".join(found)}', f'{shown} m') if found else ''
 
 
-def _mostly(calibration: Calibration, name: str) -> str:
-    """Return which source makes most of an estimate's sigma, or the most of all."""
-    estimate = calibration.estimates.get(name, NONE)
-    if estimate.value is None:
-        return ''
-    largest, share = largest_source(calibration.methods.get(estimate.method), name)
-    label = LABELS.get(largest, largest).replace('_', ' ')
-    return f'   {MOSTLY[share <= 0.5]} {label}' if largest else ''
+def _largest_errors(calibration: Calibration, width: int) -> list[str]:
+    """Return the lines with the largest error source of scale, yaw and pitch, none without."""
+    found = []
+    for name, word in {'scale_factor': 'scale', **ANGLES}.items():
+        estimate = calibration.estimates.get(name, NONE)
+        source, part = ('', 0.0) if estimate.value is None else largest_source(
+            calibration.methods.get(estimate.method), name)
+        if source:
+            found.append(f'{word}: {source_label(source)} ({100 * part:.0f} %)')
+    # lines are broken between the values only
+    lines = textwrap.wrap('; '.join(found).replace(' ', '\xa0').replace(';\xa0', '; '), width - 22)
+    return [_line('' if k else 'largest error', line.replace('\xa0', ' '))
+            for k, line in enumerate(lines)]
 
 
 def _line(label: str, text: str) -> str:

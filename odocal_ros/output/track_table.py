@@ -50,10 +50,10 @@ def _pooled(length: float, parts: list[PerDistance]) -> PerDistance:
 
 
 def before_label(legs: list[LegResult] | tuple[LegResult, ...]) -> str:
-    """Return what the track before the correction rests on: settings, or none of the scale."""
+    """Return the label of the uncorrected track: configured values, or an approximate scale."""
     configured = any('scale_ratio' in m.estimates and m.estimates['scale_ratio'].value is not None
                      for leg in legs for m in leg.methods.values())
-    return 'as configured' if configured else 'with a rough scale'
+    return 'as configured' if configured else 'approximate scale'
 
 
 def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str, list[str]]]]:
@@ -69,7 +69,7 @@ def check_table(legs: tuple[LegResult, ...]) -> tuple[list[str], list[tuple[str,
                 f'{check.percent_of_distance:.3f} %']))
     heads = [f'in {x.length:g} m' if x.length < 1000 else f'in {x.length / 1000:g} km'
              for x in pieces]
-    return [*heads, 'rms', 'max', 'mean', 'at end', 'of way'], rows
+    return [*heads, 'rms', 'max', 'mean', 'at end', 'of path'], rows
 
 
 def track_lines(legs: tuple[LegResult, ...], width: int) -> list[str]:

@@ -23,7 +23,7 @@ JUDGED = ('scale_factor', 'scale_factor_left', 'scale_factor_right', 'yaw_mounti
 
 def is_worse(old: Stored, new: Stored) -> str:
     """
-    Return why a new calibration should not quietly replace an old one, empty when it may.
+    Return the objection to replacing an old calibration silently, empty without one.
 
     The old one is good unless rejected. The new one is worse when it is rejected, when it lacks a
     value that the old one has, or gives it with a sigma more than twice as large. One that holds
@@ -36,7 +36,7 @@ def is_worse(old: Stored, new: Stored) -> str:
         rejecting = [name for name in new.reasons if name in Code.__members__
                      and Code[name].gravity is Verdict.REJECTED]
         codes = ', '.join(dict.fromkeys(rejecting[:3] or new.reasons[:3]))
-        return f'the new one is rejected ({codes}), the old one is {old.verdict.value}'
+        return f'the new result is rejected ({codes}), the old one is {old.verdict.value}'
     if old.legs and old.legs < new.legs \
             or old.carried and new.carried and new.carried.goes_on_from(old.carried):
         return ''
@@ -51,11 +51,11 @@ def _worse(label: str, old: Estimate | None, new: Estimate | None) -> str:
     if old is None or old.value is None or not old.sigma:
         return ''
     if new is None or new.value is None:
-        return f'the new one has no {label}, the old one has {said(old)}'
+        return f'the new result has no {label}, the old one has {said(old)}'
     clearly = 2.0    # times the sigma: four times as many such legs would be needed
     if new.unit == old.unit and new.sigma and new.sigma > clearly * old.sigma:
-        return (f'the {label} is {new.sigma / old.sigma:.1f} times less certain: {said(new)}, '
-                f'the old one has {said(old)}')
+        return (f'the uncertainty of the {label} is {new.sigma / old.sigma:.1f} times larger: '
+                f'{said(new)}, the old result has {said(old)}')
     return ''
 
 

@@ -20,7 +20,7 @@ from odocal_ros.errors import BadBag
 
 RAISE = 'ODOCAL_LIMITS'      # environment: a factor on all of them
 DEFINITION = 2**16           # judgement: characters of a message definition
-MESSAGE = 2**26              # judgement: bytes of one message that is asked for
+MESSAGE = 2**26              # judgement: bytes of one requested message
 ELEMENTS = 100_000           # judgement: values in the fixed arrays of one message
 SECONDS = 20                 # judgement: to understand a definition
 # judgement: bytes given to a decompressor at first: after each frame, of which there may be one in
@@ -46,11 +46,11 @@ def factor() -> float:
 
 
 def check(amount: float, limit: float, what: str, unit: str = 'bytes') -> None:
-    """Raise LimitReached where an amount is above a limit; ``what`` tells of which file."""
+    """Raise LimitReached if an amount is above a limit; ``what`` names the file."""
     limit *= factor()
     if amount > limit:
-        raise LimitReached(f'{what} takes more than {limit:.0f} {unit}, the limit for it; if it '
-                           f'is sound, set {RAISE}=10 in the environment for ten times as much')
+        raise LimitReached(f'{what} exceeds the limit of {limit:.0f} {unit}; if the file is '
+                           f'valid, set {RAISE}=10 in the environment for ten times the limit')
 
 
 class Allowance:
@@ -84,13 +84,13 @@ class Allowance:
 
     @property
     def left(self) -> int:
-        """Return how many bytes may still come."""
+        """Return the number of bytes that are still allowed."""
         return int(self.most * factor()) - self._used
 
     def unpack(self, packing: str, data: bytes | bytearray | memoryview, size: int | None = None
                ) -> bytes | bytearray | memoryview:
         """
-        Return what compressed data hold, as much as came out of a stream that is cut off.
+        Return decompressed data, up to the end of a truncated stream.
 
         packing : '', 'zstd', 'lz4' or 'bz2'.   size : bytes that it is said to be, if it is.
         Raises LimitReached, or what the decompressor raises on damage.
@@ -113,7 +113,7 @@ class Allowance:
             at -= len(stream.unused_data or b'') if stream.eof else 0
         self.take(have)
         if size is not None and have > size:
-            raise Damaged('a chunk is larger than it says')
+            raise Damaged('a chunk is larger than its header states')
         return b''.join(parts)
 
 
@@ -141,7 +141,7 @@ def zstd_module() -> ModuleType:
 
 
 def is_file(path: Path) -> bool:
-    """Tell whether a path is a regular file: a pipe or a device may never end, or wait."""
+    """Return True if a path is a regular file: a pipe or a device can be endless or block."""
     try:
         return stat.S_ISREG(path.stat().st_mode)
     except (OSError, ValueError):

@@ -10,7 +10,7 @@
 """
 Names from outside (frames, topics, types, joints, files): the one door for what others chose.
 
-Whoever writes such a name puts it through the function of his format; a frame is taken only where
+Writers of such a name use the function of their format; a frame is taken only where
 ROS takes it, since files that are acted on name it.
 """
 
@@ -55,7 +55,7 @@ def _seen(text: str) -> str:
 
 
 def is_frame(name: str) -> bool:
-    """Return whether a frame name is one that tf2 takes, safe in every file that names it."""
+    """Return True if a frame name is valid in tf2 and safe in every file that contains it."""
     return FRAME.fullmatch(name) is not None
 
 

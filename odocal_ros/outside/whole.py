@@ -8,7 +8,7 @@
 # the License.
 
 """
-Files and folders that are on the disk whole or not at all: the one way to it.
+Atomic writing of files and folders; the only module that does it.
 
 Every step that a disk can refuse goes through ``disk``, so that tests can refuse each in turn.
 """
@@ -23,7 +23,7 @@ import signal
 import threading
 from typing import Any, BinaryIO
 
-MOST_ALIKE = 1000             # judgement: folders of one name
+MOST_SAME_NAME = 1000             # judgement: folders of one name
 PART = '.part'                # of files being written: no ending that a result's or a bag's have
 
 
@@ -69,14 +69,14 @@ def whole_file(path: Path) -> Iterator[WholeFile]:
 def new_folder(root: Path, name: str) -> Path:
     """Create a folder that nobody else has: of that name, or with a number after it."""
     root.mkdir(parents=True, exist_ok=True)
-    for count in range(1, MOST_ALIKE + 1):
+    for count in range(1, MOST_SAME_NAME + 1):
         folder = root / (name if count == 1 else f'{name}-{count}')
         try:
             folder.mkdir()
         except FileExistsError:
             continue
         return folder
-    raise OSError(errno.EEXIST, f'it holds {MOST_ALIKE} folders named {name}, clear it out')
+    raise OSError(errno.EEXIST, f'it holds {MOST_SAME_NAME} folders named {name}; delete some')
 
 
 def write_text(path: Path, text: str) -> None:
@@ -124,7 +124,7 @@ def locked(folder: Path, wait: bool = True) -> Iterator[bool]:
 def uninterrupted() -> Iterator[None]:
     """Let Ctrl-C wait until the block is over."""
     if threading.current_thread() is not threading.main_thread():
-        yield       # only the main thread hears of it
+        yield       # only the main thread receives it
         return
     came: list[tuple[Any, ...]] = []
     before = signal.signal(signal.SIGINT, lambda *values: came.append(values))

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""YAML of parameter files, value by value: read alike by rcl, by YAML 1.1 and by odocal."""
+"""YAML of parameter files, value by value: read identically by rcl, by YAML 1.1 and by odocal."""
 
 from collections.abc import Mapping
 from datetime import datetime, UTC

@@ -33,7 +33,7 @@ def loader(aliases: bool = False) -> Any:
             mark = self.peek_event().start_mark
             if not aliases and self.check_event(yaml.AliasEvent):
                 raise yaml.composer.ComposerError(
-                    None, None, 'links (*name) are not taken here, nor by ROS', mark)
+                    None, None, 'aliases (*name) are not supported, as in ROS', mark)
             deepest = 30    # of mappings and lists in each other
             if self.depth >= deepest:
                 raise yaml.composer.ComposerError(
@@ -47,7 +47,7 @@ def loader(aliases: bool = False) -> Any:
                 self.depth -= 1
             if isinstance(node, yaml.MappingNode) and not all(
                     isinstance(key, yaml.ScalarNode) for key, _ in node.value):
-                raise yaml.composer.ComposerError(None, None, 'a key that is no text', mark)
+                raise yaml.composer.ComposerError(None, None, 'a key that is not text', mark)
             return node
 
         def flatten_mapping(self, node: Any) -> None:
@@ -56,7 +56,7 @@ def loader(aliases: bool = False) -> Any:
 
 
 def composed(text: str, where: str) -> Any:
-    """Return the root node of a text (None: it is empty), or raise BadConfig that tells where."""
+    """Return the root node of a text (None: it is empty), or raise BadConfig with the place."""
     import yaml
     try:
         return yaml.compose(text, Loader=loader())

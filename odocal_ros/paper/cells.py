@@ -60,7 +60,7 @@ class Cell:
 
     sense : what the printed one is times, to mean the same as ours (-1: truth - estimate).
     sign : of our value by the equations, where a magnitude is shown.
-    remark : what is to be said of it, a misprint above all.
+    remark : remark on it, usually a misprint.
     """
 
     printed: float | None

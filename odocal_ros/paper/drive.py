@@ -107,7 +107,7 @@ class PaperDrive:
             standstill=(-self.start, 0.0))
 
     def outcome(self, source: str) -> Outcome:
-        """Return what the pipeline finds with the errors of a source."""
+        """Return the pipeline result with the errors of a source."""
         result = calibrate(self.drive.leg(), self.config, self.alignment(source))
         found, truth = result.methods['two_point'].estimates, self.drive.truth
         yaw, scale = found['yaw_mounting_angle'], found['scale_factor']
@@ -129,12 +129,12 @@ class PaperDrive:
                     path.C_nb @ C_vb)
 
     def profile(self) -> SpeedProfile:
-        """Return how the distance is spread over time from the end of the standstill."""
+        """Return the distribution of distance over time from the end of the standstill."""
         path = self.path()
         return SpeedProfile(path.t, path.travel)
 
     def growth(self, source: str) -> Growth:
-        """Return how the errors of a source grow: (15)-(23), then (13), (14), (12)."""
+        """Return the growth of the errors of a source: (15)-(23), then (13), (14), (12)."""
         phi_n, eps_b = errors_of(source)
         path = self.path()
         x = propagate(path, [*phi_n, 0.0, 0.0, 0.0], eps_b)

@@ -160,7 +160,7 @@ def propagate(path: Path, x_0: Floats | list[float], eps_b: Floats | list[float]
 
 def _steps(path: Path, radius: float | None, drift_b: Floats) -> Floats:
     """
-    Return what each epoch makes of the one before: (m, 6, 6 + k), [A | B], x_1 = A x_0 + B.
+    Return the transition of each epoch: (m, 6, 6 + k), [A | B], x_1 = A x_0 + B.
 
     drift_b : (..., 3, k) drifts in b, rad/s. The first row changes nothing.
     """

@@ -19,9 +19,9 @@ from odocal_ros.paper.coefficients import DRIFT, HEADING, table_1, table_2
 from odocal_ros.paper.drive import Growth, GYRO_NOISE, Outcome, PaperDrive, SOURCES
 from odocal_ros.paper.error_forms import SpeedProfile
 
-SCALE_REMARK = ('alike to 2e-11 in every printed row, which plane and tilt are not: a constant of '
-                "the paper's numerics, no target")
-FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) beside the ellipsoid's C0 and C in "
+SCALE_REMARK = ('the same within 2e-11 in every printed row, not explained by plane or tilt: a '
+                "constant of the paper's numerics, not a target")
+FORMULA_REMARK = ("printed dK is the sphere's R in (30), (31) and the ellipsoid's C0 and C in "
                   '(13), (14): phi_U / 2 times 0.0059')
 SIGN_REMARK = '(30)-(33) are printed with the sign reversed against (27), (28)'
 
@@ -61,7 +61,7 @@ class PaperTables:
     sigma_deg: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what --json prints."""
+        """Return the output of --json."""
         third = {source: {
             'yaw_deg': row.yaw_deg.as_dict() | {'model': row.model_deg,
                                                 'noise_sigmas': row.noise_sigmas},
@@ -99,7 +99,7 @@ def _row(source: str, outcome: Outcome, growth: Growth, noise_deg: float) -> Row
     if printed_yaw is not None:
         sigmas = (printed_yaw + yaw) / noise_deg
         if abs(yaw) < noise_deg:
-            remark = 'below the gyro noise of the paper: proves nothing'
+            remark = 'below the gyro noise of the paper: not significant'
     return Row(Cell(printed_yaw, yaw, sense=-1, remark=remark),
                Cell(printed_scale, outcome.scale, remark=SCALE_REMARK if printed_scale else ''),
                float(np.rad2deg(growth.yaw[-1])), sigmas)

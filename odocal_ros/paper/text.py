@@ -28,7 +28,7 @@ TITLE_3 = """\
 Table 3: calibration errors of the drive of section 3 (11.2 km, K0 = 1.2 K, mounting 1 deg),
 simulated and put through the pipeline; `model` is the linear error model, (11)-(23) corrected."""
 TITLE_4 = """\
-Table 4: the simulation beside the closed forms (32), (33), here corrected and for the drive's
+Table 4: the simulation and the closed forms (32), (33), here corrected and for the drive's
 own speed profile."""
 
 
@@ -65,10 +65,10 @@ def _third(tables: PaperTables) -> str:
     notes = [
         f'* {below} (0.001 deg/sqrt(h) alone: {tables.noise_deg:.1e} deg, 1 sigma; printed and '
         f'ours differ by {worst[0]:.1f} of these at most, in row {worst[1]}).',
-        'Row none is not printed: it is what the method itself leaves.',
+        'Row none is not in the paper: it is the residual error of the method.',
         f'Printed scale errors: {tables.table_3["all"].scale.remark}.',
-        f'The sigma that the pipeline states for this yaw is {tables.sigma_deg:.4f} deg: that of '
-        'the heading it was given.']
+        f'The sigma of this yaw in the pipeline is {tables.sigma_deg:.4f} deg: that of the given '
+        'heading.']
     return '\n'.join(lines + [_note(note) for note in notes])
 
 

@@ -42,7 +42,7 @@ class Design:
 
     @property
     def balanced(self) -> bool:
-        """Tell whether each pair of columns holds each pair of levels equally often."""
+        """Return True if each pair of columns holds each pair of levels equally often."""
         return self.imbalance == 0.0
 
 
@@ -74,7 +74,7 @@ def field_tables(q: int) -> tuple[Ints, Ints]:
     """
     power = prime_power(q)
     if power is None:
-        raise BadUsage(f'{q} levels: no field has as many elements; give a prime power')
+        raise BadUsage(f'{q} levels: no finite field has this many elements; give a prime power')
     p, m = power
     digits = np.array([_digits(k, p, m) for k in range(q)])
     weight = p**np.arange(m)
@@ -99,7 +99,7 @@ def irreducible(p: int, m: int) -> tuple[int, ...]:
 
 
 def _divides(factor: tuple[int, ...], polynomial: tuple[int, ...], p: int) -> bool:
-    """Tell whether a monic factor divides a polynomial, both low first."""
+    """Return True if a monic factor divides a polynomial, both low first."""
     rest, d = list(polynomial), len(factor) - 1
     for k in range(len(rest) - 1, d - 1, -1):
         head = rest[k]
@@ -119,7 +119,7 @@ def bose(q: int, columns: int) -> Ints:
     Raises
     ------
     BadUsage
-        q is no prime power, or more than q + 1 columns are asked.
+        q is no prime power, or more than q + 1 columns are requested.
 
     """
     add, multiply = field_tables(q)
@@ -136,7 +136,7 @@ def full_factorial(levels: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def imbalance(rows: Ints, levels: tuple[int, ...]) -> float:
-    """Return how far the count of a pair of levels is from even, at worst over all pairs."""
+    """Return the largest deviation from equal counts over all pairs of levels."""
     worst = 0.0
     for a, b in combinations(range(len(levels)), 2):
         cells = levels[a] * levels[b]
@@ -156,7 +156,7 @@ def nearly_balanced(levels: tuple[int, ...]) -> Design:
     Return a small array for unlike numbers of levels, by dummy levels.
 
     An orthogonal array of the next prime power is folded: columns with fewer levels let some of
-    them stand for two, spread alike about the middle. Each pair of levels is still met.
+    them stand for two, spread evenly around the middle. Each pair of levels is still met.
     """
     levels = tuple(levels)
     q = next_prime_power(max(*levels, len(levels) - 1))

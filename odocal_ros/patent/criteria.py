@@ -25,7 +25,7 @@ from odocal_ros.patent.planar import coefficients, PlanarLeg, squared_distances
 
 # statistical: sigmas at which a fix's pull stops growing; one in seven white fixes is beyond
 HUBER = 2.0
-LEAST_SIGMA = 1e-4       # m, judgement: what a stated sigma is taken for at least
+LEAST_SIGMA = 1e-4       # m, judgement: lower limit of a stated sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def score(leg: PlanarLeg, sets: Floats, robust: bool = False, course: bool = Tru
 
 def loss(d2: Floats, sigma: Floats, robust: bool) -> Floats:
     """
-    Return what is lowered, of (m, k) squared distances, m^2: (m,).
+    Return the objective from (m, k) squared distances, m^2: (m,).
 
     The mean square; robust: the mean of Huber's function of the distance in sigmas, which grows
     as the square up to HUBER and in proportion beyond.
@@ -111,11 +111,11 @@ def weights(d2: Floats, sigma: Floats, robust: bool) -> Floats:
 
 
 def course_differences(leg: PlanarLeg, sets: Floats) -> Floats:
-    """Return direction of the dead-reckoned less that of the fixed way, by piece, rad: (m, c)."""
+    """Return direction of the dead-reckoned minus that of the fix path, rad: (m, c)."""
     a, b = leg.pieces.T
     mix = coefficients(sets)[:, :3]
     east, north = (rows[:3, b] - rows[:3, a] for rows in leg.basis)
-    way = leg.fixes_n[b] - leg.fixes_n[a]
-    course = arctan2(way[:, 1], way[:, 0])
+    path_length = leg.fixes_n[b] - leg.fixes_n[a]
+    course = arctan2(path_length[:, 1], path_length[:, 0])
     reckoned = arctan2(mix @ north, mix @ east)
     return wrap(reckoned + np.asarray(sets, dtype=float)[:, 2:] - course)

@@ -11,7 +11,7 @@
 Direct nonlinear least squares of left scale, right scale and heading on all fixes.
 
 The check of the response surface, and what it says of the problem itself: condition number,
-correlations, and whether positions tell left from right at all.
+correlations, and whether positions separate left and right at all.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from odocal_ros.patent.space import sets_of, Space
 SETTLED = 1e-11      # judgement: relative, rad, the last step
 HALVINGS = 40    # judgement: of a step, at most
 DIFFERENCE = np.array([-1.0, 1.0, 0.0])    # definition: right less left
-BENT = 1e-4          # judgement: of the way, what gyro, slip and tyres bend any track by
+BENT = 1e-4          # judgement: of path length: bend of any track by gyro, slip and tyres
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,12 @@ class LeastSquares:
     """
     What least squares say; x as in ``space``.
 
-    covariance : (3, 3) of x by the scatter of the residuals, those alike in a row counted as
-        fewer; where the difference was held, left and right err alike. Errors of start, gyro and
+    covariance : (3, 3) of x by the scatter of the residuals, correlated ones counted as
+        fewer; where the difference was held, left and right err equally. Errors of start, gyro and
         lever arm are not in it.
     condition : of the Jacobian by relative left, right scale (or both) and heading in rad.
     sigma_difference : of right less left, relative; besides the scatter it allows for a track
-        bent by BENT of the way, which the difference of the wheels would explain as well.
+        bent by BENT of path length, which the difference of the wheels would explain as well.
     """
 
     x: NDArray[np.float64]
@@ -155,7 +155,7 @@ def _sigma_difference(J: Floats, covariance: Floats) -> float:
 
 def repeats(rows: Floats) -> float:
     """
-    Return how many residuals in a row say the same: 1 for white ones, many for a drift.
+    Return the number of correlated residuals: 1 for white ones, many for a drift.
 
     rows : (2, k). One and twice the sum of their autocorrelations up to the first negative one.
     """

@@ -85,7 +85,7 @@ class Embodiment:
         return self.direct.sigma_difference * self.radius
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what ``odocal patent --json`` prints."""
+        """Return the output of ``odocal patent --json``."""
         return {'radius': self.radius, 'rows': [vars(row) for row in self.rows],
                 'imbalance': self.imbalance, 'orthogonal_rows': self.least,
                 'response_surface': {'iterations': self.refined.iterations,
@@ -94,11 +94,11 @@ class Embodiment:
                 'least_squares': {'condition_number': float(self.direct.condition),
                                   'correlation': float(self.direct.correlation[0, 1]),
                                   'sigma_right_less_left_m': float(self.sigma_radius)},
-                'told_apart': self.told_apart}
+                'told_apart': self.separable}
 
     @property
-    def told_apart(self) -> bool:
-        """Tell whether the fixes say more of left against right than the range does."""
+    def separable(self) -> bool:
+        """Return True if the fixes constrain left against right better than the range does."""
         return bool(self.sigma_radius <= np.sqrt(2) * 3 * RADIUS_STEP / 2)
 
 

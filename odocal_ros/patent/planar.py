@@ -116,7 +116,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
     """Return (c, 2) rows of fixes, end to end, each pair far enough apart for a course."""
     if not len(fixes_n):
         return np.empty((0, 2), np.int64)
-    course_baseline = 10.0    # m, least way between two fixes that give a course
+    course_baseline = 10.0    # m, minimum path between two fixes for a course
     course_clear = 20.0    # fix sigmas, the same: the course is then good to 4 deg
     need = max(course_baseline, course_clear * float(np.median(sigma)))
     x, y = fixes_n.T.tolist()
@@ -129,7 +129,7 @@ def course_pieces(fixes_n: Floats, sigma: Floats) -> Ints:
 
 
 def coefficients(sets: Floats) -> Floats:
-    """Return what mixes the rows of ``PlanarLeg.basis``, of (m, 3) sets: (m, 5)."""
+    """Return the coefficients of the rows of ``PlanarLeg.basis``, for (m, 3) sets: (m, 5)."""
     left, right, heading = np.asarray(sets, dtype=float).T
     return np.stack([left / 2, right / 2, np.ones_like(left), -np.cos(heading),
                      -np.sin(heading)], -1)

@@ -33,8 +33,8 @@ from odocal_ros.patent.space import NAMES, sets_of, Space
 from odocal_ros.patent.surface import refine, Refined
 from odocal_ros.reasons import Code, Reason
 
-HEADING_MEANS = ('counter-clockwise turn of the track: error of the configured heading less the '
-                 'yaw mounting angle, which positions cannot tell apart')
+HEADING_MEANS = ('counter-clockwise rotation of the track: error of the configured heading minus '
+                 'yaw mounting angle, which positions cannot separate')
 MOST_ROWS = 100      # judgement: of an array kept in calibration.json
 
 
@@ -45,9 +45,9 @@ class SearchResult:
 
     start : scales before, m per unit.   sets, scores : of the array's rows.
     best : the row with the least mean distance (robust: loss), ties by the largest.
-    meets : its maximum and mean are within the asked accuracy, None where none is asked.
+    meets : its maximum and mean meet the required accuracy, None without one.
     refined : by response surfaces.   direct : by least squares.   free : least squares with left
-    and right free; the same unless held.   held : the fixes do not tell left from right, and
+    and right free; the same unless held.   held : the fixes do not separate left and right, and
     their ratio was kept at the start values.   before, after : criteria of the start values and
     of the refined ones, one row each.
     """
@@ -70,7 +70,7 @@ class SearchResult:
     reasons: tuple[Reason, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what belongs into calibration.json, angles in deg."""
+        """Return the content for calibration.json, angles in deg."""
         r, d = self.refined, self.direct
         shown = np.arange(len(self.sets))
         if len(shown) > MOST_ROWS:      # the best ones, in the order of the array
@@ -148,7 +148,7 @@ def search(leg: PlanarLeg, ranges: Ranges, robust: bool = False,
     meets = None if accuracy is None else bool(
         scores.max[best] <= accuracy[0] and scores.mean[best] <= accuracy[1])
     free = direct = least_squares(leg, x[best], Space(held=False), robust)
-    held = not _told_apart(free, ranges)
+    held = not _separable(free, ranges)
     space = Space(held)
     if held:
         direct = least_squares(leg, x[best], space, robust)
@@ -177,9 +177,9 @@ def _wrapped(parameters: Floats) -> Floats:
     return np.array([*parameters[:2], wrap(parameters[2])])
 
 
-def _told_apart(free: LeastSquares, ranges: Ranges) -> bool:
+def _separable(free: LeastSquares, ranges: Ranges) -> bool:
     """
-    Tell whether the fixes say more of the wheels' difference than the range does.
+    Return True if the fixes constrain the wheel difference better than the range.
 
     The range is twice the stated error of each wheel, the sigma of their difference follows.
     """
@@ -192,17 +192,17 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
     if held:
         sigma = 100 * free.sigma_difference
         good = f'to {sigma:.2g} % at best' if sigma < 100 else 'not at all'
-        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, 'positions alone tell left from right '
+        found.append(Reason(Code.WHEELS_NOT_SEPARABLE, 'positions separate left and right wheel '
                             f'{good} (condition number {free.condition:.2g}, correlation '
                             f'{free.correlation[0, 1]:+.6f}): the search moved both together'))
     if refined.widened:
         grown = [f'{name} +-{_amount(k, a)} to +-{_amount(k, b)}' for k, (name, a, b) in enumerate(
             zip(NAMES, ranges.half, refined.half, strict=True)) if b > a]
-        found.append(Reason(Code.SEARCH_WIDENED, 'the minimum lay on the edge of the range '
-                            f'searched, which was widened: {", ".join(grown)}'))
+        found.append(Reason(Code.SEARCH_WIDENED, 'the minimum was on the edge of the search '
+                            f'range, which was widened: {", ".join(grown)}'))
     if not refined.settled or refined.on_edge:
         where = 'ends on the edge of the widest range' if refined.on_edge else \
-            f'has not settled after {refined.iterations} response surfaces'
+            f'has not converged after {refined.iterations} response surfaces'
         found.append(Reason(Code.SEARCH_NOT_SETTLED, f'the search {where}'))
     else:
         apart = np.abs(refined.x - direct.x)
@@ -210,8 +210,8 @@ def _reasons(ranges: Ranges, refined: Refined, direct: LeastSquares, free: Least
         share = float((apart / ranges.half).max())
         agree = 1e-3    # of the range: surface and least squares are one
         if share > agree or not direct.settled:
-            found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares part '
-                                f'by {100 * share:.2g} % of the range'))
+            found.append(Reason(Code.SEARCH_NOT_SETTLED, 'response surface and least squares '
+                                f'differ by {100 * share:.2g} % of the range'))
     return tuple(found)
 
 

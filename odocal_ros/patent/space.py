@@ -12,8 +12,8 @@ The parameters of the search: relative change of each wheel's scale, and heading
 
 Outside they are the patent's: x = (left, right, heading), scale = start value (1 + x). Inside the
 search moves by mean, difference and heading, in which the criterion's long valley is no slant:
-left and right alike move the track by the distance, their difference by the track width at most.
-Where the fixes cannot tell left from right, the difference is held and two coordinates are left.
+left plus right moves the track by the distance, their difference by the track width at most.
+If the fixes cannot separate left and right, the difference is held and two coordinates are left.
 """
 
 from dataclasses import dataclass

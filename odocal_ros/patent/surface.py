@@ -10,8 +10,8 @@
 """
 Response surface: a second-order polynomial fitted to a criterion, its minimum in the range.
 
-The box of points to which it is fitted then moves there and shrinks, until the parameters settle.
-Where the minimum lies on the edge of the range, the range is widened.
+The box of fitted points then moves there and shrinks, until the parameters converge. If
+the minimum lies on the edge of the range, the range is increased.
 """
 
 from collections.abc import Callable
@@ -81,7 +81,7 @@ def fit_surface(y: Floats, values: Floats) -> Surface:
 
 def minimum_in_box(gradient: Floats, hessian: Floats, low: Floats, high: Floats) -> Floats:
     """
-    Return where a quadratic is least in a box: exact, whatever the signs of its curvature.
+    Return the minimum of a quadratic in a box: exact for any signs of its curvature.
 
     The minimum is stationary on one of the box's faces (the inside and the corners among them),
     and of three parameters there are but 27.
@@ -165,7 +165,7 @@ class _Walk:
         return fit_surface(self.grid, self.values)
 
     def step(self, surface: Surface) -> bool:
-        """Move to the surface's minimum in the range, shrink the box; tell whether it settled."""
+        """Move to the surface's minimum in the range, shrink the box; return if it settled."""
         S, bound = self.space.S, self.space.bounds(self.half)
         v = S @ self.q
         # y = (q - q0) / w, and what the range bounds is v = S q, here in half ranges
@@ -194,7 +194,7 @@ class _Walk:
         return done
 
     def _to_best_of_grid(self, bound: Floats) -> Bools:
-        """Move to the best fitted point within the range; tell where it is an end of the box."""
+        """Move to the best fitted point within the range; return where it is an end of the box."""
         points = self.q + self.grid * self.w
         allowed = (np.abs(points @ self.space.S.T) <= bound).all(axis=1)
         k = int(np.argmin(np.where(allowed, self.values, np.inf)))

@@ -28,15 +28,14 @@ def text_of(table: Embodiment, fix_noise: str, truth: tuple[float, float, float]
     lines += [f'  {row.name:22} {row.left:+9.5f} {row.right:+9.5f} {row.heading_deg:+9.4f} '
               f'{row.criteria["max"]:9.3f} {row.criteria["mean"]:9.3f} {row.criteria["rms"]:9.3f}'
               for row in table.rows]
-    lines += ['', f'array of 81: counts of pairs off even by {table.imbalance:.2f} at most; an '
+    lines += ['', f'array of 81: counts of pairs deviate by {table.imbalance:.2f} at most; an '
               f'orthogonal one needs {table.least}',
-              f'response surface: {r.iterations} fits, {"" if r.settled else "not "}settled, '
+              f'response surface: {r.iterations} fits, {"" if r.settled else "not "}converged, '
               f'{"" if r.on_edge else "not "}on the edge of the range; R^2 '
               f'{r.first.r_squared:.4f} first, {r.last.r_squared:.7f} last',
               f'least squares: condition number {d.condition:.3g}, correlation of left and right '
-              f'{d.correlation[0, 1]:+.7f};\n  right less left is known to '
+              f'{d.correlation[0, 1]:+.7f};\n  right minus left has an uncertainty of '
               f'{table.sigma_radius:.3g} m']
-    if not table.told_apart:
-        lines.append('left and right are not told apart by these fixes: read the lines '
-                     '"wheels together"')
+    if not table.separable:
+        lines.append('these fixes do not separate left and right: use the lines "wheels together"')
     return '\n'.join(lines) + '\n'

@@ -11,7 +11,7 @@
 Pass or fail of a calibration against limits: what a line's end must know.
 
 A value passes where all within two sigma of it lies within its limits, and fails where all of it
-lies outside; else it is not decided, and more must be driven. With an honest sigma a vehicle that
+lies outside; else it is not decided, and more must be driven. With a correct sigma a vehicle that
 is on a limit or beyond passes in 2.3 % of all cases at most, and one within its limits fails in no
 more (docs/fleet.md).
 """
@@ -76,7 +76,7 @@ class Acceptance:
 
 
 def decide(value: float, sigma: float, low: float, high: float) -> Decision:
-    """Return whether a value surely lies within its limits (PASS), or surely outside (FAIL)."""
+    """Return PASS for a value certainly within its limits, FAIL if certainly outside."""
     least, most = value - LIMIT_SIGMAS * sigma, value + LIMIT_SIGMAS * sigma
     if low <= least and most <= high:
         return Decision.PASS
@@ -124,18 +124,18 @@ def hold(name: str, found: Estimate, low: float, high: float) -> Held:
 
 
 def _lacking(held: Held, reasons: tuple[Reason, ...]) -> tuple[str, str]:
-    """Return why a value is not decided, and what to do about it."""
+    """Return the explanation why a value is undecided, and the remedy."""
     name, found = held.name.replace('_', ' '), held.estimate
     if found.value is None or found.sigma is None:
         about = 'scale_factor' if held.name == 'scale_ratio' else held.name
-        told = next((r for r in reasons if ABOUT.get(r.code) == about), None)
-        if held.name == 'scale_ratio' and told is None:
+        reason = next((r for r in reasons if ABOUT.get(r.code) == about), None)
+        if held.name == 'scale_ratio' and reason is None:
             return f'{name} not known', 'Set odometer.nominal_scale.'
-        return f'{name} not determined', (told or DRIVE_MORE[held.name]).remedy
+        return f'{name} not determined', (reason or DRIVE_MORE[held.name]).remedy
     if held.sigma_wanted is None:
-        return (f'{name} lies beyond its limit, by less than {LIMIT_SIGMAS:g} sigma',
+        return (f'{name} is beyond its limit, by less than {LIMIT_SIGMAS:g} sigma',
                 DRIVE_MORE[held.name].remedy)
     times = (found.sigma / held.sigma_wanted)**2
-    return (f'{name} lies within its limits, its sigma is too large: '
-            f'{held.sigma_wanted:.2g} would do, it is {found.sigma:.2g} (about '
-            f'{math.ceil(times)} times as many such legs)', DRIVE_MORE[held.name].remedy)
+    return (f'{name} is within its limits, but its sigma is {found.sigma:.2g}; the limit is '
+            f'{held.sigma_wanted:.2g} (needs about {math.ceil(times)} times as many such '
+            'legs)', DRIVE_MORE[held.name].remedy)

@@ -10,7 +10,7 @@
 """
 Alignment of a leg: which standstill, which heading source.
 
-Pure: takes screened inputs, returns an Alignment and what was found on the way.
+Pure: takes screened inputs, returns an Alignment and its reasons.
 """
 
 from collections.abc import Callable
@@ -95,7 +95,7 @@ def _from_place(inputs: Inputs, span: Floats | tuple[float, float] | None, fixes
     """
     Return C_np of the place of a standstill: east, north and up differ from those at the origin.
 
-    By 0.16 mrad for each kilometre of the way from there to the mark.
+    By 0.16 mrad for each kilometre of path from there to the mark.
     """
     if span is None or not len(fixes_n):
         return np.eye(3)
@@ -118,7 +118,7 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
     t = inputs.t_imu
     first = max(0.0, float(t[0]))
     pick = (t >= first) & (t <= min(first + MOTION_LEVEL, inputs.t_stop))
-    if pick.sum() < 2:      # the Imu falls silent at the mark: IMU_GAP will say so
+    if pick.sum() < 2:      # the IMU falls silent at the mark: IMU_GAP will say so
         pick = np.abs(t - first) <= np.sort(np.abs(t - first))[1]
     _, q_0b = attitude(t[pick], inputs.w_b[pick], np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     ends = t[pick][[0, -1]]
@@ -127,8 +127,8 @@ def _level(inputs: Inputs, spans: Floats, metres_per_unit: float, latitude: floa
         ends - 0.5, *inputs.travel.t[[0, -1]])
     level = level_in_motion(t[pick], inputs.f_b[pick], q_0b,
                             speed / np.maximum(inside, 1e-3), latitude, grade)
-    found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: levelled over '
-                   f'{t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
+    found = Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level estimated '
+                   f'over {t[pick][-1] - t[pick][0]:.0f} s of driving, gyro bias unknown '
                    f'(+-{np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h)')
     return level, grade.gyro_noise, (found,)
 
@@ -139,8 +139,8 @@ def _against_grade(noise: float, grade: Grade) -> tuple[Reason, ...]:
     noisier_at_rest = 10.0    # times the noise of the grade at rest: another gyro, or another unit
     if times <= noisier_at_rest:
         return ()
-    unit = ', as one that sends deg/s would be' if 30 < times < 120 else ''
-    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'at rest the gyro is {times:.0f} times as noisy as '
+    unit = ', so its unit is probably deg/s' if 30 < times < 120 else ''
+    return (Reason(Code.IMU_WORSE_THAN_GRADE, f'gyro noise at rest is {times:.0f} times that of '
                    f'its grade{unit}'),)
 
 
@@ -187,7 +187,7 @@ def _fixed(inputs: Inputs, level: Level, latitude: float, grade: Grade, config: 
 
 
 def _turn_since(inputs: Inputs, level: Level) -> float:
-    """Return how far b has turned about the vertical from the level's epoch to the mark, rad."""
+    """Return the rotation of b about the vertical from the epoch of the level to the mark, rad."""
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= 0.0)
     if pick.sum() < 2:
         return 0.0
@@ -223,13 +223,13 @@ def _from_quaternions(t: Floats, q: Floats, variance: Floats, level: Level, conf
         away = np.where(pick, np.abs(t - level.t), np.inf)
         pick = (away <= heading_reach) & (away == away.min(initial=np.inf))
     if not pick.any():
-        return None, 'no orientation is sent at the start (covariance[0] = -1, or no message)'
+        return None, 'no orientation at the start (covariance[0] = -1, or no message)'
     C = to_b(matrix_from_quat(q[pick]))
     yaw = np.arctan2(C[:, 1, 0].mean(), C[:, 0, 0].mean()) + offset
     stated = float(np.median(variance[pick]))
     sigma = np.sqrt(stated) if stated > 0 else config.alignment.heading_sigma
     if sigma > HEADING_LIMIT:
-        return None, f'its covariance says +-{np.rad2deg(sigma):.3g} deg'
+        return None, f'its covariance is +-{np.rad2deg(sigma):.3g} deg'
     return (float(wrap(yaw)), float(sigma)), ''
 
 
@@ -239,13 +239,13 @@ def _gyrocompass(inputs: Inputs, level: Level, latitude: float, grade: Grade,
         return None, 'needs a standstill'
     yaw, sigma = gyrocompass(level, latitude, grade)
     if sigma > COMPASS_LIMIT:
-        return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) leaves '
-                      f'{np.rad2deg(min(sigma, np.pi)):.1f} deg of heading')
+        return None, (f'the gyro bias ({np.rad2deg(grade.gyro_bias) * 3600:.3g} deg/h) causes a '
+                      f'heading uncertainty of {np.rad2deg(min(sigma, np.pi)):.1f} deg')
     off = off_the_earth(level, latitude, grade)
     no_earth_sigmas = 4.0    # sigmas: a gyro with such a bias is no compass
     if off > no_earth_sigmas:
-        return None, (f'at rest the gyro does not show the turn of the Earth, by {off:.0f} sigma: '
-                      f'its bias is not that of the {config.imu.grade} grade')
+        return None, (f'the turn rate at rest differs from the Earth rate by {off:.0f} sigma: '
+                      f'the gyro bias exceeds the {config.imu.grade} grade')
     return (yaw, sigma), ''
 
 
@@ -257,7 +257,7 @@ def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Float
             grade: Grade) -> tuple[float, float, tuple[Reason, ...]]:
     """Return the yaw that turns the first 30 m of track onto the fixes, its sigma, reasons."""
     trial = complete(level, 0.0, np.pi, 'course', True, origin.latitude, grade, 0.0)
-    course_time = 300.0    # s within which the way for a course must be driven
+    course_time = 300.0    # s within which the path for a course must be driven
     pick = (inputs.t_imu >= level.t) & (inputs.t_imu <= max(0.0, level.t) + course_time)
     t, q_nb = attitude(inputs.t_imu[pick], inputs.w_b[pick] - trial.gyro_bias, trial.q_nb,
                        earth_rate_n(origin.latitude))
@@ -273,5 +273,5 @@ def _course(inputs: Inputs, level: Level, metres_per_unit: float, fixes_n: Float
             k = int(np.argmax(long_enough))
             yaw = np.arctan2(true[k, 1], true[k, 0]) - np.arctan2(dr[k, 1], dr[k, 0])
             return float(wrap(yaw)), float(np.sqrt(2) * sigma_fix / np.hypot(*dr[k])), ()
-    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course either: the fixes do not move '
+    return 0.0, np.pi, (Reason(Code.HEADING_UNAVAILABLE, 'no course: the fixes move less than '
                                f'{COURSE_DISTANCE:.0f} m within {course_time:.0f} s'),)

@@ -8,12 +8,12 @@
 # the License.
 
 """
-Where legs begin and end by themselves (``leg.automatic``): one search for both doors.
+Start and end of automatic legs (``leg.automatic``): one search for node and replay.
 
 It goes by the stamps of the rows alone, so that a recording gives the legs that the node had. A
 leg begins where the vehicle drives off, and ends at the first standstill after half of
 ``leg.automatic_minutes``, at any long one, or when the minutes are over, in motion: the next one
-then begins where it ended. A gap of the Imu that no leg survives lies between two legs.
+then begins where it ended. A gap of the IMU that no leg survives lies between two legs.
 """
 
 from collections import deque
@@ -49,7 +49,7 @@ class LegSearch:
     """
     Finds legs in rows as they come; ``spans`` holds them, the open one last.
 
-    The rows of the odometer decide, once the Imu has passed them; how they were chopped into
+    The rows of the odometer decide, once the IMU has passed them; how they were chopped into
     blocks leaves no trace.
     """
 
@@ -63,10 +63,10 @@ class LegSearch:
         surveyed = config.reference.start and config.reference.end
         self._first_ns = dict.fromkeys(('imu', 'odometer') + (() if surveyed else ('fix',)), 0)
         self.spans: deque[Span] = deque()
-        most_waiting = 200_000    # odometer rows that wait for the Imu
+        most_waiting = 200_000    # odometer rows that wait for the IMU
         # stamp and travel of odometer rows
         self._waiting: deque[tuple[int, float]] = deque(maxlen=most_waiting)
-        self._gaps: deque[tuple[int, int]] = deque()         # of the Imu: both edges
+        self._gaps: deque[tuple[int, int]] = deque()         # of the IMU: both edges
         self._imu_ns = 0
         self._travel = 0.0
         self._anchor: tuple[int, float] | None = None        # where it moved last
@@ -84,7 +84,7 @@ class LegSearch:
             return
         self._first_ns[slot] = self._first_ns[slot] or int(block.stamp_ns[0])
         if slot == 'imu':
-            self._hear(block.stamp_ns)
+            self._receive(block.stamp_ns)
         elif isinstance(block, OdometerSamples) and slot == 'odometer' and form is not None:
             self._steps = self._steps or Steps(form)
             self._still = self._steps.still
@@ -104,14 +104,14 @@ class LegSearch:
         self.spans.clear()
         self._from_ns, self._needs_rest = after_ns, at_rest
 
-    def _hear(self, stamps: Ints) -> None:
+    def _receive(self, stamps: Ints) -> None:
         known = np.append(self._imu_ns or stamps[0], stamps[stamps > self._imu_ns])
         for k in np.flatnonzero(np.diff(known) > self._max_gap_ns):
             self._gaps.append((int(known[k]), int(known[k + 1])))
         self._imu_ns = int(known.max())
 
     def _decide(self) -> None:
-        """Go through the rows that the Imu has passed."""
+        """Go through the rows that the IMU has passed."""
         if not all(self._first_ns.values()):
             return
         first_ns = max(self._first_ns.values())
@@ -168,7 +168,7 @@ class LegSearch:
 
 
 def refusal(result: LegResult) -> Reason | None:
-    """Return why a leg that nobody asked for is dropped: what it is rejected for, None if not."""
+    """Return the rejecting reason of a dropped automatic leg, None if it is kept."""
     if result.verdict is not Verdict.REJECTED:
         return None
     every = (*result.reasons, *(r for m in result.methods.values() for r in m.reasons))
@@ -178,7 +178,7 @@ def refusal(result: LegResult) -> Reason | None:
 
 def fold(legs: Iterable[LegResult], config: Config,
          carried: Carried | None = None) -> Carried | None:
-    """Return what is carried on with some legs taken in, by time."""
+    """Return the carried information including some legs, by time."""
     for leg in legs:
         carried = combine([leg], config, carried).carried or carried
     return carried

@@ -95,7 +95,7 @@ def calibrate(leg: Leg, config: Config, alignment: Alignment | None = None,
 
 def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
     """
-    Return what lowers the verdict of a leg, as ``calibrate`` has it, but for what methods say.
+    Return the reasons of a leg as in ``calibrate``, without those of its methods.
 
     A leg that is not over may be given, as ``screened`` has it: what more of a drive cures is left
     out.
@@ -108,7 +108,7 @@ def faults(leg: Leg, seen: Screened, config: Config) -> tuple[Reason, ...]:
 
 
 def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened:
-    """Return what a leg is made of, facing up."""
+    """Return the inputs of a leg, z up."""
     inputs, found = screen(leg, config)
     reasons = (*notes, *found)
     missing = _missing(leg, inputs)
@@ -124,7 +124,7 @@ def screened(leg: Leg, config: Config, notes: Sequence[Reason] = ()) -> Screened
 
 
 def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
-    """Return where a counter without a sign shows in the smoother's slips, (m, 2) s, and scale."""
+    """Return intervals of an unsigned counter in the smoother's slips, (m, 2) s, and the scale."""
     smoother = result.methods.get('smoother')
     scale = None if smoother is None else smoother.estimates['scale_factor'].value
     if smoother is None or not scale:
@@ -133,12 +133,12 @@ def _reversed(result: LegResult, inputs: Inputs) -> tuple[Floats, float | None]:
 
 
 def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
-    """Return what a leg lacks for any method to be tried."""
+    """Return the data that a leg lacks for any method."""
     missing = []
     if leg.stop_ns <= leg.start_ns:
         missing.append(Reason(Code.LEG_TOO_SHORT, 'the stop mark is not after the start mark'))
     for n, least, code, what in (
-            (len(inputs.t_imu), 4, Code.NO_IMU, 'Imu'),
+            (len(inputs.t_imu), 4, Code.NO_IMU, 'IMU'),
             (len(inputs.travel.t), 2, Code.NO_ODOMETER, 'odometer')):
         if n < least:
             missing.append(Reason(code, f'{n} usable {what} messages'))
@@ -148,6 +148,6 @@ def _missing(leg: Leg, inputs: Inputs) -> list[Reason]:
 
 
 def _turned_over(inputs: Inputs) -> Inputs:
-    """Return inputs with a forward-right-down Imu read as what it is."""
+    """Return inputs with a forward-right-down IMU read as what it is."""
     C = matrix_from_rpy([np.pi, 0.0, 0.0])
     return replace(inputs, w_b=inputs.w_b @ C.T, f_b=inputs.f_b @ C.T, C_bi=C @ inputs.C_bi)

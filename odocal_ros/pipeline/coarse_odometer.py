@@ -24,7 +24,7 @@ NAME = 'speed_truncation'
 
 def half_step(inputs: Inputs) -> float:
     """
-    Return how much of the way half a step of the speed is, 0.0 where there are no steps.
+    Return half a step of the speed relative to the path length, 0.0 without steps.
 
     Speeds sent are too low by that on the mean where the sender truncates, by nothing where it
     rounds, and the grid does not say which.
@@ -46,13 +46,13 @@ def held_steps(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
 
 
 def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
-    """Say that speed or counts come in coarse steps."""
+    """Return the reasons for coarse steps of speed or counts."""
     K, size = placed.nominal or placed.rough, half_step(inputs)
     count = inputs.travel.quantum * K
     coarse_count_m = 0.2    # m, a count that is
     if count > coarse_count_m:
-        return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m: each reading is late '
-                       'by up to that')]
+        return [Reason(Code.COUNTER_COARSE, f'one count is {count:.2f} m, so each reading lags '
+                       'by up to this distance')]
     coarse = _coarse(inputs)
     coarse_worth = 5e-4    # of the scale: half a step that is worth a word
     if coarse is None or coarse.truncation and size < coarse_worth:
@@ -61,14 +61,14 @@ def coarse_reasons(inputs: Inputs, placed: Placed) -> list[Reason]:
     sent = f'{coarse.step:.3g} rad/s ({metres:.3g} m/s)' if inputs.scale_unit == 'm/rad' \
         else f'{coarse.step:.3g} m/s ({3.6 * coarse.step:.3g} km/h)'
     if not coarse.truncation:
-        return [Reason(Code.SPEED_ON_CHANGE, 'the odometer repeats its speed until it has changed '
-                       f'by {sent}; half a step is added towards the last change')]
-    between = ', with values interpolated in between' if coarse.interpolated else ''
-    return [Reason(Code.SPEED_COARSE, f'the odometer sends whole steps of {sent}{between}: '
-                   f'what they add up to is {100 * size:.2g} % too little if they are truncated')]
+        return [Reason(Code.SPEED_ON_CHANGE, 'odometer speed repeats until it has changed by '
+                       f'{sent}; half a step is added in the direction of the last change')]
+    between = ', with interpolated values between' if coarse.interpolated else ''
+    return [Reason(Code.SPEED_COARSE, f'odometer resolution is {sent}{between}; if truncated, '
+                   f'the distance is {100 * size:.2g} % too short')]
 
 
 def _coarse(inputs: Inputs) -> CoarseSpeed | None:
     """Return the grid of the speed, of one of two wheels, None where there is none."""
     each = (inputs.travel, inputs.travel_left, inputs.travel_right)
-    return next((way.coarse for way in each if way is not None and way.coarse), None)
+    return next((travel.coarse for travel in each if travel is not None and travel.coarse), None)

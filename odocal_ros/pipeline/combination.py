@@ -28,7 +28,7 @@ from odocal_ros.settings.levels import DAY_NS
 from odocal_ros.settings.nominal import nominal_scale
 
 PER_LEG = {Code.SCALE_SIGMA_TOO_LARGE, Code.YAW_SIGMA_TOO_LARGE, Code.SCALE_FAR_FROM_NOMINAL}
-# the same of legs that are combined on their border: all of them may tell what none does
+# the same of legs that are combined by marginal information: all may determine what none does
 ON_BORDER = {Code.YAW_NOT_DETERMINED, Code.PITCH_NOT_DETERMINED, Code.PARAMETER_NOT_DETERMINED,
              Code.YAW_FAR_FROM_NOMINAL}
 SMOOTHER = 'smoother'      # the method whose legs are combined on their border
@@ -47,9 +47,9 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
     config : Config
         Limits, frames.
     carried : Carried, optional
-        What earlier legs tell of the vehicle.
+        Information of earlier legs on the vehicle.
     imu : Carried, optional
-        What other legs tell of its Imu, where nothing is carried.
+        Information of other legs on its IMU, if nothing is carried.
 
     Returns
     -------
@@ -92,20 +92,20 @@ def combine(legs: Sequence[LegResult], config: Config, carried: Carried | None =
 
 
 def _belongs(carried: Carried, legs: Sequence[LegResult]) -> bool:
-    """Tell whether legs are of the odometer of earlier ones, and driven after them."""
+    """Return True if legs have the odometer of earlier ones and were driven after them."""
     smoothed = [leg.methods[SMOOTHER] for leg in legs if SMOOTHER in leg.methods]
     return all(m.estimates['scale_factor'].unit == carried.unit for m in smoothed) \
         and min(leg.start_ns for leg in legs) > carried.last_ns
 
 
 def _of_others(imu: Carried, legs: Sequence[LegResult]) -> bool:
-    """Tell whether none of the legs may be among those that told of the Imu."""
+    """Return True if none of the legs can be among those that determined the IMU constants."""
     return not any(imu.first_ns <= leg.start_ns <= imu.last_ns for leg in legs)
 
 
 def _carried_on(methods: Mapping[str, MethodResult], good: Sequence[LegResult],
                 before: Carried | None) -> Carried | None:
-    """Return what legs leave for those to come, None where they tell nothing."""
+    """Return the marginal information of legs for later ones, None without any."""
     whole = methods.get(SMOOTHER)
     times = [leg.start_ns for leg in good if SMOOTHER in leg.methods
              and leg.methods[SMOOTHER].verdict is not Verdict.REJECTED]
@@ -130,7 +130,7 @@ def driven_twice(legs: Sequence[LegResult]) -> list[LegResult]:
 def together(name: str, results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
              numbers: Sequence[int] | None = None, carried: Carried | None = None) -> MethodResult:
     """
-    Return what a method says of several legs, and of those carried on where it can.
+    Return the result of a method for several legs, including carried ones if possible.
 
     results : sequence of MethodResult, one a leg.   times_ns, numbers : as for ``combine_legs``.
     """
@@ -178,8 +178,7 @@ def _leg_reasons(legs: Sequence[LegResult], good: Sequence[LegResult], twice: Se
                                if alone or r.code not in PER_LEG
                                and not (m.border and r.code in ON_BORDER))]
         if leg in twice:
-            reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}covers time that an earlier leg '
-                                  'covers; not used'))
+            reasons.append(Reason(Code.LEGS_OVERLAP, f'{prefix}overlaps an earlier leg; not used'))
         elif good and leg not in good:
             every = [*leg.reasons, *(r for m in leg.methods.values() for r in _further(m, leg))]
             reasons.append(Reason(Code.LEG_REJECTED, f'{prefix}rejected and not used: '
@@ -201,7 +200,7 @@ def _further(method: MethodResult, leg: LegResult) -> list[Reason]:
 
 
 def _why(reasons: Sequence[Reason]) -> str:
-    """Return what rejects, in words."""
+    """Return the rejecting reasons as text."""
     return '; '.join(dict.fromkeys(r.text for r in reasons
                                    if r.code.gravity is Verdict.REJECTED))
 

@@ -17,7 +17,7 @@ from odocal_ros.pipeline.prepared import PreparedLeg
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-WHAT = {'gnss': 'fixes', 'odometer': 'odometer'}
+WHAT = {'gnss': 'fix', 'odometer': 'odometer'}
 
 
 def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
@@ -37,20 +37,20 @@ def delay_notes(prepared: PreparedLeg, seen: Mapping[str, tuple[float, float]],
     """
     speed = _speed(prepared) * scale
     notes = []
-    least_delay_way = 0.1    # m: a lever arm need not be known better either
+    least_delay_path = 0.1    # m: a lever arm need not be known better either
     hidden_by_fix = 0.25    # of a fix's sigma: what a delay makes of less, no fix shows
     for name, (late, sigma) in seen.items():
-        way = abs(late) * speed
-        worth = max(least_delay_way, hidden_by_fix * prepared.fix_sigma)
-        if not (abs(late) > REMARK_SIGMAS * sigma and way > worth):
+        metres = abs(late) * speed
+        worth = max(least_delay_path, hidden_by_fix * prepared.fix_sigma)
+        if not (abs(late) > REMARK_SIGMAS * sigma and metres > worth):
             continue
         set_to = getattr(prepared.config, name).time_offset
         notes.append(Reason(
-            Code.DELAY_SEEN, f'the stamps of the {WHAT[name]} are {abs(late):.3f} s '
-            f'(+-{sigma:.3f} s) {"late" if late > 0 else "early"} against the other sensors: '
-            f'{way:.2g} m at {speed:.1f} m/s. The values allow for it; '
-            f'{name}.time_offset = {set_to - late:.3f} would take it out'
-            + (f' (it is {set_to:g})' if set_to else '')))
+            Code.DELAY_SEEN, f'{WHAT[name]} stamps are {abs(late):.3f} s (+-{sigma:.3f} s) '
+            f'{"late" if late > 0 else "early"} relative to the other sensors, {metres:.2g} m at '
+            f'{speed:.1f} m/s; accounted for. To remove the delay, set {name}.time_offset to '
+            f'{set_to - late:.3f}'
+            + (f' (now {set_to:g})' if set_to else '')))
     return notes
 
 

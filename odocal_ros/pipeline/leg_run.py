@@ -41,7 +41,7 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
     """Return the result of a leg: its counts, findings and what more there is."""
     between = (inputs.t_fix >= -0.5) & (inputs.t_fix <= inputs.t_stop + 0.5)
     if 'distance' not in more:
-        more['distance'] = _way_of(inputs.t_fix[between], inputs.geodetic[between])
+        more['distance'] = _path_of(inputs.t_fix[between], inputs.geodetic[between])
     return LegResult(
         start_ns=leg.start_ns, stop_ns=leg.stop_ns, duration=inputs.t_stop,
         imu_samples=len(inputs.t_imu),
@@ -50,8 +50,8 @@ def leg_result(leg: Leg, inputs: Inputs, reasons: Sequence[Reason],
         C_bi=inputs.C_bi, **more)
 
 
-def _way_of(t_fix: Floats, geodetic: Floats) -> float:
-    """Return the way by the fixes, m: what is known of a leg that is refused."""
+def _path_of(t_fix: Floats, geodetic: Floats) -> float:
+    """Return the path length by the fixes, m, for a leg that is refused."""
     if not len(t_fix):
         return 0.0
     fixes_n = origin_amid(t_fix, geodetic).to_n(np.nan_to_num(geodetic))
@@ -59,7 +59,7 @@ def _way_of(t_fix: Floats, geodetic: Floats) -> float:
 
 
 def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResult:
-    """Return what a leg gives; ``progress`` is called as ``calibrate`` says."""
+    """Return the result of a leg; ``progress`` is called as in ``calibrate``."""
     leg, inputs, asked = prepared.leg, prepared.inputs, prepared.config.method
     names = _methods_of(prepared)
     runs = run_methods(names, prepared, _teller(names, progress))
@@ -89,7 +89,7 @@ def run_leg(prepared: PreparedLeg, progress: Callable[[Stage], None]) -> LegResu
 
 
 def _once(found: Sequence[Reason]) -> list[Reason]:
-    """Return what methods and tracks found, of fixes far off a path only what the first said."""
+    """Return the reasons of methods and tracks; those on outlier fixes only from the first."""
     far = [k for k, r in enumerate(found) if r.code is Code.BAD_ROWS_DROPPED]
     return [r for k, r in enumerate(found) if k not in far[1:]]
 
@@ -106,7 +106,7 @@ def _effort(names: Iterable[str]) -> int:
 
 def _teller(names: Iterable[str],
             progress: Callable[[Stage], None]) -> Callable[[str], Passed]:
-    """Return what tells that a method begins, and gives what tells of its passes."""
+    """Return a callback that reports the start of a method and returns one for its passes."""
     done = 0.0
 
     def begun(name: str) -> Passed:

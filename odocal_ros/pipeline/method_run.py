@@ -38,7 +38,7 @@ class MethodRun(NamedTuple):
 
     paths : None where it refuses.   found : of the data, said of the leg.   delays : 'gnss' or
     'odometer' to s late and sigma; None from a method that sees none.   odometer : slip or
-    lateness that its track shows beside the Imu, said of the leg unless a better method has
+    lateness that its track shows beside the IMU, said of the leg unless a better method has
     looked; None: it does not look.
     """
 

@@ -72,9 +72,9 @@ def run_methods(names: Iterable[str], prepared: PreparedLeg,
 
 def found_by(runs: dict[str, MethodRun], prepared: PreparedLeg) -> list[Reason]:
     """
-    Return what methods found of the data, each said once.
+    Return the reasons of methods on the data, each once.
 
-    Delays are by the best method that sees them, what the odometer does beside the Imu by the best
+    Delays are by the best method that sees them, what the odometer does beside the IMU by the best
     that looked and is not rejected, else by the first.
     """
     found: list[Reason] = []
@@ -101,14 +101,14 @@ def _doubted(run: MethodRun, prepared: PreparedLeg) -> MethodRun:
 def _guarded(name: str, prepared: PreparedLeg, work: Callable[[], MethodRun]) -> MethodRun:
     inputs = prepared.inputs
     try:
-        # what runs away is told by the number that is none, not by warnings and what follows
+        # divergence is detected by non-finite numbers, not by warnings
         with raised_if_wild():
             return work()
     except (OdocalError, MemoryError):
         raise
     except FloatingPointError as error:
         return MethodRun(UNKNOWN[name](inputs, Reason(
-            Code.NOT_CONVERGED, f'{name} ran away from any number ({error}); samples are wild or '
-            'missing')))
+            Code.NOT_CONVERGED, f'{name} diverged ({error}). Likely cause: invalid or missing '
+            'samples')))
     except Exception as error:      # what it said of the data may be as wrong: nothing of it stays
         return MethodRun(failed(lambda why: UNKNOWN[name](inputs, why), name, error))

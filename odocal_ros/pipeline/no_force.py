@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a method's result is doubted by where the Imu sent no force: ``screening/force.py``."""
+"""Additional uncertainty of a result without an accelerometer: ``screening/force.py``."""
 
 from dataclasses import replace
 
@@ -20,10 +20,10 @@ NAME = 'hills'
 
 
 def upright(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
-    """Return a method's result as it was, or of an Imu without force: hills in, no angles."""
+    """Return a method's result as it was, or of an IMU without force: hills in, no angles."""
     if prepared.inputs.felt:
         return method
-    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a way longer
+    hills = 5e-4    # of the scale: half the mean square of slopes of 3 %, which make a path longer
     method = with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, hills))
     # what NO_ACCELEROMETER says of the angles, with another remedy
     said = {Code.PITCH_NOT_DETERMINED} | (

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A leg whose Imu was silent for a while: cut there, its parts are legs of the same vehicle."""
+"""A leg whose IMU was silent for a while: cut there, its parts are legs of the same vehicle."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,9 +25,9 @@ from odocal_ros.settings.config import Config
 
 
 def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
-    """Return a leg cut where its Imu is silent for longer; itself without gaps, or of many."""
+    """Return a leg cut where its IMU is silent for longer; itself without gaps, or of many."""
     gaps = _gaps(leg, limit_s)
-    most_parts = 20    # an Imu with more gaps stutters: its leg is rejected
+    most_parts = 20    # an IMU with more gaps stutters: its leg is rejected
     if not 0 < len(gaps) < most_parts:
         return [leg]
     begins = [None, *gaps[:, 1].tolist()]
@@ -39,7 +39,7 @@ def parts_of(leg: Leg, limit_s: float) -> list[Leg]:
 
 
 def _gaps(leg: Leg, limit_s: float) -> Ints:
-    """Return begin and end of the gaps of the Imu, ns: (k, 2); one up to a mark is one, too."""
+    """Return begin and end of the gaps of the IMU, ns: (k, 2); one up to a mark is one, too."""
     near_start_ns = 60 * 10**9    # what lies nearer to the start mark belongs to the leg
     near = _near(leg.imu.stamp_ns, leg.start_ns - near_start_ns, leg.stop_ns)
     if len(near) < 2:
@@ -73,10 +73,10 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
     parts = parts_of(leg, config.leg.max_gap)
     results = []
     for k, part in enumerate(parts if len(parts) > 1 or parts[0] is not leg else ()):
-        def told(stage: Stage, k: int = k) -> None:
+        def report(stage: Stage, k: int = k) -> None:
             if progress is not None:
                 progress(replace(stage, done=(k + stage.done) / len(parts)))
-        results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=told))
+        results.append(calibrate(part, config, notes=notes, holdout=holdout, progress=report))
     good = [one for one in results if one.verdict is not Verdict.REJECTED]
     if not good:
         return [calibrate(leg, config, notes=notes, holdout=holdout, progress=progress)]
@@ -88,6 +88,8 @@ def calibrate_parts(leg: Leg, config: Config, notes: tuple[Reason, ...] = (),
 
 def _cut(leg: Leg, one: LegResult, count: int) -> Reason:
     begin, end = ((t - leg.start_ns) * 1e-9 for t in (one.start_ns, one.stop_ns))
-    return Reason(Code.LEG_CUT, f'this is the leg from {begin:.1f} to {end:.1f} s of '
-                  f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s'
-                  + (f', one of {count} parts' if count > 1 else ', the only part that carries'))
+    return Reason(Code.LEG_CUT, f'this section covers {begin:.1f} to {end:.1f} s of the '
+                  f'{(leg.stop_ns - leg.start_ns) * 1e-9:.1f} s leg'
+                  + (f', one of {count} '
+                     'sections' if count > 1 else ', the only section long enough '
+                     'to calibrate'))

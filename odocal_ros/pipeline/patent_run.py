@@ -21,7 +21,7 @@ def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
     """
     Return a leg as the patent sees it: two tracks in the plane, and fixes.
 
-    ready : PreparedLeg.   pitch : rad, of the Imu on the vehicle.   None without two wheels, or
+    ready : PreparedLeg.   pitch : rad, of the IMU on the vehicle.   None without two wheels, or
     without a fix at the start.
     """
     inputs = ready.inputs
@@ -42,7 +42,7 @@ def planar_of(ready: PreparedLeg, pitch: float) -> PlanarLeg | None:
 
 
 def search_of(ready: PreparedLeg, pitch: float) -> SearchResult | None:
-    """Return what the search finds, None with too few fixes; arguments as of planar_of."""
+    """Return the result of the search, None with too few fixes; arguments as in planar_of."""
     leg = planar_of(ready, pitch)
     if leg is None:
         return None

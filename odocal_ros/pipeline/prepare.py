@@ -106,7 +106,7 @@ def _reckoned(leg: Leg, inputs: Inputs, config: Config, placed: Placed, faces: F
 
 
 def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
-    """Return a leg whose way and speed are judged by a scale known better than the rough one."""
+    """Return a leg with distance and speed checked by a better scale than the rough one."""
     distance, judged = judge_way(prepared.track, prepared.inputs.t_stop, scale,
                                  prepared.config.leg)
     return replace(prepared, metres_per_unit=scale, distance=distance, reasons=(
@@ -114,20 +114,21 @@ def judged_by(prepared: PreparedLeg, scale: float) -> PreparedLeg:
 
 
 def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
-    """Return why there is no drive to speak of, None where there is one."""
+    """Return the explanation why there is no usable drive, None if there is one."""
     still = not_moving(inputs.travel, inputs.t_fix, placed.fixes_n, placed.fix_sigma,
                        inputs.t_stop)
     if still or not placed.rough:
-        return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little for a scale'),)
+        return still or (Reason(Code.LEG_TOO_SHORT, 'the fixes move too little to estimate a '
+                                'scale'),)
     covered = (inputs.t_imu >= 0.0) & (inputs.t_imu <= inputs.t_stop)
-    fewest_rows = 4    # of the Imu between the marks, for an attitude
+    fewest_rows = 4    # of the IMU between the marks, for an attitude
     if covered.sum() < fewest_rows:
         return imu_gap(inputs.t_imu, 0.0, inputs.t_stop, 0.0)
     return None
 
 
 def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
-    """Return how the gyro turns, where it does not turn with the course of the fixes."""
+    """Return the reason for a gyro that does not turn with the course of the fixes."""
     up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma)
@@ -136,7 +137,7 @@ def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ..
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
                    reasons: Sequence[Reason]) -> tuple[tuple[Reason, ...], WheelSlips]:
-    """Return what is wrong with two wheels beside each other, and where one slipped."""
+    """Return the faults found by comparing two wheels, and the slips of one of them."""
     odometer, left, right = config.odometer, inputs.travel_left, inputs.travel_right
     if left is None or right is None or not inputs.felt or BROKEN & {r.code for r in reasons}:
         return (), NO_SLIPS
@@ -148,8 +149,8 @@ def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,
 
 
 def _four_fifths(track: Track, t_stop: float) -> float:
-    """Return when four fifths of the distance are driven, s."""
+    """Return the time at which four fifths of the distance are driven, s."""
     inside = (track.t >= 0) & (track.t <= t_stop)
     s = track.s[inside]
-    way = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
-    return float(track.t[inside][np.searchsorted(way, 0.8 * way[-1])])
+    path_length = np.cumsum(np.abs(np.diff(s, prepend=s[:1])))
+    return float(track.t[inside][np.searchsorted(path_length, 0.8 * path_length[-1])])

@@ -39,7 +39,7 @@ class PreparedLeg(Placed):
     """
     All that methods read; what they find is theirs, so that their order does not matter.
 
-    leg, inputs, config : as screened, under the settings in force.   facing : of the Imu, None
+    leg, inputs, config : as screened, under the settings in force.   facing : of the IMU, None
     unseen.   lever_b : (3,) m, from the odometer's point to the antenna.   spans : (s, 2) s,
     standstills.   alignment : and what it had to say.   epochs : the attitude as aligned, t (m,)
     s and q_nb (m, 4).   track : of the odometer (the mean of the wheels), dead reckoned so.
@@ -104,7 +104,7 @@ class PreparedLeg(Placed):
                       self.config.gnss.correlation_time, max(MARK_WINDOW, 2.5 * rhythm))
 
     def _surveyed(self, name: str, t: float) -> tuple[float, ...]:
-        """Return the reference point at a mark, () where the way does not begin or end there."""
+        """Return the reference point at a mark, () if the path does not start or end there."""
         if not name:
             return ()
         t_mark = 0.0 if name == 'start' else self.inputs.t_stop

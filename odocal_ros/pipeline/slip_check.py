@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The odometer of a leg against the Imu's acceleration: slips that no other check has named."""
+"""The odometer of a leg against the IMU's acceleration: slips that no other check has named."""
 
 import numpy as np
 

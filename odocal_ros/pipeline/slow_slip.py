@@ -10,7 +10,7 @@
 """
 A wheel that slips all along from some moment on, or loses air: what that does to a scale.
 
-It leaves a scale between that of before and that of after; the fixes of the leg do not tell which
+It leaves a scale between that of before and that of after; the fixes do not determine which
 of them is the vehicle's.
 """
 
@@ -26,6 +26,6 @@ def held(method: MethodResult, prepared: PreparedLeg) -> MethodResult:
     change = abs(prepared.wheel_slips.change)
     if not change:
         return method
-    # halves of the way half the change apart in the mean of the wheels: the mean is a quarter off
+    # halves of the path half the change apart in the mean of the wheels: the mean is a quarter off
     return with_scale_error(method, prepared, NAME, dict.fromkeys(SCALES, change / 4)
                             | dict.fromkeys(WHEELS, change / 2))

@@ -55,7 +55,7 @@ def smoother(ready: PreparedLeg, passed: Passed) -> MethodRun:
     delays = {name: method.estimates[f'{name}_delay'] for name in ('gnss', 'odometer')}
     seen = {name: (e.value, e.sigma) for name, e in delays.items()
             if e.value is not None and e.sigma is not None}
-    # the odometer's and the fixes' stamps are mended by the delays found, else by what is set
+    # stamps of odometer and fixes are corrected by the estimated delays, else by the settings
     late = {name: e.value or 0.0 for name, e in delays.items()}
     travel = ready.inputs.travel
     t, q_nb = _attitude(ready, method.details)
@@ -74,7 +74,7 @@ def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
     found = search_of(ready, method.estimates['pitch_mounting_angle'].value or 0.0)
     if found is None:
         return method
-    # what positions alone cannot tell, the gyro may have: of that the smoother speaks itself
+    # the gyro may determine what positions do not: the smoother reports that itself
     said = (r for r in found.reasons if r.code is not Code.WHEELS_NOT_SEPARABLE)
     return replace(method, reasons=(*method.reasons, *said),
                    details=method.details | {'search': found.as_dict()})
@@ -82,7 +82,7 @@ def _with_search(method: MethodResult, ready: PreparedLeg) -> MethodResult:
 
 def _attitude(ready: PreparedLeg, details: Mapping[str, Any]) -> tuple[Floats, Floats]:
     """
-    Return the smoother's attitude at the Imu's rate: t (m,) s, q_nb (m, 4).
+    Return the smoother's attitude at the IMU's rate: t (m,) s, q_nb (m, 4).
 
     Between keyframes the gyros turn it; where they end, beyond the fixes fitted, by them alone.
     """
@@ -99,7 +99,7 @@ def _late_path(track: Track, f: Floats, lever_b: Floats, late: float) -> Path:
         inside = np.clip(t, track.t[0], track.t[-1])
         beyond = np.clip(t - inside, -abs(late), abs(late))
         P = track.at(inside)
-        onward = 0.2    # s, whose motion goes on beyond the data, by the delay
+        onward = 0.2    # s of extrapolation beyond the data, for the delay
         before = track.at(inside - np.copysign(onward, beyond))
         P = P + (P - before) * (np.abs(beyond) / onward)[..., None, None]
         let_go()        # of hours of sums, before hours of attitude are read

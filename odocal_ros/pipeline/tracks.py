@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The tracks of a leg, as configured and as calibrated, and how far they stray from the fixes."""
+"""The tracks of a leg, as configured and as calibrated, and their deviation from the fixes."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -44,7 +44,7 @@ def as_configured(ready: PreparedLeg, f: Floats, estimates: Mapping[str, Estimat
 def near(ready: PreparedLeg, path: Path, pin: MarkFix,
          between: Bools) -> tuple[Bools, tuple[Reason, ...]]:
     """
-    Tell which fixes do not lie absurdly far from a path that fits.
+    Return a mask of fixes without gross outliers from a fitting path.
 
     Returns
     -------
@@ -55,11 +55,11 @@ def near(ready: PreparedLeg, path: Path, pin: MarkFix,
         return between, ()
     off = np.hypot(*stray(path, pin, (ready.inputs.t_fix, ready.fixes_n))[:, :2].T)
     usual = max(float(np.median(off[between])), ready.fix_sigma)
-    track_outlier = 20.0    # times the usual distance from the track: an outlier beyond doubt
+    track_outlier = 20.0    # times the usual distance from the track: a certain outlier
     far = off > track_outlier * usual
     found = (Reason(
-        Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes '
-        f'lie more than {track_outlier * usual:.0f} m off the track; not used in the check'),)
+        Code.BAD_ROWS_DROPPED, f'{int((far & between).sum())} of {int(between.sum())} fixes are '
+        f'more than {track_outlier * usual:.0f} m from the track; not used in the check'),)
     return ~far, found if (far & between).any() else ()
 
 
@@ -78,18 +78,18 @@ def tracks(ready: PreparedLeg, paths: Paths) -> tuple[dict[str, Any], tuple[Reas
         name: start.position_n + path(t) - path(np.array(start.t))
         for name, path in (('track_before_n', before), ('track_n', after))}
     more |= {'origin': (ready.origin.latitude, ready.origin.longitude, ready.origin.height)}
-    pin, between, way, found = _checked(ready, after, start)
+    pin, between, path_length, found = _checked(ready, after, start)
     more['reference_n'] = ready.fixes_n[between]
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return more, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
-    more |= {name: track_check(stray(path, pin, fixes), way)
+    more |= {name: track_check(stray(path, pin, fixes), path_length)
              for name, path in (('before', before), ('after', after))}
-    way_at = np.interp(fixes[0], *driven(ready))
+    path_at = np.interp(fixes[0], *driven(ready))
     off_before, off_after = (stray(path, pin, fixes) for path in paths)
-    more['per_distance'] = per_distance(way_at, off_before, off_after)
+    more['per_distance'] = per_distance(path_at, off_before, off_after)
     kept, far = near(ready, after, start, between)
-    found += (*check_worse(way_at, off_before, off_after, bool(ready.nominal)), *far)
+    found += (*check_worse(path_at, off_before, off_after, bool(ready.nominal)), *far)
     return more | {'evidence': evidence(ready.leg, ready.inputs, ready.track, ready.fixes_n, kept,
                                         start, paths, ready.config, ready.t_fit)}, found
 
@@ -99,11 +99,11 @@ def check_of(ready: PreparedLeg, path: Path) -> tuple[dict[str, Any], tuple[Reas
     start = _start(ready, path)
     if start is None:
         return {}, ()
-    pin, between, way, found = _checked(ready, path, start)
+    pin, between, path_length, found = _checked(ready, path, start)
     if pin is None or between.sum() < FEWEST_TRACK_FIXES:
         return {}, found
     fixes = ready.inputs.t_fix[between], ready.fixes_n[between]
-    check = track_check(stray(path, pin, fixes), way)
+    check = track_check(stray(path, pin, fixes), path_length)
     return {'check': {name: getattr(check, name) for name in (
         'rms', 'max', 'mean', 'end', 'percent_of_distance')}}, found
 
@@ -115,7 +115,7 @@ def _start(ready: PreparedLeg, path: Path) -> MarkFix | None:
 
 def _checked(ready: PreparedLeg, path: Path,
              start: MarkFix) -> tuple[MarkFix | None, Bools, float, tuple[Reason, ...]]:
-    """Return where the path is pinned, which fixes it is held against, the way in m; reasons."""
+    """Return start points of the path, the fixes to compare it with, the path in m; reasons."""
     pin: MarkFix | None = start
     begin, end = start.t, ready.t_fit
     found: tuple[Reason, ...] = ()
@@ -130,6 +130,6 @@ def _checked(ready: PreparedLeg, path: Path,
 
 
 def driven(ready: PreparedLeg) -> tuple[Floats, Floats]:
-    """Return times of the track, s, and the way driven until then, m."""
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
-    return ready.track.t, way * ready.metres_per_unit
+    """Return times of the track, s, and the path length until then, m."""
+    path_length = np.append(0.0, np.cumsum(np.abs(np.diff(ready.track.s))))
+    return ready.track.t, path_length * ready.metres_per_unit

@@ -57,7 +57,7 @@ def two_point(ready: PreparedLeg, passed: Passed | None = None) -> MethodRun:
 
 
 class TwoPointRun:
-    """The method on its way over one leg."""
+    """One run of the method over a leg."""
 
     def __init__(self, ready: PreparedLeg) -> None:
         self.ready, self.inputs = ready, ready.inputs
@@ -136,7 +136,7 @@ class TwoPointRun:
         return change
 
     def _judged(self, chord: Chord, f: Floats, between: Bools) -> tuple[Chord, Floats]:
-        """Return the chord with honest marks, the factor on fix sigmas; judge the track."""
+        """Return the chord with realistic marks, the factor on fix sigmas; check the track."""
         ready = self.ready
         fixes = self.inputs.t_fix[between], ready.fixes_n[between]
         drift_n = self._drift(chord, f)
@@ -156,12 +156,12 @@ class TwoPointRun:
         return chord, factor
 
     def _drift(self, chord: Chord, f: Floats) -> Floats:
-        """Return how far the gyros may bend a track pinned at both ends: (3, k) m, 1 sigma."""
+        """Return the bend of a track, fixed at both ends, by gyro errors: (3, k) m, 1 sigma."""
         keep = epochs_between(self.track, chord.start.t, chord.end.t)
         D = displacement(self.track, keep, chord.start.t, f)
         sources = drift_sources(self.track.t[keep], D, self.track.q_nb[keep],
                                 self.ready.alignment)
-        # the bow of a pinned track is a quarter of what its free end would stray
+        # the bow of a track fixed at both ends is a quarter of the drift of a free end
         return np.concatenate(list(sources.values()), axis=1) / 4
 
     def _noise_factor(self, residual: Floats, covariance: Floats, drift: float,
@@ -169,9 +169,8 @@ class TwoPointRun:
         factor = fix_noise_factor(residual, covariance, drift, (chord.start, chord.end))
         if factor.max() > 1.0:
             self.reasons.append(Reason(
-                Code.FIXES_NOISIER_THAN_SAID, 'the fixes stray from the track '
-                f'{factor[0]:.1f} times (in height {factor[2]:.1f} times) as far as their '
-                'covariance says'))
+                Code.FIXES_NOISIER_THAN_SAID, f'the fixes deviate from the track {factor[0]:.1f} '
+                f'times (in height {factor[2]:.1f} times) as much as their covariance states'))
         return factor
 
     def _judge_track(self, chord: Chord, f: Floats, fixes: tuple[Floats, Floats], residual: Floats,
@@ -191,9 +190,9 @@ class TwoPointRun:
                                           ready.distance)
 
     def _reversed(self, chord: Chord) -> None:
-        """Say that the odometer counts down where nothing tells how the Imu is pushed."""
+        """Return the reason for an odometer that counts down without a known IMU orientation."""
         backwards = chord.M[:2, 0] @ chord.M[:2, 0] > 0 and self.track.s[-1] < self.track.s[0]
         if backwards and self.ready.facing is None and not chord.alignment.heading_separable:
             self.found.append(Reason(
-                Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive '
-                'counts mean backwards, or the vehicle was reversed all the way'))
+                Code.ODOMETER_REVERSED, 'the odometer counts down over the leg: positive counts '
+                'mean backwards, or the vehicle reversed during the whole leg'))

@@ -7,4 +7,4 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a drive will tell before it is driven."""
+"""Prediction of a planned drive."""

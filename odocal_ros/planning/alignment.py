@@ -58,7 +58,7 @@ def plan_alignment(drive: PlannedDrive, config: Config, fix_sigma: float,
     else:
         level = _level_in_motion(drive, grade)
         found = (Reason(Code.NO_STANDSTILL, 'no standstill before the start mark: level and gyro '
-                        'bias come from the drive itself'),)
+                        'bias are estimated from the drive'),)
     yaw, sigma, source, why = _heading(drive, config.alignment, fix_sigma, level, grade)
     alignment = complete(level, yaw, sigma, source, source != 'gyrocompass', drive.latitude,
                          grade, grade.gyro_noise)
@@ -104,12 +104,12 @@ def _heading(drive: PlannedDrive, config: AlignmentConfig, fix_sigma: float, lev
             _, sigma = gyrocompass(level, drive.latitude, grade)
             if sigma <= COMPASS_LIMIT:
                 return yaw, sigma, 'gyrocompass', ()
-            unable = (f'the gyro bias leaves {np.rad2deg(min(sigma, np.pi)):.1f} deg of '
-                      'heading')
+            unable = ('the gyro bias causes a heading uncertainty of '
+                      f'{np.rad2deg(min(sigma, np.pi)):.1f} deg')
         if source == 'gyrocompass':
             why = (Reason(Code.GYROCOMPASS_REFUSED, f'heading from gyrocompass: {unable}'),)
         source = 'course'
     if source in OWN_SOURCES:
         return yaw, config.heading_sigma, source, ()
-    way = max(COURSE_DISTANCE, 8 * fix_sigma)
-    return yaw, float(np.sqrt(2) * fix_sigma / way), 'course', why
+    path_length = max(COURSE_DISTANCE, 8 * fix_sigma)
+    return yaw, float(np.sqrt(2) * fix_sigma / path_length), 'course', why

@@ -48,9 +48,9 @@ class PlannedDrive:
         if len({row.shape for row in rows.values()}) > 1 or rows['t'].ndim != 1:
             raise BadUsage('the planned drive needs one speed, yaw and slope for each time')
         if not all(np.isfinite(row).all() for row in rows.values()):
-            raise BadUsage('the planned drive holds numbers that are not finite; mend its source')
+            raise BadUsage('the planned drive holds numbers that are not finite; check its source')
         if len(rows['t']) < 2 or not (np.diff(rows['t']) > 0).all():
-            raise BadUsage('the planned drive needs two or more times, each later than the last')
+            raise BadUsage('the planned drive needs two or more increasing times')
         for name, row in rows.items():
             row.setflags(write=False)
             object.__setattr__(self, name, row)
@@ -61,16 +61,16 @@ class PlannedDrive:
 
     @property
     def C_nb(self) -> NDArray[np.float64]:
-        """Return the attitude of an Imu that looks forward, (m, 3, 3)."""
+        """Return the attitude of an IMU that looks forward, (m, 3, 3)."""
         return matrix_from_rpy(np.stack([np.zeros_like(self.yaw), -self.slope, self.yaw], -1))
 
     @property
     def travel(self) -> NDArray[np.float64]:
-        """Return the signed way rolled by each time, 0 at the start mark, (m,) m."""
+        """Return the signed travel at each time, 0 at the start mark, (m,) m."""
         s = np.concatenate([[0.0], np.cumsum(
             (self.speed[:-1] + self.speed[1:]) / 2 * np.diff(self.t))])
-        way: Floats = s - np.interp(0.0, self.t, s)
-        return way
+        path_length: Floats = s - np.interp(0.0, self.t, s)
+        return path_length
 
     @property
     def distance(self) -> float:

@@ -27,14 +27,14 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     Raises
     ------
     BadData
-        Imu, odometer or fixes are missing.
+        IMU, odometer or fixes are missing.
     BadUsage
         The vehicle did not move.
 
     """
     if not (len(inputs.t_imu) > 3 and len(inputs.travel.t) > 1 and len(inputs.t_fix)):
-        raise BadData('a profile needs Imu, odometer and fixes between the marks; see odocal '
-                      'inspect for what is there')
+        raise BadData('a profile needs IMU, odometer and fixes between the marks; check the bag '
+                      'with odocal inspect')
     placed = _placed(inputs, config)
     origin, scale = placed.origin, placed.rough
     first, last = max(inputs.t_imu[0], inputs.travel.t[0]), min(
@@ -45,8 +45,8 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
     resting = np.any([(t >= a) & (t <= b) for a, b in spans], axis=0) if len(spans) \
         else np.zeros(len(t), bool)
     profile_window = 0.5    # s each side that a speed is taken over
-    way = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
-    speed = np.where(resting, 0.0, way * scale / (2 * profile_window))
+    path_length = inputs.travel.at(t + profile_window) - inputs.travel.at(t - profile_window)
+    speed = np.where(resting, 0.0, path_length * scale / (2 * profile_window))
     speed[~resting & (np.abs(speed) <= REST_SPEED)] = 2 * REST_SPEED   # too short to count as rest
     yaw = _yaw(inputs, spans, t)
     return PlannedDrive(t, speed, yaw + _first_course(t, speed, yaw, inputs.t_fix, placed.fixes_n),
@@ -54,10 +54,10 @@ def profile_of(inputs: Inputs, config: Config) -> PlannedDrive:
 
 
 def _placed(inputs: Inputs, config: Config) -> Placed:
-    """Return where the fixes lie and how far a count reaches; raise BadData without."""
+    """Return the fix positions and the metres per count; raise BadData without them."""
     placed = place(inputs, config)
     if not placed.rough:
-        raise BadData('the scale is not known yet: the fixes moved too little, and '
+        raise BadData('the scale is not known yet: the fixes moved too little and '
                       'odometer.nominal_scale is not set')
     return placed
 
@@ -87,7 +87,7 @@ def _yaw(inputs: Inputs, spans: Floats, t: Floats) -> Floats:
 
 
 def _first_course(t: Floats, speed: Floats, yaw: Floats, t_fix: Floats, fixes_n: Floats) -> float:
-    """Return what turns the track of speed and yaw onto the fixes, rad."""
+    """Return the angle that rotates the track of speed and yaw onto the fixes, rad."""
     step = speed[:-1] * np.diff(t)
     track = np.concatenate([[0.0], np.cumsum(step * np.exp(1j * yaw[:-1]))])
     inside = (t_fix >= t[0]) & (t_fix <= t[-1])

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Manoeuvres a planned drive could have besides: they tell what a straight run leaves open."""
+"""Manoeuvres to add to a planned drive; they determine what a straight run does not."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ TOWN_SIDES = 1.0, 1.0, -1.0, -1.0    # two to the left, then two to the right
 
 
 def stop_and_start(drive: PlannedDrive) -> PlannedDrive:
-    """Return the drive with a stop on the way: braked, stood for 5 s, up to speed again."""
+    """Return the drive with one more stop: braking, 5 s of standing, acceleration."""
     k = _amid(drive)
     v = drive.speed[k]
     ramp = abs(v) / BRAKING
@@ -35,7 +35,7 @@ def stop_and_start(drive: PlannedDrive) -> PlannedDrive:
                                            [v, 0.0, 0.0, v]), np.zeros_like(t))
 
 
-def turns_both_ways(drive: PlannedDrive) -> PlannedDrive:
+def left_and_right_turns(drive: PlannedDrive) -> PlannedDrive:
     """Return the drive with a turn of 90 deg to the left and, a little later, one to the right."""
     k = _amid(drive)
     v = drive.speed[k]
@@ -93,12 +93,12 @@ def inserted(drive: PlannedDrive, k: int, t: Floats, speed: Floats,
 
 
 def _amid(drive: PlannedDrive) -> int:
-    """Return the row nearest to the middle of the way among those near the greatest speed."""
+    """Return the row nearest to the middle of the path among those near the greatest speed."""
     speed = np.where(drive.t >= 0, np.abs(drive.speed), 0.0)
     near_top = 0.9    # of the greatest speed: where there is room for a manoeuvre
     fast = np.flatnonzero(speed >= near_top * speed.max())
-    way = np.cumsum(np.abs(np.diff(drive.travel, prepend=drive.travel[0])))
-    return int(fast[np.argmin(np.abs(way[fast] - way[-1] / 2))])
+    path_length = np.cumsum(np.abs(np.diff(drive.travel, prepend=drive.travel[0])))
+    return int(fast[np.argmin(np.abs(path_length[fast] - path_length[-1] / 2))])
 
 
 def _grid(end: float, *knots: float) -> Floats:

@@ -52,13 +52,13 @@ class Plan:
 
     @property
     def verdict(self) -> Verdict:
-        """Return what such a leg will be good for: the drive and the best method that decides."""
+        """Return the predicted verdict: of the drive and the best method."""
         order = list(Verdict)
         best = min((self._verdict_of(name) for name in self.deciding), key=order.index)
         return Verdict.worst([verdict_of(self.two_point.of_drive), best])
 
     def reasons_of(self, name: str) -> tuple[Reason, ...]:
-        """Return what a method will say; of two_point also what its alignment has to say."""
+        """Return the predicted reasons of a method; for two_point also those of its alignment."""
         if name != 'two_point':
             return self.methods[name].reasons
         return tuple(r for r in self.two_point.reasons if r not in self.two_point.of_drive)
@@ -69,7 +69,7 @@ class Plan:
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """
-        Return what is worth saying.
+        Return the reasons of the prediction.
 
         Of the drive; of methods that give; and why the others that might have been the result
         give nothing, the smoother's refusals always.
@@ -88,7 +88,7 @@ class Plan:
 
 def plan_methods(drive: PlannedDrive, sigmas: Sigmas, spacing: float | None = None) -> Plan:
     """
-    Return what a drive will give by the methods that the settings ask for.
+    Return the predictions of the configured methods for a drive.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ from odocal_ros.reasons import Code, Reason, Verdict
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.levels import SWAY
 
-SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive tells it
+SLIP = 0.01                 # m/sqrt(s), judgement: slip, before a drive determines it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class Sigmas:
     """
     Error figures a drive is planned with, 1 sigma.
 
-    config : grade of the Imu (imu.*), heading source and its sigma (alignment.*; ``auto`` takes
+    config : grade of the IMU (imu.*), heading source and its sigma (alignment.*; ``auto`` takes
     the given heading sigma where the source is set, else a gyrocompass if the gyro allows, else
     the course), lever arm, latencies, correlation time of the fixes (NaN: 60 s; 0: white).
     fix, fix_up : m, error of one fix, east and north each, and up (None: twice that).
@@ -68,12 +68,11 @@ class Sigmas:
                             ('fix rate', self.fix_rate),
                             ('heading sigma', self.config.alignment.heading_sigma)):
             if not (np.isfinite(value) and value > 0):
-                raise BadConfig(f'{what} {value:g}: want a number above 0; nothing is known '
-                                'exactly')
+                raise BadConfig(f'{what} {value:g}: required: a number above 0')
         for what, value in (('size of a count', self.quantum), ('sway', self.sway),
                             ('slip', self.slip)):
             if not (np.isfinite(value) and value >= 0):
-                raise BadConfig(f'{what} {value:g}: want 0 or more')
+                raise BadConfig(f'{what} {value:g}: required: 0 or more')
 
     @property
     def covariance_n(self) -> Floats:
@@ -83,9 +82,9 @@ class Sigmas:
 
     @property
     def correlation_time(self) -> float:
-        """Return the time over which fix errors stay alike, s; 0: white."""
+        """Return the correlation time of fix errors, s; 0: white."""
         asked = self.config.gnss.correlation_time
-        # s over which fixes of one receiver stay alike where nothing is said
+        # s, default correlation time of fixes of one receiver
         correlation_time = 60.0
         return correlation_time if np.isnan(asked) else asked
 
@@ -116,13 +115,13 @@ class Prediction:
 
     @property
     def verdict(self) -> Verdict:
-        """Return what such a leg will be good for."""
+        """Return the predicted verdict of such a leg."""
         return Verdict.worst(r.code.gravity for r in self.reasons)
 
 
 def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
     """
-    Return what the two-point method will give for a drive.
+    Return the prediction of the two-point method for a drive.
 
     Raises
     ------
@@ -159,7 +158,7 @@ def predict(drive: PlannedDrive, sigmas: Sigmas) -> Prediction:
 def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: float,
                  farthest: float = 1e5) -> float | None:
     """
-    Return how many metres more, straight on, bring a sigma down to what is asked.
+    Return the straight distance, m, that brings a sigma down to its limit.
 
     None where no distance up to ``farthest`` m does: a two-point yaw is never better than its
     heading.
@@ -184,7 +183,7 @@ def metres_to_go(drive: PlannedDrive, sigmas: Sigmas, parameter: str, asked: flo
 
 
 def _rest(t: float, spans: Sequence[tuple[float, float]]) -> float:
-    """Return how long the standstill at a mark lasts, s."""
+    """Return the duration of the standstill at a mark, s."""
     begin, end = standing_at(t, spans) or (0.0, 0.0)
     return end - begin
 

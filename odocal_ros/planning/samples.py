@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Ideal samples of a planned drive: what Imu, odometer and fixes would show without any error."""
+"""Ideal samples of a planned drive: what IMU, odometer and fixes would show without any error."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class Ideal:
     A planned drive as the smoother sees it, free of errors.
 
     leg : its samples; fixes and headings are thinned to one for each keyframe or so.
-    imu : their Imu rows with keyframes.     state : what is true at the keyframes.
+    imu : their IMU rows with keyframes.     state : what is true at the keyframes.
     fixes_in_one : how many fixes each fix of the leg stands for.
     """
 
@@ -49,7 +49,7 @@ class Ideal:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Motion of the Imu at t (m,) s: attitude (m, 3, 3), place, velocity, force, rate (m, 3)."""
+    """Motion of the IMU at t (m,) s: attitude (m, 3, 3), place, velocity, force, rate (m, 3)."""
 
     t: Floats
     C_nb: Floats
@@ -103,7 +103,7 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
 
 
 def _motion(drive: PlannedDrive, t: Floats, origin: Origin, config: Config) -> _Motion:
-    """Return the motion of the Imu on the plane that n lies in."""
+    """Return the motion of the IMU on the plane that n lies in."""
     speed, yaw, slope = (np.interp(t, drive.t, x) for x in (drive.speed, drive.yaw, drive.slope))
     C_nb = matrix_from_rpy(np.stack([np.zeros_like(yaw), -slope, yaw], -1))
     turn, climb = np.gradient(yaw, t), np.gradient(slope, t)

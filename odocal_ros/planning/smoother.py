@@ -36,7 +36,7 @@ SWAY_RATE = 10.0        # Hz, definition: of the white noise that sigmas.sway is
 def predict_smoother(drive: PlannedDrive, sigmas: Sigmas,
                      spacing: float | None = None) -> MethodResult:
     """
-    Return what the smoother will give for a drive, covariance only.
+    Return the prediction of the smoother for a drive, covariance only.
 
     The rows are those of ``smooth`` at the true states of ideal samples, the levels those of
     ``planned_levels``, and what is said of the outcome is said by the code that says it of a fit.
@@ -80,8 +80,8 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
     """
     Return the noise that a drive is planned with, where a fit would estimate it.
 
-    Imu by its grade; wheels that slip by ``sigmas.slip``, slide and bounce by ``sigmas.sway``;
-    fixes of the stated sigma, white, or white to WHITE_SHARE of it beside a part that stays alike
+    IMU by its grade; wheels that slip by ``sigmas.slip``, slide and bounce by ``sigmas.sway``;
+    fixes of the stated sigma, white, or white to WHITE_SHARE of it besides a time-correlated part
     for the correlation time. Never less than the smoother's own bounds.
     """
     grade = grade_of(sigmas.config.imu)

@@ -25,14 +25,15 @@ OFFSET_REACH = 1.0     # s, format: what a time_offset setting holds
 CLOCK_SET = 0.02       # s, judgement: a clock set by more than this is named
 GROUP = {'odometer': 'odometer', 'odometer_right': 'odometer', 'fix': 'gnss'}
 TOPICS = ('odometer', 'odometer_right', 'fix', 'heading')
-TOO_FAR = ('Stamp all sensors with one clock: no time_offset reaches so far. Of a bag that is '
-           'played: ros2 bag play --clock, and the node with use_sim_time:=true.')
+TOO_FAR = ('Stamp all sensors with one clock: the difference exceeds the range of time_offset. '
+           'If a bag is played, use ros2 bag play --clock at normal speed and start the node '
+           'with use_sim_time:=true.')
 
 
 def judge_clocks(leg: Leg, offsets: Mapping[str, float],
                  labels: Mapping[str, str]) -> list[Reason]:
     """
-    Compare each topic's clock with the Imu's, at equal times of arrival.
+    Compare each topic's clock with the IMU's, at equal times of arrival.
 
     Parameters
     ----------
@@ -54,14 +55,14 @@ def judge_clocks(leg: Leg, offsets: Mapping[str, float],
         ahead = median(_lag_at(samples.received_ns, imu) - _lag(samples))
         ahead += offsets[slot]
         if abs(ahead) > CLOCK_APART:
-            found.append(Reason(Code.CLOCKS_DIFFER, f'the {labels[slot]} stamps are {ahead:+.3f} '
-                                's against the Imu stamps of the same moment'
-                                f'{_cure(slot, ahead)}', remedy(ahead)))
+            found.append(Reason(Code.CLOCKS_DIFFER, f'{labels[slot]} stamps are {ahead:+.3f} s '
+                                'relative to IMU stamps of the same '
+                                f'time{_cure(slot, ahead)}', remedy(ahead)))
     return found
 
 
 def remedy(ahead: float) -> str:
-    """Return what to do about a clock so many s ahead of the Imu's."""
+    """Return the remedy for a clock that is this many seconds ahead of the IMU clock."""
     return TOO_FAR if abs(ahead) > OFFSET_REACH else Code.CLOCKS_DIFFER.remedy
 
 
@@ -77,7 +78,7 @@ def _lag(samples: Samples) -> Floats:
 
 
 def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
-    """Return the lag of the Imu at times of arrival: (m,) s; in pieces, for it may be long."""
+    """Return the lag of the IMU at times of arrival: (m,) s; in pieces, for it may be long."""
     base = imu.received_ns[0]
 
     def seconds(received_ns: Ints) -> Floats:
@@ -85,7 +86,7 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
         return since
 
     if not by_step(lambda ns: np.diff(seconds(ns)) > 0, imu.received_ns).all():
-        # what queued arrives at once: its mean tells
+        # queued messages arrive together: their mean is used
         arrival, group, count = np.unique(seconds(imu.received_ns), return_inverse=True,
                                           return_counts=True)
         lag = np.bincount(group, _lag(imu)) / count
@@ -99,10 +100,10 @@ def _lag_at(arrival_ns: Ints, imu: ImuSamples) -> Floats:
 
 
 def _cure(slot: str, ahead: float) -> str:
-    """Say which offset brings a topic's stamps onto the Imu's, where a setting reaches so far."""
+    """Return the offset that aligns a topic's stamps with the IMU, if a setting allows it."""
     if slot not in GROUP or abs(ahead) > OFFSET_REACH:
         return ''
-    return f'; add {-ahead:+.3f} to {GROUP[slot]}.time_offset if that is not transport'
+    return f'; if this is not transport delay, add {-ahead:+.3f} to {GROUP[slot]}.time_offset'
 
 
 def _may_be_odd(stamp_ns: Ints) -> Bools:
@@ -127,7 +128,7 @@ def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
         return []
     first, last = int(odd[0]), int(odd[-1])
     lag = _lag(samples)
-    lag_neighbours = 50    # rows each side that tell the lag there
+    lag_neighbours = 50    # rows on each side that determine the lag
     before = lag[max(0, first + 1 - lag_neighbours):first + 1]
     after = lag[last + 1:][:lag_neighbours]
     moved = float(np.median(before) - np.median(after))      # of the stamps, against arrival
@@ -136,4 +137,4 @@ def _was_set(samples: Samples, label: str, start_ns: int) -> list[Reason]:
         return []
     return [Reason(Code.CLOCKS_DIFFER, f'the {label} clock was set by {moved:+.3f} s during the '
                    f'leg, at t = {(samples.stamp_ns[at] - start_ns) * 1e-9:.2f} s: its stamps '
-                   'before and after do not fit together')]
+                   'before and after are inconsistent')]

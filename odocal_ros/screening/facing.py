@@ -8,10 +8,10 @@
 # the License.
 
 """
-Where an Imu faces in the vehicle: forward is where speeding up pushes it.
+Where an IMU faces in the vehicle: forward is where speeding up pushes it.
 
 All that follows takes the body frame for forward-left-up but for some degrees. Where it is a
-quarter or a half turn off, the odometer parts from the Imu at every start, as if wheels spun.
+quarter or a half turn off, the odometer parts from the IMU at every start, as if wheels spun.
 """
 
 from dataclasses import dataclass
@@ -38,9 +38,9 @@ WAYS = 'forwards', 'to the right', 'backwards', 'to the left'     # by quarters 
 @dataclass(frozen=True, eq=False)
 class Pushes:
     """
-    What pushes the Imu in the level plane, by bins of BIN_S seconds, complex: e1 + i e2.
+    What pushes the IMU in the level plane, by bins of BIN_S seconds, complex: e1 + i e2.
 
-    e1, e2 : (3,) level axes, in the frame of the Imu's data.   force : (m,) m/s^2.
+    e1, e2 : (3,) level axes, in the frame of the IMU's data.   force : (m,) m/s^2.
     onward, inward : (m,) of the vehicle, real m/s^2: speeding up; to the left in turns.
     near : (m,) whether the bin before it is the one just before.
     """
@@ -69,7 +69,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     Parameters
     ----------
     t, w, f : (n,), (n, 3), (n, 3) arrays
-        Times, s, turn rate, rad/s, and specific force, in any one frame fixed to the Imu.
+        Times, s, turn rate, rad/s, and specific force, in any one frame fixed to the IMU.
     up : (3,)
         Unit vector, as gravity shows.
     travel : Travel
@@ -108,7 +108,7 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
 
 def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     """
-    Return where the Imu faces, None where the drive does not show it.
+    Return the IMU orientation in the vehicle, None if the drive does not determine it.
 
     Changes from bin to bin are compared, so that a slope, which changes slowly, is no push. The
     turns have a factor of their own: a gyro of the wrong sign does not turn the answer.
@@ -139,7 +139,7 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
     # only half of the residual lies across, only every other change (they share bins) is a draw
     variance = np.vdot(rest, rest).real / len(A) * inverse[0, 0].real
     sigma = float(np.sqrt(variance) / max(abs(gain[0]), 1e-9))
-    facing_sigma = np.deg2rad(10.0)    # 1 sigma of where the Imu faces, to speak of it
+    facing_sigma = np.deg2rad(10.0)    # limit of the 1 sigma of the IMU orientation
     push_gain = 0.5, 2.0    # of the push by what the wheels say: else it is something else
     if sigma > facing_sigma or not push_gain[0] < abs(gain[0]) < push_gain[1]:
         return None
@@ -148,7 +148,7 @@ def facing(inputs: 'Inputs', metres_per_unit: float) -> Facing | None:
 
 
 def toward(found: Facing | None, f: Floats) -> Floats:
-    """Return scale times forward axis, (3,), turned to where the Imu faces if that is far off."""
+    """Return scale times forward axis, (3,), turned to where the IMU faces if that is far off."""
     yaw, pitch = mounting_from_forward(f)
     near_facing = np.deg2rad(10.0)    # off what a method takes for forward: no matter for slips
     if found is None or abs(float(wrap(found.yaw - yaw))) < max(near_facing, 3 * found.sigma):
@@ -157,22 +157,23 @@ def toward(found: Facing | None, f: Floats) -> Floats:
 
 
 def axes_reasons(found: Facing | None, nominal_yaw: float) -> tuple[Reason, ...]:
-    """Return IMU_AXES, or ODOMETER_REVERSED, where the Imu faces far from its nominal yaw, rad."""
+    """Return IMU_AXES, or ODOMETER_REVERSED, where the IMU faces far from its nominal yaw, rad."""
     if found is None:
         return ()
     nominal = 0.0 if np.isnan(nominal_yaw) else nominal_yaw
     off = abs(float(wrap(found.yaw - nominal)))
-    way = WAYS[round(found.yaw / (np.pi / 2)) % 4]
+    direction = WAYS[round(found.yaw / (np.pi / 2)) % 4]
     seen = f'{np.rad2deg(found.yaw):+.0f} deg, +-{max(np.rad2deg(found.sigma), 1):.0f}'
     if nominal:
         seen += f', nominal {np.rad2deg(nominal):+.0f}'
-    other_way_round = np.deg2rad(150.0)    # an odometer that runs the other way looks so too
-    if off > other_way_round:
-        return (Reason(Code.ODOMETER_REVERSED, f'speeding up pushes the Imu {way} (yaw mounting '
-                       f'{seen}): positive counts mean backwards, the Imu faces the other way, or '
-                       'all was driven in reverse and the counter does not tell'),)
+    reversed_orientation = np.deg2rad(150.0)    # a reversed odometer looks the same
+    if off > reversed_orientation:
+        return (Reason(Code.ODOMETER_REVERSED, f'accelerations point {direction} in the IMU frame '
+                       f'(yaw mounting {seen}): positive counts mean backwards, the IMU x axis '
+                       'points backwards, or the whole leg was driven in reverse with an unsigned '
+                       'counter'),)
     far_facing = np.deg2rad(75.0)    # off the nominal: no mounting is meant so
     if off < far_facing + 3 * found.sigma:
         return ()
-    return (Reason(Code.IMU_AXES, f'speeding up pushes the Imu {way} (yaw mounting {seen}): the '
-                   'body frame is not forward-left-up'),)
+    return (Reason(Code.IMU_AXES, f'accelerations point {direction} in the IMU frame '
+                   f'(yaw mounting {seen}): the body frame is not forward-left-up'),)

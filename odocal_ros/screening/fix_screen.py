@@ -49,14 +49,16 @@ def usable_fixes(fix: FixSamples, sent: int,
     found: tuple[Reason, ...] = ()
     if (unknown & ~no_fix).any():
         found += (Reason(Code.COVARIANCE_UNKNOWN, f'{int((unknown & ~no_fix).sum())} of {sent} '
-                         'fixes come without a usable covariance; taken as '
-                         f'{gnss.default_sigma:g} m (gnss.default_sigma)'),)
+                         f'fixes have no usable covariance; {gnss.default_sigma:g} m '
+                         '(gnss.default_sigma) is used'),)
     bad = [(f'{int(m.sum())} {what}', do) for m, what, do in (
         (no_fix, f'with status below {gnss.min_status}', 'Drive under open sky, or lower '
          'gnss.min_status if these fixes are good.'),
-        (lost & ~no_fix, 'at no real position', 'Mend the driver that sends positions nowhere.'),
-        (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m', 'Raise gnss.max_sigma '
-         '(0: no limit) if these sigmas are honest: a fix is weighed by its own.')) if m.any()]
+        (lost & ~no_fix, 'at an invalid position', 'Check the driver: these positions are not on '
+         'Earth.'),
+        (poor & ~no_fix & ~lost, f'with sigma above {gnss.max_sigma:g} m', 'If these '
+         'uncertainties are correct, raise gnss.max_sigma (0: no limit): each fix is weighted by '
+         'its own uncertainty.')) if m.any()]
     if bad:
         code = Code.BAD_ROWS_DROPPED if use.any() else Code.FIXES_UNUSABLE
         said, do = zip(*bad, strict=True)
@@ -66,7 +68,7 @@ def usable_fixes(fix: FixSamples, sent: int,
 
 
 def placed(fix: FixSamples) -> Bools:
-    """Tell which fixes are on the Earth, and not where both angles are zero: (n,) bool."""
+    """Return a mask of fixes on the Earth whose angles are not both zero: (n,) bool."""
     nowhere = (fix.latitude == 0) & (fix.longitude == 0)
     # NaN compares false: what is not within is nowhere
     there: Bools = (abs(fix.latitude) <= np.pi / 2) & (abs(fix.longitude) <= 2 * np.pi) & ~nowhere
@@ -74,7 +76,7 @@ def placed(fix: FixSamples) -> Bools:
 
 
 def _away(fix: FixSamples, good: Bools) -> Bools:
-    """Tell which of the good fixes are on another part of the Earth than most: (n,) bool."""
+    """Return a mask of good fixes far from most others: (n,) bool."""
     away = np.zeros(len(good), bool)
     if good.any():
         r_e = ecef_from_geodetic(fix.latitude[good], fix.longitude[good], 0.0)
@@ -101,7 +103,7 @@ def covariances(fix: FixSamples, default_sigma: float) -> tuple[Floats, Bools]:
 
 
 def _proper(matrices: Floats) -> Bools:
-    """Tell which matrices are covariances that can be inverted: (n, k, k) to (n,) bool."""
+    """Return a mask of invertible covariance matrices: (n, k, k) to (n,) bool."""
     variance = np.diagonal(matrices, axis1=1, axis2=2)
     largest_sigma = 1e8    # m, a sigma beyond it says nothing
     # products and roots of what is beyond any receiver would overflow
@@ -114,7 +116,7 @@ def _proper(matrices: Floats) -> Bools:
         unit = matrices / (sigma[:, :, None] * sigma[:, None, :])
     unit[~sane] = np.eye(matrices.shape[1])
     asymmetry = 1e-3    # correlations above and below the diagonal
-    # one that is not symmetric is damaged: which half holds, nobody knows
+    # one that is not symmetric is damaged: the correct half is unknown
     sane &= (np.abs(unit - np.swapaxes(unit, 1, 2)) < asymmetry).all(axis=(1, 2))
     # least eigenvalue of the correlations: below it an axis adds nothing
     least_eigenvalue = 1e-6
@@ -123,7 +125,7 @@ def _proper(matrices: Floats) -> Bools:
 
 
 def origin_amid(t_fix: Floats, geodetic: Floats) -> Origin:
-    """Return where n is fixed: the fix amid those about the start, so that no outlier is it."""
+    """Return the origin of n: the median fix of those near the start, so it is not an outlier."""
     about_start = 11    # fixes about the start mark that the origin is amid
     near = np.sort(np.argsort(np.abs(t_fix), kind='stable')[:about_start])
     r_e = ecef_from_geodetic(geodetic[near, 0], geodetic[near, 1], 0.0)

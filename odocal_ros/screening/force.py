@@ -8,9 +8,9 @@
 # the License.
 
 """
-An Imu that sends turn rates only: a car's yaw rate on the bus, the gyro of a robot.
+An IMU that sends turn rates only: a car's yaw rate on the bus, the gyro of a robot.
 
-The ground is then taken as level and the Imu as upright: gravity stands where an accelerometer
+The ground is then taken as level and the IMU as upright: gravity stands where an accelerometer
 would show it, so that all that follows needs no other case; what that may be wrong by goes into
 the level (``pipeline/align.py``) and the scale (``pipeline/no_force.py``).
 """
@@ -31,7 +31,7 @@ TILT_SIGMA = 0.05    # rad of road and mounting, 1 sigma of each axis; judgement
 
 
 def felt(f_i: Floats) -> bool:
-    """Return whether any of (n, 3) forces as sent is one, or none has come yet."""
+    """Return True if any of the (n, 3) forces is valid, or none has arrived yet."""
     if not len(f_i):
         return True
     with np.errstate(invalid='ignore'):      # a NaN that signals
@@ -41,7 +41,7 @@ def felt(f_i: Floats) -> bool:
 
 def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     """
-    Return a leg whose Imu, where it sends no force, stands upright on level ground; and why.
+    Return a leg whose IMU, where it sends no force, stands upright on level ground; and why.
 
     None is sent where each value is zero or NaN (as REP-145's covariance[0] of -1 is read).
     """
@@ -51,6 +51,6 @@ def with_force(leg: Leg, config: Config) -> tuple[Leg, tuple[Reason, ...]]:
     up_i = matrix_from_rpy(config.imu.mounting_rpy).T[:, 2]
     gravity_i = np.tile(up_i * G / (config.imu.accel_scale or 1.0), (len(f_i), 1))
     return replace(leg, imu=replace(leg.imu, f_i=gravity_i)), (Reason(
-        Code.NO_ACCELEROMETER, 'the Imu sends turn rates but no acceleration: the scale is told '
-        'by gyro, counter and fixes, on ground taken as level; yaw and pitch mounting angle need '
-        'an accelerometer (yaw: or a heading from outside)'),)
+        Code.NO_ACCELEROMETER, 'the IMU publishes turn rates but no acceleration. The scale is '
+        'estimated from gyro, odometer and fixes on assumed level ground; yaw and pitch mounting '
+        'need an accelerometer (yaw: or an external heading)'),)

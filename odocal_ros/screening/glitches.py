@@ -36,15 +36,15 @@ ROWS_BESIDE = 5          # rows to either side that are still where a single row
 # is then left
 TURN_STEP, FORCE_STEP, USUAL_STEPS, GLITCH_TIME, BACK_SHARE = 0.8, 50.0, 20.0, 0.4, 0.5
 # judgement: of a single row: least that it is off by, rad/s (0.003 rad in 0.1 s) and m/s^2; times
-# as far from its neighbours as those beside it are from theirs; of that, how alike the two are
-SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, NEIGHBOURS_ALIKE = 0.03, 2.0, 10.0, 0.3
+# as far from its neighbours as those beside it are from theirs; of that, how similar the two are
+SINGLE_TURN, SINGLE_FORCE, SINGLE_TIMES, EQUAL_NEIGHBOURS = 0.03, 2.0, 10.0, 0.3
 GLITCH_SHARE = 0.002      # of the rows: more of them are no glitches
 ROLLS = 0.1               # of the top speed: slower on the mean, a vehicle may as well stand
 Oriented = TypeVar('Oriented', ImuSamples, HeadingSamples)
 
 
 def beyond(name: str, column: NDArray[Any]) -> Bools:
-    """Tell which rows hold NaN, Inf or a value beyond any sensor: (n, ...) to (n,) bool."""
+    """Return a mask of rows with NaN, Inf or an impossible value: (n, ...) to (n,) bool."""
     column = np.asarray(column)
     if np.issubdtype(column.dtype, np.integer):
         return np.zeros(len(column), bool)
@@ -62,11 +62,11 @@ def beyond(name: str, column: NDArray[Any]) -> Bools:
 
 
 def oriented(samples: Oriented) -> Oriented:
-    """Return Imu or heading rows without the orientations that are none; variance NaN there."""
+    """Return IMU or heading rows without the orientations that are none; variance NaN there."""
     def no_attitude(wild: Bools, q_ni: Floats, variance: Floats) -> Bools:
         length = lengths(np.where(wild[:, None], 0.0, q_ni))
         unit_length = 2.0    # times one, either way: a quaternion of another length is no attitude
-        widest_variance = 1e12    # rad^2, no driver's way of saying unknown is beyond it
+        widest_variance = 1e12    # rad^2, drivers use smaller values for unknown
         none: Bools = ((length < 1 / unit_length) | (length > unit_length)
                        | (np.abs(variance) > widest_variance))
         return none
@@ -81,7 +81,7 @@ def oriented(samples: Oriented) -> Oriented:
 
 def about_clumps(wild: Bools) -> Bools:
     """
-    Tell which rows stand in or about a clump of rows that are beyond any sensor.
+    Return a mask of rows in or near a group of impossible rows.
 
     Where a recording is damaged, what shows is a part of what is wrong: rows beside it are wrong
     by less than a sensor's range.
@@ -100,7 +100,7 @@ def about_clumps(wild: Bools) -> Bools:
 
 def alone(t: Floats, x: Floats, least: float) -> Bools:
     """
-    Tell which rows leave their neighbours at a bound and come back at another.
+    Return a mask of rows that jump away from their neighbours and back.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def alone(t: Floats, x: Floats, least: float) -> Bools:
 
 def single(x: Floats, least: float) -> Bools:
     """
-    Tell which rows are off alone, while nothing stirs to either side: motion begins and ends.
+    Return a mask of isolated outliers with no motion before and after.
 
     x : (n, k).   least : off by less, a row is let be.   Returns (n,) bool, all false where so
     many rows are that it is the sensor's nature.
@@ -156,7 +156,7 @@ def single(x: Floats, least: float) -> Bools:
         at = far[ROWS_BESIDE:][:m]
         apart = np.abs(x[edge + 1:][:m] - x[ROWS_BESIDE:][:m])
         is_off: Bools = ((at > np.maximum(least, SINGLE_TIMES * beside))
-                         & (apart < NEIGHBOURS_ALIKE * at))
+                         & (apart < EQUAL_NEIGHBOURS * at))
         alone: Bools = across(np.logical_or, is_off)
         return alone
 
@@ -168,14 +168,14 @@ def single(x: Floats, least: float) -> Bools:
 
 
 def imu_glitches(t: Floats, w_i: Floats, f_i: Floats, imu: ImuConfig) -> Bools:
-    """Return which Imu rows hold a spike that no vehicle makes, by the imu settings' factors."""
+    """Return a mask of IMU rows with an impossible spike, by the factors of the imu settings."""
     gyro, accel = max(imu.gyro_scale, 1e-12), max(imu.accel_scale, 1e-12)
     return (alone(t, w_i, TURN_STEP / gyro) | single(w_i, SINGLE_TURN / gyro)
             | alone(t, f_i, FORCE_STEP / accel) | single(f_i, SINGLE_FORCE / accel))
 
 
 def speed_glitches(t: Floats, speed: Floats) -> Bools:
-    """Return which rows of an odometer that sends rates hold a spike no wheel makes."""
+    """Return a mask of rows of a rate odometer with an impossible spike."""
     if len(speed) < 20:
         return np.zeros(len(speed), bool)
     top = np.percentile(np.abs(speed), 95)
@@ -187,7 +187,7 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     """
     Return IMU_GAP where the gyro repeats one value to the last bit while the wheels roll.
 
-    t, w : (n,), (n, 3) Imu rows.   travel : Travel.   limit : s, as long as a gap may be.
+    t, w : (n,), (n, 3) IMU rows.   travel : Travel.   limit : s, as long as a gap may be.
     A gyro that reads zero is let pass: some drivers have a dead band.
     """
     if len(t) < 2 or len(travel.t) < 2:
@@ -202,5 +202,6 @@ def frozen(t: Floats, w: Floats, travel: Travel, limit: float) -> tuple[Reason, 
     if not len(held):
         return ()
     worst = held[np.argmax((end - begin)[held])]
-    return (Reason(Code.IMU_GAP, f'the gyro repeats one value for {end[worst] - begin[worst]:.2f} '
-                   f's at t = {begin[worst]:.2f} s while the wheels roll: it hangs'),)
+    return (Reason(Code.IMU_GAP, 'the gyro repeats one value for '
+                   f'{end[worst] - begin[worst]:.2f} s at t = {begin[worst]:.2f} s while the '
+                   'wheels turn: its output is frozen'),)

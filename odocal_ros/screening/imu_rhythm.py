@@ -8,12 +8,12 @@
 # the License.
 
 """
-Imu rows on the rhythm of their sender, where stamps jitter about it.
+IMU rows on the rhythm of their sender, where stamps jitter about it.
 
-An Imu samples by its own crystal; what stamps its rows as they arrive makes jitter of some
+An IMU samples by its own crystal; what stamps its rows as they arrive makes jitter of some
 milliseconds, or pairs. Integrals see the change from row to row times the jitter: with an engine's
 vibration a noise many times the sensors' own. Rows are put on an even rhythm where rate and force
-are evener so, as they would not be of an Imu that is asked at uneven times.
+are evener so, unlike those of an IMU that is polled at uneven times.
 """
 
 from collections.abc import Iterable
@@ -29,7 +29,7 @@ BLOCK_TIME = 1.0          # s, judgement: of rows in whose mean a lost row shows
 WINDOW_BLOCKS = 20        # judgement: of a mean, which leaves jitter over sqrt(2000) at 100 Hz
 JITTER_SHARE = 2e-3       # judgement: of an interval, the least that is worth it
 TESTED_ROWS = 20_000      # judgement: at the most, in as many
-TESTED_GROUPS = 40        # judgement: groups, whose sums tell how sure it is
+TESTED_GROUPS = 40        # judgement: groups, whose sums give the significance
 BESIDE, HERE, NODES = np.arange(-2, 3), 2, (0, 1, 3, 4)     # definition: a row amid its cubic's
 APART = 1e-9              # s, judgement: that rows are apart at least
 SURE_SIGMAS = 4.0         # statistical: that rows are evener so, by chance once in 30,000
@@ -37,7 +37,7 @@ SURE_SIGMAS = 4.0         # statistical: that rows are evener so, by chance once
 
 def on_rhythm(t: Floats, w: Floats, f: Floats) -> Floats:
     """
-    Return when rows were sampled: (n,) s, rising.
+    Return the sampling times of rows: (n,) s, increasing.
 
     t : (n,) s by stamps, rising.   w, f : (n, 3) turn rate and specific force, in any unit.
     """
@@ -81,7 +81,7 @@ class _Rhythm:
         self.knots, self.late = np.concatenate([np.zeros((2, 0)), *lines], axis=1)
 
     def _means(self, t: Floats) -> Floats:
-        """Return how late the rows of each block are in the mean, the held up ones left out."""
+        """Return the mean lateness of the rows of each block, without the delayed ones."""
         blocks, found = len(t) // self.per, []
         for some in np.array_split(np.arange(blocks), 1 + len(t) // PIECE_ROWS):
             rows = np.arange(some[0] * self.per, (some[-1] + 1) * self.per)
@@ -122,7 +122,7 @@ class _Rhythm:
 
 def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
     """
-    Tell whether rows are surely evener by other times than as sent.
+    Return True if rows are significantly more even at other times than their stamps.
 
     sent, even : (m, 5) s of rows and those beside.   columns : (m, 5) each, what they measured.
     """
@@ -138,7 +138,7 @@ def _evener(sent: Floats, even: Floats, columns: Iterable[Floats]) -> bool:
 
 
 def _weights(times: Floats) -> Floats:
-    """Return what of a row and those beside is how far it is off their cubic: (m, 5) for both."""
+    """Return the weights for the deviation of a row from the cubic of its neighbours: (m, 5)."""
     weights = np.full(times.shape, -1.0)
     for i, j in product(NODES, NODES):
         if i != j:

@@ -10,7 +10,7 @@
 """
 Odometer rows that came late: a pause, then rows in a burst that catch up.
 
-A counter without a header is stamped on the way: what holds a message up (a serial line, a busy
+A counter without a header is stamped at arrival: what delays a message (a serial line, a busy
 machine) looks like a wheel that slid and spun. No row is early, so the sender's even rhythm shows
 in the rows that came soonest; that, later by what all rows are, is where the others are put, where
 the counts bear it out; else where the travel on both sides of a burst has them.
@@ -27,7 +27,7 @@ from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.odometer_care import counter_steps
 
 ON_TIME_WINDOW = 5.0      # s, judgement: within which some row comes on time
-EVEN_BESIDE = 5           # judgement: rows to either side that tell where a row should be
+EVEN_BESIDE = 5           # judgement: rows to either side that determine the place of a row
 LINE = (-EVEN_BESIDE, EVEN_BESIDE)
 # definition: a line takes half the acceleration for lateness
 CUBIC = (2 * LINE[0], *LINE, 2 * LINE[1])
@@ -38,12 +38,12 @@ ROUNDING_COUNTS = 2.5     # judgement: that rounding may put a row off by
 def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
             name: str = 'odometer') -> Floats:
     """
-    Return when rows were taken: (n,) s, late ones put back.
+    Return the sampling times of rows: (n,) s, late ones moved back.
 
     samples : OdometerSamples, usable.   t : (n,) s by stamps.   found : list that findings join.
     """
     if form.quantity == 'rate' or len(t) < 4 * EVEN_BESIDE:
-        return t       # what a late speed adds comes out right by itself
+        return t       # the travel of a late speed is still correct
     step = (counter_steps(samples.value, form.modulus) if form.quantity == 'cumulative'
             else samples.value[1:].astype(float))
     travel = np.concatenate([[0.0], np.cumsum(step)])
@@ -60,8 +60,8 @@ def on_time(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list
         worst, times = int(np.argmax(late)), int((np.diff(named.astype(int)) == 1).sum())
         found.append(Reason(Code.ODOMETER_LATE, f'{int(named.sum())} of {len(t)} {name} messages '
                             f'came late, {max(times, 1)} time{"s" * (times > 1)}, by up to '
-                            f'{late[worst]:.3g} s at t = {t[worst]:.2f} s; put where they belong, '
-                            'between the rows beside'))
+                            f'{late[worst]:.3g} s at t = {t[worst]:.2f} s; moved back between '
+                            'their neighbours'))
     return true
 
 
@@ -172,8 +172,8 @@ def _by_travel(t: Floats, travel: Floats, a: int, b: int, usual: float) -> Float
     catching_up = 3.0    # times the speed beside: no wheel, so rows that catch up
     if t[b] - t[a] > even_travel or not beside or speed(a + 1, b) < catching_up * beside:
         return t[rows]
-    if travel[a] == travel[b]:      # there and back: it tells no time
+    if travel[a] == travel[b]:      # there and back: it gives no time
         return t[rows]
-    # some rows of the burst are lost, so that its rhythm tells nothing
+    # some rows of the burst are lost, so that its rhythm is useless
     by_travel = t[a] + (travel[rows] - travel[a]) * (t[b] - t[a]) / (travel[b] - travel[a])
     return np.maximum.accumulate(np.clip(by_travel, t[a], t[rows]))

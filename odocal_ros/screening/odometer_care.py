@@ -10,8 +10,8 @@
 """
 Odometer rows that do not say what they seem to: false rows, hung counters, lost increments.
 
-False rows are dropped where the counter goes on beside them as if nothing had been; what cannot
-be known of the travel (a reset, a gap of speeds or increments) becomes a doubt of the budget.
+False rows are dropped if the counter continues normally after them; unknown travel (a reset, a gap
+of speeds or increments) is an uncertainty in the error budget.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ from odocal_ros.nav.odometer import FEWEST_STEPS, RESET_FACTOR, Travel
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.screening.glitches import speed_glitches
 
-STEPS_BESIDE = 5    # judgement: steps beside a jump or a gap that tell the speed there
+STEPS_BESIDE = 5    # judgement: steps next to a jump or gap that give the speed there
 
 
 def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[Reason],
@@ -37,8 +37,8 @@ def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[
         false = false_counts(t, samples.value, form.modulus)
         if false.any():
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'counts hang or jump away and come back, first at '
-                                f't = {t[np.argmax(false)]:.2f} s; dropped'))
+                                'counts freeze or jump away and back, first at t = '
+                                f'{t[np.argmax(false)]:.2f} s; dropped'))
         return take(samples, ~false), t[~false]
     if form.quantity == 'increment':
         false = speed_glitches(t, samples.value.astype(float))
@@ -47,8 +47,8 @@ def mended(samples: OdometerSamples, t: Floats, form: OdometerForm, found: list[
             kept: NDArray[Any] = np.where(false, good, samples.value).astype(samples.value.dtype)
             samples = replace(samples, value=kept)
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(false.sum())} of {len(t)} {name} '
-                                'increments stand alone far from their neighbours, first at '
-                                f't = {t[np.argmax(false)]:.2f} s; taken like those beside'))
+                                'increments are isolated outliers, first at t = '
+                                f'{t[np.argmax(false)]:.2f} s; replaced by interpolation'))
     return samples, t
 
 
@@ -63,7 +63,7 @@ def counter_steps(value: Values, modulus: int) -> Floats:
 
 def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     """
-    Tell which rows of a counter are false: hung before a jump that catches up, or away and back.
+    Return a mask of false counter rows: frozen before a catch-up jump, or away and back.
 
     t : (n,) s.   value : (n,) as sent.   Returns (n,) bool.
     """
@@ -76,7 +76,7 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
     size = np.abs(rate)
     top = float(np.percentile(size[size > 0], 95))
     jumps = np.flatnonzero(size > max(RESET_FACTOR * top, 3 / np.median(dt))).tolist()
-    most_jumps = 200    # beyond it the counter is not mended, but judged by the check
+    most_jumps = 200    # beyond it the counter is not corrected; the check decides
     if len(jumps) > most_jumps:
         return false
     done = -1
@@ -97,27 +97,27 @@ def false_counts(t: Floats, value: Values, modulus: int) -> Bools:
 
 
 def _goes_on(t: Floats, net: float, rate: Floats, a: int, b: int) -> bool:
-    """Tell whether the counter after step b goes on from before step a at speeds as beside."""
+    """Return True if the counter after step b continues that before step a at adjacent speeds."""
     length = t[b + 1] - t[a]
-    ways = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
+    travels = [_usual(r) * length for r in (rate[max(0, a - STEPS_BESIDE):a],
                                          rate[b + 1:b + 1 + STEPS_BESIDE])]
-    goes_on_share = 0.5    # of the travel expected by the speed beside: what still goes on
-    slack = goes_on_share * max(abs(w) for w in ways) + 3
-    return bool(min(ways) - slack <= net <= max(ways) + slack)
+    goes_on_share = 0.5    # of the expected travel: limit for a counter that continues
+    slack = goes_on_share * max(abs(w) for w in travels) + 3
+    return bool(min(travels) - slack <= net <= max(travels) + slack)
 
 
 def _comes_back(t: Floats, net: float, step: Floats, a: int, b: int, top: float) -> bool:
-    """Tell whether a far jump at step a is taken back at step b, but for what may be motion."""
+    """Return True if step b reverts a far jump at step a, except for possible motion."""
     reach = 1.2 * top * (t[b + 1] - t[a]) + 3
     return bool(abs(net) <= reach and min(abs(step[a]), abs(step[b])) > 2 * reach)
 
 
-def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Floats, Floats]:
-    """Return travel, lost increments bridged, and where (s) how much of it is in doubt."""
+def doubted(travel: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Floats, Floats]:
+    """Return travel with interpolated gaps, and times (s) and sigmas of uncertain travel."""
     none = np.empty(0)
-    if len(way.t) < FEWEST_STEPS:
-        return way, none, none
-    dt, step = np.diff(way.t), np.diff(way.s)
+    if len(travel.t) < FEWEST_STEPS:
+        return travel, none, none
+    dt, step = np.diff(travel.t), np.diff(travel.s)
     usual = np.median(dt)
     rate = step / np.maximum(dt, usual)
     if form.quantity == 'cumulative':
@@ -127,8 +127,8 @@ def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Flo
         stall = [_stall(step, k) for k in odd.tolist()]
         most = [max(abs(_usual(rate[max(0, a - STEPS_BESIDE):a])),
                     abs(_usual(rate[k + 1:][:STEPS_BESIDE])))
-                * (way.t[k + 1] - way.t[a]) for a, k in zip(stall, odd, strict=True)]
-        return way, way.t[odd], np.array(most) / np.sqrt(3)
+                * (travel.t[k + 1] - travel.t[a]) for a, k in zip(stall, odd, strict=True)]
+        return travel, travel.t[odd], np.array(most) / np.sqrt(3)
     odd = np.flatnonzero(dt > max(MISSING_INTERVALS * usual, 0.2))
     before = np.array([_usual(rate[max(0, k - STEPS_BESIDE):k]) for k in odd])
     after = np.array([_usual(rate[k + 1:k + 1 + STEPS_BESIDE]) for k in odd])
@@ -136,42 +136,42 @@ def doubted(way: Travel, value: Values, form: OdometerForm) -> tuple[Travel, Flo
     if form.quantity == 'increment' and len(odd):
         step = step.copy()
         step[odd] += (before + after) / 2 * missing
-        way = Travel(way.t, np.concatenate([[0.0], np.cumsum(step)]), way.quantum)
+        travel = Travel(travel.t, np.concatenate([[0.0], np.cumsum(step)]), travel.quantum)
     # speeds within a gap: anything between those beside it, and more the longer it is
     spread = np.abs(after - before) / np.sqrt(12) + np.minimum(missing / 50, 0.3) * np.maximum(
         np.abs(before), np.abs(after)) / np.sqrt(3)
-    lost, sigma = way.t[odd], spread * missing
+    lost, sigma = travel.t[odd], spread * missing
     if form.quantity == 'rate':
-        hidden = np.copysign(_hidden(way, value), step)
+        hidden = np.copysign(_hidden(travel, value), step)
         at = np.flatnonzero(hidden)
-        way = replace(way, s=way.s + np.concatenate([[0.0], np.cumsum(hidden)]))
-        lost, sigma = np.r_[lost, way.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
-    return way, lost, sigma
+        travel = replace(travel, s=travel.s + np.concatenate([[0.0], np.cumsum(hidden)]))
+        lost, sigma = np.r_[lost, travel.t[at]], np.r_[sigma, np.abs(hidden[at]) / 2]
+    return travel, lost, sigma
 
 
-def _hidden(way: Travel, value: Values) -> Floats:
+def _hidden(travel: Travel, value: Values) -> Floats:
     """
-    Return how far the wheel rolls in each step at speeds that are sent as zero: (n - 1,).
+    Return the travel in each step at speeds published as zero: (n - 1,).
 
-    In a dead band the speed goes on to zero, or comes from there, as it changed beside: it rolls
-    by v^2 / 2a, of which the mean of the two rows has half a step. A robot in a yard that stops
-    every ten metres loses per cent by it.
+    In a dead band the speed continues to zero, or starts from there, at its adjacent rate: the
+    travel is v^2 / 2a, and the mean of the two rows contains half a step. A robot in a yard that
+    stops every ten metres would lose several per cent.
     """
     hidden, size = np.zeros(len(value) - 1), np.abs(value)
-    least = 2 * way.coarse.step if way.coarse else 0.0
-    # times what rows tell: as long a way at speeds sent as zero is a dead band's
-    dead_band_way = 1.5
+    least = 2 * travel.coarse.step if travel.coarse else 0.0
+    # times the counted travel: this much travel at zero speed is a dead band
+    dead_band_ratio = 1.5
     for edge in np.flatnonzero((size[1:] == 0) != (size[:-1] == 0)):
         stops = size[edge + 1] == 0
         rows = np.arange(edge, edge - STEPS_BESIDE, -1) if stops else np.arange(edge + 1, edge + 1
                                                                           + STEPS_BESIDE)
         rows = rows[(rows >= 0) & (rows < len(size))]
         v, change = size[rows[0]], size[rows[-1]] - size[rows[0]]
-        took = abs(way.t[rows[-1]] - way.t[rows[0]])
+        took = abs(travel.t[rows[-1]] - travel.t[rows[0]])
         if v > least and change > 0 and took > 0:
-            told = v * (way.t[edge + 1] - way.t[edge]) / 2
+            counted = v * (travel.t[edge + 1] - travel.t[edge]) / 2
             whole = min(v**2 * took / (2 * change), v)      # no longer than 2 s
-            hidden[edge] = whole - told if whole > dead_band_way * told else 0.0
+            hidden[edge] = whole - counted if whole > dead_band_ratio * counted else 0.0
     return hidden
 
 

@@ -43,9 +43,9 @@ class Placed:
 
 def place(inputs: 'Inputs', config: Config) -> Placed:
     """
-    Return where the fixes of screened inputs lie and how far a count reaches.
+    Return the fix positions of screened inputs and the metres per count.
 
-    inputs : Inputs.   config : Config; nothing of it is asked but the nominal scale.
+    inputs : Inputs.   config : Config; only the nominal scale is used.
     """
     nominal = nominal_scale(config, inputs.scale_unit)
     if not len(inputs.t_fix):

@@ -8,11 +8,11 @@
 # the License.
 
 """
-Reversing that the counter does not tell: it counts up, and the Imu is pushed backwards.
+Reversing with an unsigned counter: it counts up while accelerations point backwards.
 
 Off a stop the specific force along the vehicle grows with what the wheels speed up by, in the same
-ratio at every start. Where the ratio has the other sign the vehicle went the other way. Fixes see
-that only once the stretch is long beside their noise; a few metres are enough for the Imu.
+ratio at every start. Where the ratio has the other sign the vehicle reversed. Fixes see
+that only once the stretch is long beside their noise; a few metres are enough for the IMU.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ from odocal_ros.settings.levels import FAULT_SIGMAS
 REVERSING_STEP = 0.1          # s, judgement: grid
 PUSH_TIME = 0.6            # s, judgement: each side, that accelerations are taken over
 STOP_BEFORE = 1.0             # s, judgement: of the stop that belong to it
-BY_IMU = 'the Imu is pushed the other way than at the other starts'
-BY_FIT = 'Imu and fixes go back'
+BY_IMU = 'the acceleration has the opposite sign of the other starts'
+BY_FIT = 'IMU and fixes move backwards'
 
 
 def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
                     between: tuple[float, float]) -> Floats:
     """
-    Return where the vehicle drives off backwards and the counter counts up: (m, 2) s.
+    Return the intervals of reversing in which the counter counts up: (m, 2) s.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     t_imu, w_b, f_b : (n,), (n, 3), (n, 3) arrays
         s, turn rate, rad/s, bias and all, specific force, m/s^2.
     between : (2,)
-        The marks, s; what was driven before tells what is usual.
+        The marks, s; earlier travel gives the usual values.
 
     Returns
     -------
     Begin and end of each such stretch. Travel that counts down in reverse gives none, nor does an
-    Imu whose x axis lies across the vehicle.
+    IMU whose x axis lies across the vehicle.
 
     """
     none = np.empty((0, 2))
@@ -68,9 +68,9 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
     push = _second(t, travel.t, travel.s)
     ratio, sigma = np.array([_ratio(t, push, force, a, b)
                              for a, b in zip(begins, ends, strict=True)]).T
-    way = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
+    driven = np.abs(travel.at(t[ends]) - travel.at(t[begins]))
     clear = np.abs(ratio) > FAULT_SIGMAS * sigma
-    onward = np.sign((way * np.sign(ratio))[clear].sum())
+    onward = np.sign((driven * np.sign(ratio))[clear].sum())
     usual = clear & (np.sign(ratio) == onward)
     if not onward or not usual.any():
         return none
@@ -85,22 +85,22 @@ def reversed_starts(travel: Travel, t_imu: Floats, w_b: Floats, f_b: Floats,
 
 def doubled(slips: Sequence[dict[str, Any]], travel: Travel, metres_per_unit: float) -> Floats:
     """
-    Return the stretches between stops that slipped by twice their way: reversed, (m, 2) s.
+    Return the sections between stops with a slip of twice their length: reversed, (m, 2) s.
 
     slips : of the smoother, dicts of t and duration, s, and metres that the wheel turned beyond
-    the ground.   A wheel that spins on the spot slips by its way once.
+    the ground.   A wheel that spins on the spot slips by its travel once.
     """
     t = np.arange(travel.t[0] + PUSH_TIME, travel.t[-1] - PUSH_TIME, REVERSING_STEP)
     begins, ends = _stretches(t, travel) if len(t) > 2 else (np.empty(0, int),) * 2
     spans = np.stack([t[begins] - PUSH_TIME, t[ends] + PUSH_TIME], -1)
-    way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
+    driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * metres_per_unit
     middle = np.array([s['t'] + s['duration'] / 2 for s in slips])
     size = np.array([s['metres'] for s in slips])
     slipped = np.array([size[(middle > a) & (middle < b)].sum() for a, b in spans])
-    least_backwards = 1.0    # m of way
-    twice = slipped / np.maximum(2 * way, least_backwards)
-    twice_the_way = (0.8, 1.2)    # of twice the way, that a stretch slips by
-    return spans[(way > least_backwards) & (twice > twice_the_way[0]) & (twice < twice_the_way[1])]
+    least_backwards = 1.0    # m of path
+    twice = slipped / np.maximum(2 * driven, least_backwards)
+    low, high = 0.8, 1.2    # of twice the path length, as slip of a reversed section
+    return spans[(driven > least_backwards) & (twice > low) & (twice < high)]
 
 
 def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: str,
@@ -109,20 +109,20 @@ def said_of(spans: Floats, travel: Travel, metres_per_unit: float | None, seen: 
     Return REVERSING_UNSIGNED with the stretches that are counted backwards, none without.
 
     metres_per_unit : of travel, rough, None unknown.   seen : BY_IMU or BY_FIT.
-    signed : whether the counter is said to tell the direction.
+    signed : True if the counter is configured as signed.
     """
     if not len(spans):
         return ()
     how = 'the counter does not count down' if signed else 'odometer.signed is false'
-    way = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
+    driven = np.abs(np.diff(travel.at(spans), axis=1))[:, 0] * (metres_per_unit or np.nan)
     each = [f'{b - a:.0f} s from t = {a:.1f} s' + (f', {m:.1f} m' if m == m else '')
-            for (a, b), m in zip(spans.tolist(), way.tolist(), strict=True)]
-    most_told = 3    # stretches told in the sentence
-    more = f' and {len(each) - most_told} more' if len(each) > most_told else ''
+            for (a, b), m in zip(spans.tolist(), driven.tolist(), strict=True)]
+    most_listed = 3    # sections listed in the text
+    more = f' and {len(each) - most_listed} more' if len(each) > most_listed else ''
     times = f'{len(each)} time{"s" * (len(each) > 1)}'
-    return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen}, and the odometer counts on: the '
-                   f'vehicle reversed and {how}; counted backwards: {"; ".join(each[:most_told])}'
-                   f'{more}'),)
+    return (Reason(Code.REVERSING_UNSIGNED, f'{times} {seen} while the odometer counts up: the '
+                   f'vehicle reversed and {how}; counted as reverse: '
+                   f'{"; ".join(each[:most_listed])}{more}'),)
 
 
 def _stretches(t: Floats, travel: Travel) -> tuple[Ints, Ints]:
@@ -151,10 +151,10 @@ def _second(t: Floats, t_in: Floats, s: Floats) -> Floats:
 
 class _Forces:
     """
-    Integrals of the Imu's rows at the steps of a grid t: (m,).
+    Integrals of the IMU's rows at the steps of a grid t: (m,).
 
     turned, speed : (m, 3) of w and f.   speed_before : (m, 3), PUSH_TIME before.
-    push : (m,) second difference of the way that f_x makes.
+    push : (m,) second difference of the travel from f_x.
     """
 
     def __init__(self, t: Floats, t_imu: Floats, w_b: Floats, f_b: Floats) -> None:
@@ -168,10 +168,10 @@ class _Forces:
 def _ratio(t: Floats, push: Floats, force: _Forces, a: int, b: int) -> tuple[float, float]:
     """Return by how much the specific force grows with the odometer's acceleration, and sigma."""
     low = max(0, a - round((STOP_BEFORE + PUSH_TIME) / REVERSING_STEP))
-    longest_start = 12.0    # s after a stop that are looked at: longer, and the tilt wanders
+    longest_start = 12.0    # s after a stop that are looked at: later the tilt drifts
     high = min(len(t), b + 1, a + round(longest_start / REVERSING_STEP))
     span = t[low:high]
-    # which way is up, at rest: as the vehicle pitches, gravity goes into x or out of it
+    # the up direction at rest: as the vehicle pitches, gravity enters x
     rest = force.speed_before[low], force.speed[max(a - round(PUSH_TIME / REVERSING_STEP), 0)]
     up = (rest[1] - rest[0]) / max(np.linalg.norm(rest[1] - rest[0]), 1e-9)
     turn = force.turned[low:high] - force.turned[low]

@@ -30,7 +30,7 @@ from odocal_ros.screening.glitches import (
 )
 from odocal_ros.settings.config import Config
 
-LABEL = {'imu': 'Imu', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
+LABEL = {'imu': 'IMU', 'odometer': 'odometer', 'odometer_right': 'right odometer', 'fix': 'fix',
          'fix_velocity': 'fix velocity', 'heading': 'heading'}
 NOTHING = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'odometer_right': Code.NO_ODOMETER,
            'fix': Code.FIXES_UNUSABLE}
@@ -55,8 +55,8 @@ def usable_rows(slot: str, leg: Leg, config: Config, offset: float,
     spikes = _spikes(slot, clean, t, form, config)
     if spikes.any():
         found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(spikes.sum())} of {len(t)} '
-                            f'{LABEL[slot]} messages stand alone far from their neighbours, '
-                            f'first at t = {t[np.argmax(spikes)]:.2f} s; dropped'))
+                            f'{LABEL[slot]} messages are isolated outliers, first at t = '
+                            f'{t[np.argmax(spikes)]:.2f} s; dropped'))
         if not about_clumps(wild).any():        # else what is about them is left out already
             at = np.flatnonzero(good) if order is None else np.flatnonzero(good)[order]
             wild[at[spikes]] = True
@@ -77,13 +77,13 @@ def _spikes(slot: str, samples: Any, t: Floats, form: OdometerForm, config: Conf
 
 
 def _where(samples: Samples, index: int, leg: Leg) -> str:
-    """Say where a row is, in seconds from the start mark (by arrival where it has no stamp)."""
+    """Return the time of a row in seconds from the start mark (arrival time without a stamp)."""
     stamp = samples.stamp_ns[index] if samples.stamp_ns[index] > 0 else samples.received_ns[index]
     return f't = {(stamp - leg.start_ns) * 1e-9:.2f} s'
 
 
 def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Bools, Bools]:
-    """Tell which rows have a stamp and what a row needs, and which are beyond any sensor."""
+    """Return masks of rows with a stamp and all required values, and of impossible rows."""
     needed = {'imu': ('w_i', 'f_i'), 'fix': ('latitude', 'longitude')}.get(slot, ('value',))
     if slot in ('fix_velocity', 'heading'):
         needed = ('velocity_n',) if slot == 'fix_velocity' else ('q_ni',)
@@ -97,7 +97,7 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
     if slot == 'fix':
         finite |= samples.status < 0       # a receiver without a fix says NaN: not a fault
     for bad, what in ((~stamped, 'have no stamp (zero or negative)'),
-                      (stamped & ~finite, 'hold NaN, Inf or a value beyond any sensor')):
+                      (stamped & ~finite, 'hold NaN, Inf or an impossible value')):
         if bad.any():
             first = int(np.argmax(bad))
             found.append(Reason(Code.BAD_ROWS_DROPPED, f'{int(bad.sum())} of {len(bad)} '
@@ -110,18 +110,18 @@ def _finite(samples: Any, slot: str, leg: Leg, found: list[Reason]) -> tuple[Boo
 
 def _damaged(wild: Bools, good: Bools, slot: str, found: list[Reason],
              most: float = np.inf) -> Bools:
-    """Tell which rows are about clumps of wild ones, and say so: or of more than so many."""
+    """Return a mask of rows near groups of invalid rows, and the reason if there are many."""
     suspect = about_clumps(wild)
     if suspect.any() or wild.sum() > most:
         found.append(Reason(Code.ROWS_DAMAGED, f'{int(wild.sum())} of {len(wild)} {LABEL[slot]} '
-                            'messages hold values beyond any sensor, or far from those beside '
-                            f'them; {int((suspect & good & ~wild).sum())} more about them were '
+                            'messages hold impossible values or outliers; '
+                            f'{int((suspect & good & ~wild).sum())} messages next to them were '
                             'dropped too'))
     return suspect
 
 
 def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints | None:
-    """Return which rows to keep, the most whose stamps rise strictly; None for all."""
+    """Return the largest set of rows with strictly increasing stamps; None for all."""
     stamp = samples.stamp_ns
     step = np.diff(stamp)
     if (step > 0).all():
@@ -129,10 +129,10 @@ def _rising(samples: Samples, slot: str, leg: Leg, found: list[Reason]) -> Ints 
     keep = _longest_rising(stamp)
     same, back = int((step == 0).sum()), int((step < 0).sum())
     first = int(np.argmax(step <= 0)) + 1
-    what = [f'{same} repeat the stamp before them'] * (same > 0)
-    what += [f'{back} time{"s" * (back > 1)} the stamps step back (by up to '
-             f'{-step.min() * 1e-9:.3g} s)'] * (back > 0)
-    found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not rise: '
+    what = [f'{same} repeat the previous stamp'] * (same > 0)
+    what += [f'{back} backward step{"s" * (back > 1)} (up to {-step.min() * 1e-9:.3g} '
+             's)'] * (back > 0)
+    found.append(Reason(Code.STAMPS_NOT_RISING, f'{LABEL[slot]} stamps do not increase: '
                         f'{" and ".join(what)}, first at {_where(samples, first, leg)}; '
                         f'{len(stamp) - len(keep)} of {len(stamp)} messages dropped'))
     return keep

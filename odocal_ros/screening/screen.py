@@ -11,7 +11,7 @@
 Screening: a raw leg to clean arrays on one time axis, with a sentence for each thing found.
 
 Rows that cannot be used are dropped and counted, the rest is used. Times are seconds since the
-start mark; the mark is an Imu stamp, so the Imu's time offset moves the others against it.
+start mark; the mark is an IMU stamp, so the IMU's time offset moves the others against it.
 """
 
 from dataclasses import dataclass, replace
@@ -57,8 +57,8 @@ class Inputs:
     travel: Travel                     # mean of the wheels
     travel_left: Travel | None
     travel_right: Travel | None
-    doubt_t: NDArray[np.float64]       # (d,) s, where travel is in doubt (resets, gaps)
-    doubt_sigma: NDArray[np.float64]   # (d,) by how much, scale units
+    doubt_t: NDArray[np.float64]       # (d,) s, times of uncertain travel (resets, gaps)
+    doubt_sigma: NDArray[np.float64]   # (d,) its sigma, scale units
     t_fix: NDArray[np.float64]         # (k,)
     geodetic: NDArray[np.float64]      # (k, 3) latitude, longitude rad, height m (NaN: none)
     covariance_n: NDArray[np.float64]  # (k, 3, 3) m^2
@@ -78,7 +78,7 @@ class Inputs:
         return medians(self.f_b)
 
     def mirrored(self, spans: Floats) -> 'Inputs':
-        """Return them with what was counted in spans, (m, 2) s, counted the other way."""
+        """Return them with the counts in spans, (m, 2) s, reversed."""
         if not len(spans):
             return self
         return replace(self, travel=self.travel.mirrored(spans),
@@ -172,7 +172,7 @@ def _turned(vector_i: Floats, scale: float, C_bi: Floats) -> Floats:
 
 
 def _offsets(config: Config) -> dict[str, float]:
-    """Return what to add to each topic's times: the marks are Imu stamps, so the Imu's is 0."""
+    """Return the time offset of each topic; marks are IMU stamps, so that of the IMU is 0."""
     imu = config.imu.time_offset
     wheel, gnss = config.odometer.time_offset - imu, config.gnss.time_offset - imu
     return {'imu': 0.0, 'odometer': wheel, 'odometer_right': wheel, 'fix': gnss,
@@ -189,7 +189,7 @@ def _gaps(slot: str, t: Floats, found: list[Reason]) -> None:
 
 
 def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[Reason, ...]:
-    """Return IMU_GAP where the Imu misses more than ``limit`` s between t_from and t_stop."""
+    """Return IMU_GAP where the IMU misses more than ``limit`` s between t_from and t_stop."""
     t = t_imu[np.searchsorted(t_imu, t_from - 1e-9):
               np.searchsorted(t_imu, t_stop + 1e-9, side='right')]
     long = np.flatnonzero(by_step(lambda t: np.diff(t) > limit, t))
@@ -199,5 +199,5 @@ def imu_gap(t_imu: Floats, t_from: float, t_stop: float, limit: float) -> tuple[
     if not gaps:
         return ()
     length, at = max(gaps)
-    return (Reason(Code.IMU_GAP, f'the Imu is missing for {length:.2f} s at t = {at:.2f} s '
-                   f'({len(gaps)} gap{"s" * (len(gaps) > 1)} above {limit:g} s)'),)
+    return (Reason(Code.IMU_GAP, f'no IMU data for {length:.2f} s at t = {at:.2f} s ({len(gaps)} '
+                   f'gap{"s" * (len(gaps) > 1)}; the limit is {limit:g} s)'),)

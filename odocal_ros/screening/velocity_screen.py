@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Whether a velocity is that of the fixes: east and north, m/s, of the antenna."""
+"""Consistency test of a GNSS velocity (east and north, m/s, of the antenna) with the fixes."""
 
 import numpy as np
 
@@ -16,21 +16,21 @@ from odocal_ros.nav.earth import radii
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
-# s, of the displacements that are compared: judgement, longer than delays of receivers
+# s, length of compared displacements: judgement, longer than delays of receivers
 WINDOW = 10.0
-# relative to the displacements by the fixes. Judgement: wheel speeds are off by a few per cent,
-# wrong axes, units and frames by far more
+# relative to the displacements between fixes. Judgement: errors of wheel speeds are a few per
+# cent, errors from wrong axes, units and frames are far larger
 MOST_UNLIKE = 0.1
 
 
 def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
                  covariance_n: Floats) -> tuple[Reason, ...]:
     """
-    Return why a velocity is not that of the fixes; empty: it is, or nothing tells.
+    Return VELOCITY_UNUSABLE if the velocity contradicts the fixes, otherwise nothing.
 
-    Displacements between fixes, complex numbers D, are z times those by the velocity, V, with
-    z = sum(conj(V) D) / sum(|V|^2), 1 where the velocity is as it should be. Axes that are
-    swapped, those of the vehicle, a speed without direction, and km/h have another z.
+    Displacements between fixes, complex numbers D, are z times those from the velocity, V, with
+    z = sum(conj(V) D) / sum(|V|^2), 1 for a correct velocity. Swapped axes, vehicle axes, a speed
+    without direction, and km/h have another z.
 
     t, velocity_n : (m,) s, (m, 3) m/s.   t_fix, geodetic, covariance_n : (k,) s, (k, 3) rad and m,
     (k, 3, 3) m^2.
@@ -54,6 +54,6 @@ def contradicted(t: Floats, velocity_n: Floats, t_fix: Floats, geodetic: Floats,
     sigma = float(np.sqrt(2 * np.median(covariance[:, 0, 0]) / power))
     if abs(z - 1) < MOST_UNLIKE + REMARK_SIGMAS * sigma:
         return ()
-    return (Reason(Code.VELOCITY_UNUSABLE, 'the GNSS velocity does not agree with the fixes: '
-                   f'displacements by the fixes are {abs(z):.2f} times those by the velocity, '
-                   f'turned by {np.degrees(np.angle(z)):+.0f} deg; it is not used'),)
+    return (Reason(Code.VELOCITY_UNUSABLE, 'GNSS velocity contradicts the fixes and is not '
+                   f'used: displacements between fixes are {abs(z):.2f} times those from the '
+                   f'velocity, rotated by {np.degrees(np.angle(z)):+.0f} deg'),)

@@ -8,10 +8,10 @@
 # the License.
 
 """
-Wheel counters that roll over elsewhere than their message type says, each wheel by itself.
+Wheel counters that roll over below the range of their message type, each separately.
 
-Two wheels behind two drivers need not count alike: one sends 64 bits, the other 16 in a message of
-64. A rollover that the type does not tell leaves jumps against the way, all of one size: the span.
+Two wheels of two drivers can count differently: one sends 64 bits, the other 16 in a message of
+64. Such a rollover leaves jumps against the travel, all of one size: the span.
 """
 
 from dataclasses import dataclass, replace
@@ -51,9 +51,9 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
     whole = np.issubdtype(value.dtype, np.integer)
     off = step - usual
     top = float(np.percentile(np.abs(usual), 99.9))
-    least_jump = 8.0    # counts, smallest jump against the way
+    least_jump = 8.0    # counts, smallest jump against the travel
     far = np.abs(off) > np.maximum(2 * np.abs(usual) + least_jump * whole, 1.5 * top)
-    rows = np.flatnonzero(far & (off * usual <= 0))      # a hung counter catches up along the way
+    rows = np.flatnonzero(far & (off * usual <= 0))      # a frozen counter catches up forwards
     if not len(rows):
         return None
     size = np.abs(off[rows])
@@ -81,7 +81,7 @@ def hidden_span(value: Values, step: Floats) -> Span | None:
 
 
 def _running_median(step: Floats) -> Floats:
-    median_reach = 7    # steps each side of the running median that tells the step a jump replaced
+    median_reach = 7    # steps on each side of the running median for the step replaced by a jump
     padded = np.pad(step, median_reach, mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * median_reach + 1)
     return np.median(windows, axis=-1)
@@ -102,7 +102,7 @@ def _measured(value: Values, rows: Ints, middle: float, slack: float) -> tuple[f
 def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
              side: str) -> tuple[OdometerSamples, tuple[Reason, ...], Floats, Floats]:
     """
-    Return rows with hidden rollovers undone, what was found, and the doubt that is left.
+    Return rows with hidden rollovers corrected, the reasons, and the remaining uncertainty.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
 
     Returns
     -------
-    samples; reasons; (k,) s and (k,) counts, where and how much of the travel is in doubt.
+    samples; reasons; (k,) s and (k,) counts: times and sigmas of uncertain travel.
 
     """
     span = hidden_span(samples.value, step)
@@ -129,10 +129,11 @@ def unrolled(t: Floats, samples: OdometerSamples, step: Floats,
     times = len(span.rows)
     about = f'about {span.size:.6g} (+-{span.sigma:.2g})' if span.sigma else NAMED_SPANS.get(
         span.size, f'{span.size:.0f}')
-    found = Reason(Code.WHEEL_COUNTERS_DIFFER, f"the {side} wheel's count rolls over at {about}, "
-                   f'which its message type does not tell: {times} jump{"s" * (times > 1)} of '
-                   f'that size against the way, first at t = {t[span.rows[0] + 1]:.2f} s; undone')
-    # one error of the span for all jumps; the budget takes doubts as independent
+    found = Reason(Code.WHEEL_COUNTERS_DIFFER, f'the {side} wheel counter rolls over at {about}, '
+                   f'not at the range of its message type: {times} jump{"s" * (times > 1)} of '
+                   f'this size against the travel, first at t = {t[span.rows[0] + 1]:.2f} s; '
+                   'corrected')
+    # one error of the span for all jumps; the budget treats uncertainties as independent
     doubt = np.full(times, span.sigma * np.sqrt(times))
     return (replace(samples, value=value), (found,),
             *((t[span.rows], doubt) if span.sigma else (none, none)))

@@ -25,7 +25,7 @@ from odocal_ros.screening.wheel_pair import Imu, Pair, pair, robust_fit, runs, T
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 FAULT_GRID = 0.5          # s, judgement
-STILL_SHARE = 0.02        # judgement: of the other wheel's way: what still counts as not moving
+STILL_SHARE = 0.02        # judgement: of the other wheel's travel: limit for not moving
 OTHER_WHEEL_COUNTS = 8    # judgement: the other wheel makes meanwhile, at least
 SIDES = ('left', 'right')
 
@@ -53,17 +53,17 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
     if two is None:
         return ()
     steps = np.diff([two.left, two.right])          # (2, n)
-    way = np.abs(steps).sum(axis=1)
-    weak = int(np.argmin(way))
-    if way.max() <= OTHER_WHEEL_COUNTS * two.quantum or way.max() == 0.0:
+    rolled = np.abs(steps).sum(axis=1)
+    weak = int(np.argmin(rolled))
+    if rolled.max() <= OTHER_WHEEL_COUNTS * two.quantum or rolled.max() == 0.0:
         return ()                                   # neither moves: the odometer is still
-    if way[weak] <= STILL_SHARE * way.max():
+    if rolled[weak] <= STILL_SHARE * rolled.max():
         return (Reason(Code.WHEEL_DEAD, f'the {SIDES[weak]} wheel does not count '
-                       f'({way[weak]:.6g} against {way.max():.6g} of the '
-                       f'{SIDES[1 - weak]} one): the mean of both is no travel'),)
+                       f'({rolled[weak]:.6g} against {rolled.max():.6g} of the {SIDES[1 - weak]} '
+                       'wheel): the mean of both is not the travel'),)
     if np.array_equal(left.s, right.s) and np.array_equal(left.t, right.t):
-        return (Reason(Code.WHEEL_DEAD, 'the right wheel counts what the left one counts, to the '
-                       'last digit: one counter is sent twice'),)
+        return (Reason(Code.WHEEL_DEAD, 'both wheels have identical counts: one counter is sent '
+                       'twice'),)
     held = [_held(two, steps, k) for k in (0, 1)]
     hung = np.any(held, axis=0)
     turn = np.diff(two.turn)
@@ -79,7 +79,7 @@ def broken_wheels(left: Travel, right: Travel, imu: Imu,
 
 def _line(A: Floats, y: Floats, floor: float) -> tuple[Floats, Floats]:
     """
-    Return what left wheel, turn and time make of the right wheel, and the covariance.
+    Return the fit of the right wheel by left wheel, turn and time, and its covariance.
 
     Two starts, since the faulty cells may be many: least squares, and the usual ratio of the
     wheels without a turn; the one that leaves fewer cells over.
@@ -101,14 +101,14 @@ def _floor(two: Pair, steps: Floats) -> float:
 
 
 def _rolling(steps: Floats, quantum: float) -> Bools:
-    """Tell where each wheel rolls for certain: (2, n)."""
+    """Return a mask of the times at which each wheel certainly rolls: (2, n)."""
     top = np.percentile(np.abs(steps), 95, axis=1, keepdims=True)
     rolls: Bools = np.abs(steps) > np.maximum(ROLLS * top, 0.5 * quantum)
     return rolls
 
 
 def _held(two: Pair, steps: Floats, k: int) -> Bools:
-    """Tell in which cells wheel k stands, for two seconds or longer, while the other one rolls."""
+    """Return a mask of cells in which wheel k stands for 2 s or longer while the other rolls."""
     own, other = np.abs(steps[k]), np.abs(steps[1 - k])
     still: Bools = two.known & (own <= STILL_SHARE * other) & _rolling(steps, two.quantum)[1 - k]
     hang_time = 2.0    # s without a count while the other wheel rolls; shorter is slip
@@ -149,10 +149,11 @@ def _dead(two: Pair, steps: Floats, held: list[Bools]) -> tuple[Reason, ...]:
     else:
         where = f'{len(spans)} time{"s" * (len(spans) > 1)}, first from t = {begin:.1f} s for ' \
                 f'{(spans[0][1] - first) * FAULT_GRID:.1f} s'
-        where += f', at last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
+        where += f', last from t = {two.t[spans[-1][0]]:.1f} s on' * bool(
             after and len(spans) > 1)
     return (Reason(Code.WHEEL_DEAD, f'the {SIDES[k]} wheel does not count {where} while the '
-                   f'{SIDES[1 - k]} one goes on by {lost:.6g}: the mean of both is no travel'),)
+                   f'{SIDES[1 - k]} wheel advances by {lost:.6g}: the mean of both is not the '
+                   'travel'),)
 
 
 def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance: float,
@@ -161,10 +162,10 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
     if ratio < -FAULT_SIGMAS * np.sqrt(variance) and ratio < -0.1:
         k = _against_imu(two, steps, imu)
         which = (f'the {SIDES[k]} wheel counts down when the vehicle drives forward, the '
-                 f'{SIDES[1 - k]} one up' if k is not None else
-                 'one wheel counts up while the other counts down; the Imu does not tell which '
-                 'is right')
-        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is no travel'),)
+                 f'{SIDES[1 - k]} wheel counts up' if k is not None else
+                 'one wheel counts up while the other counts down; the IMU data cannot decide '
+                 'which is correct')
+        return (Reason(Code.WHEEL_REVERSED, f'{which}: the mean of both is not the travel'),)
     rolling = _rolling(np.stack([expected, steps[1]]), two.quantum).all(axis=0)
     against = two.known & rolling & (expected * steps[1] < 0) & (steps[0] * steps[1] < 0)
     against_time = 1.5    # s of counting against the other wheel
@@ -173,7 +174,7 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
         return ()
     back = [-step[step < 0].sum() for step in steps]
     unsigned = [k for k in (0, 1) if back[k] <= 3 * two.quantum + STILL_SHARE * back[1 - k]]
-    which = (f'the {SIDES[unsigned[0]]} wheel counts up in reverse gear too' if len(unsigned) == 1
+    which = (f'the {SIDES[unsigned[0]]} wheel also counts up in reverse' if len(unsigned) == 1
              else 'one wheel counts up while the other counts down')
     a, b = spans[0]
     return (Reason(Code.WHEEL_REVERSED, f'{which}: {len(spans)} time{"s" * (len(spans) > 1)}, '
@@ -181,7 +182,7 @@ def _reversed(two: Pair, steps: Floats, expected: Floats, ratio: float, variance
 
 
 def _against_imu(two: Pair, steps: Floats, imu: Imu) -> int | None:
-    """Return the wheel whose speed changes against the Imu's x axis, None where that is unsure."""
+    """Return the wheel whose speed changes against the IMU's x axis, None where that is unsure."""
     t_imu, _, f_b = imu
     push = np.diff(integral_at((two.t[:-1] + two.t[1:]) / 2, t_imu, f_b[:, 0]))
     push = push - np.median(push)

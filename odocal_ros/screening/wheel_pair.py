@@ -110,7 +110,7 @@ def robust_fit(A: Floats, y: Floats, floor: float, prior: Sequence[float] | Floa
             residual = y - A @ x
             sigma = max(float(np.median(np.abs(residual))) / 0.6745, floor)
             u = residual / (TUKEY * sigma)
-            # absolute values first (Huber): without a start Tukey's weights may settle anywhere
+            # absolute values first (Huber): without a start Tukey's weights can converge anywhere
             huber = start is None and turn < tukey_passes // 2
             weight = 1 / np.maximum(1.0, 3 * np.abs(u)) if huber else np.where(
                 np.abs(u) < 1, (1 - u**2)**2, 0.0)

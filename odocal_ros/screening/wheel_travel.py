@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Travel of one or two wheels: each counter mended by itself, then their mean."""
+"""Travel of one or two wheels: each counter corrected separately, then their mean."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from odocal_ros.settings.config import Config
 
 @dataclass(frozen=True, eq=False)
 class Wheels:
-    """Travel of the wheels, and what of it is in doubt."""
+    """Travel of the wheels, and its uncertain parts."""
 
     mean: Travel
     left: Travel | None
@@ -49,22 +49,22 @@ def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
         samples, t = rows('odometer')
         odometer = config.odometer
         if odometer.left and odometer.right and len(t):
-            found.append(Reason(Code.WHEEL_DEAD, 'the right wheel sends no message between the '
-                                'marks: what follows is the left wheel alone'))
+            found.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no message between the '
+                                'marks: only the left wheel is used'))
         left, doubt_t, doubt = _one(samples, t, leg.form, config, found)
         return Wheels(left, None, None, doubt_t, doubt)
     form_right = leg.form_right or leg.form
     samples, t = rows('odometer')
     left, t_left, doubt_left = _one(samples, t, leg.form, config, found, 'left')
     if _kind(form_right) != _kind(leg.form):
-        found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, 'the right wheel sends '
-                            f'{_words(form_right)}, the left one {_words(leg.form)}: they have '
-                            'no mean, so the left wheel is taken alone'))
+        found.append(Reason(Code.WHEEL_COUNTERS_DIFFER, 'the right wheel publishes '
+                            f'{_words(form_right)}, the left wheel {_words(leg.form)}: they '
+                            'cannot be averaged, so only the left wheel is used'))
         return Wheels(left, None, None, t_left, doubt_left)
     samples, t = rows('odometer_right')
     if not len(t):
-        found.append(Reason(Code.WHEEL_DEAD, 'the right wheel sends no usable value between the '
-                            'marks: what follows is the left wheel alone'))
+        found.append(Reason(Code.WHEEL_DEAD, 'the right wheel has no usable value between the '
+                            'marks: only the left wheel is used'))
         return Wheels(left, None, None, t_left, doubt_left)
     right, t_right, doubt_right = _one(samples, t, form_right, config, found, 'right')
     mean = mean_travel(left, right) if len(left.t) and len(right.t) else left
@@ -74,7 +74,7 @@ def wheels(leg: Leg, config: Config, rows: Callable[[str], tuple[Any, Floats]],
 
 def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config,
          found: list[Reason], side: str = '') -> tuple[Travel, Floats, Floats]:
-    """Return a wheel's travel, and where and how much of it is in doubt."""
+    """Return the travel of a wheel, and times and sigmas of uncertain travel."""
     name = f"the {side} wheel's counter" if side else 'the counter'
     doubt_t = doubt = np.empty(0)
     if side and form.quantity == 'cumulative':
@@ -83,10 +83,10 @@ def _one(samples: OdometerSamples, t: Floats, form: OdometerForm, config: Config
         found.extend(why)
     samples, t = mended(samples, t, form, found, f'{side} odometer'.strip())
     t = on_time(samples, t, form, found, f'{side} odometer'.strip())
-    way, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
+    counts, reasons = travel(t, samples.value, form, config.odometer.reversed, name)
     found.extend(reasons)
-    way, more_t, more = doubted(way, samples.value, form)
-    return way, np.append(doubt_t, more_t), np.append(doubt, more)
+    counts, more_t, more = doubted(counts, samples.value, form)
+    return counts, np.append(doubt_t, more_t), np.append(doubt, more)
 
 
 def _kind(form: OdometerForm) -> tuple[str, str]:
@@ -94,6 +94,6 @@ def _kind(form: OdometerForm) -> tuple[str, str]:
 
 
 def _words(form: OdometerForm) -> str:
-    """Return what values a form means, for people."""
+    """Return the meaning of the values of a form, for people."""
     what = {'cumulative': 'a running count', 'increment': 'increments', 'rate': 'a speed'}
     return f'{what[form.quantity]} ({form.scale_unit})'

@@ -7,4 +7,4 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What may be set, its limits and defaults; Imu grades."""
+"""What may be set, its limits and defaults; IMU grades."""

@@ -7,14 +7,15 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""--accept NAME=LOW:HIGH, the short way to the settings accept.*; angles in degrees too."""
+"""--accept NAME=LOW:HIGH, the short form of the settings accept.*; angles in degrees too."""
 
 import math
 
 from odocal_ros.errors import BadUsage
 from odocal_ros.settings.config import ACCEPTED
 
-WANTED = '--accept NAME=LOW:HIGH, as in --accept scale_ratio=0.995:1.005; either may be left out'
+WANTED = ('--accept NAME=LOW:HIGH, such as --accept scale_ratio=0.995:1.005; either limit can be '
+          'omitted')
 DEG = '_deg'
 
 
@@ -34,12 +35,13 @@ def parse_accept(text: str) -> dict[str, float]:
     if name.endswith(f'angle{DEG}'):
         plain, factor = name.removesuffix(DEG), math.radians(1.0)
     if plain not in ACCEPTED:
-        raise BadUsage(f'--accept {text}: want one of '
+        raise BadUsage(f'--accept {text}: required: one of '
                        + ', '.join(n + f' (or {n}{DEG})' * n.endswith('angle') for n in ACCEPTED))
     if not (equals and colon and limits != ':'):
-        raise BadUsage(f'--accept {text}: want {WANTED}')
+        raise BadUsage(f'--accept {text}: required: {WANTED}')
     try:
         return {f'accept.{plain}_{side}': float(value) * factor
                 for side, value in (('min', low), ('max', high)) if value.strip()}
     except ValueError:
-        raise BadUsage(f'--accept {text}: {limits} are no two numbers; want {WANTED}') from None
+        raise BadUsage(f'--accept {text}: {limits} are not two numbers; required: '
+                       f'{WANTED}') from None

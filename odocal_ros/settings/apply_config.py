@@ -18,37 +18,37 @@ from odocal_ros.settings.setting import setting
 @dataclass(frozen=True, kw_only=True)
 class StartConfig:
     attitude: tuple[float, ...] = setting((), 'x, y, z, w', -1.0, 1.0, ro=True, about=(
-        'Attitude of the Imu (its body frame b) in the odom frame at the first message, from '
-        'another system; empty: level by the accelerometer, the vehicle heads along x.'))
+        'Attitude of the IMU (body frame b) in the odom frame at the first message, from another '
+        'system; empty: levelled by the accelerometer, heading along x.'))
     gyro_bias: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad/s', -1.0, 1.0, ro=True, about=(
-        'Gyro bias in b that goes with the attitude given.'))
-    latitude: float = setting(NAN, 'deg', -90.0, 90.0, ro=True, about='Where the attitude given '
-                              "is east-north-up: the Earth's turn is then taken out of the turn "
-                              'rates; NaN: it stays in the gyro bias seen at rest.')
+        'Gyro bias in b that belongs to this attitude.'))
+    latitude: float = setting(NAN, 'deg', -90.0, 90.0, ro=True, about='Latitude, if the attitude '
+                              'is given in east-north-up: the Earth rate is removed from the '
+                              'turn rates. NaN: it remains in the gyro bias measured at rest.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateConfig:
-    rate: float = setting(20.0, 'Hz', 1.0, 200.0, ro=True, about='Highest rate of the messages '
-                          'sent; twists are means over the time since the one before.')
+    rate: float = setting(20.0, 'Hz', 1.0, 200.0, ro=True, about='Highest publishing rate; '
+                          'twists are means since the previous message.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class OdomFrames:
-    base: str = setting('base_link', ro=True, frame=True, about='Vehicle frame: of the twist, '
-                        'and child frame of the odometry.')
-    odom: str = setting('odom', ro=True, frame=True, about='Frame of the pose: where the node '
-                        'began, x forward, z up.')
+    base: str = setting('base_link', ro=True, frame=True, about='Vehicle frame: frame of the '
+                        'twist and child frame of the odometry.')
+    odom: str = setting('odom', ro=True, frame=True, about='Frame of the pose: origin at node '
+                        'start, x forward, z up.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class ApplyConfig:
     """All settings of the node ``odometry``."""
 
-    vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: the '
-                           'calibration of another one is refused.')
-    levelling: bool = setting(True, ro=True, about='Tilt is held by the accelerometer, gyro bias '
-                              'by stops; false: gyros alone from the start, as replay reckons.')
+    vehicle: str = setting('', ro=True, about='Name of the vehicle; a calibration of another '
+                           'vehicle is refused.')
+    levelling: bool = setting(True, ro=True, about='Use the accelerometer for tilt and stops for '
+                              'the gyro bias; false: gyros only, as in replay.')
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     start: StartConfig = StartConfig()

@@ -41,31 +41,30 @@ NAN = math.nan
 
 @dataclass(frozen=True, kw_only=True)
 class OdometerConfig:
-    type: str = setting('auto', ro=True, about="Message type 'pkg/msg/Type'; auto: taken from the "
-                        'first publisher seen, or the only candidate in a bag.')
+    type: str = setting('auto', ro=True, about="Message type 'pkg/msg/Type'; auto: type of the "
+                        'first publisher, or of the only candidate in a bag.')
     field: str = setting('', ro=True, about='Dotted path to the value, with [i] or [name]; empty: '
                          "the type's default.")
     quantity: str = setting('auto', choices=('auto', 'cumulative', 'increment', 'rate'), ro=True,
-                            about='What the value is: a running count, the count since the last '
-                            "message, or a speed; auto: the type's default.")
+                            about='Meaning of the value: running count, count since the last '
+                            "message, or speed; auto: the type's default.")
     wrap: int = setting(0, 'counts', 0, 2**62, ro=True, about='Counter modulus; 0: that of the '
                         'integer type (65536 for 16 bits sent in an Int32).')
     signed: bool = setting(True, ro=True, about='False for pulses without direction: reversing '
-                           'is then told from Imu and fixes, or rejects the leg.')
+                           'is then detected from IMU and fixes, or rejects the leg.')
     reversed: bool = setting(False, ro=True, about='Positive counts mean backwards.')
     nominal_scale: float = setting(0.0, 'm/pulse, m/rad or 1', 0.0, 1e6, about='Scale factor as '
                                    'configured, K0; 0: unknown for counts, 1 for speeds.')
-    max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Largest believable deviation '
-                                         'from the nominal scale; beyond it the verdict is '
-                                         'caution.')
+    max_scale_deviation: float = setting(0.35, '1', 0.0, 1.0, about='Limit of the deviation from '
+                                         'the nominal scale; beyond it the verdict is caution.')
     lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
         'Wheel contact point in base_link (forward, left, up).'))
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to odometer stamps.')
     # a bus and a middleware seldom deliver within less; u-blox asks for 10 ms or better
     time_sigma: float = setting(0.01, 's', 0.0, 1.0, about='Unknown latency of the odometer, 1 '
                                 'sigma; matters in turns and at marks set in motion.')
-    left: str = setting('', ro=True, about="Left wheel: joint name, array index, or 'topic' when "
-                        'it has a topic of its own.')
+    left: str = setting('', ro=True, about="Left wheel: joint name, array index, or 'topic' if "
+                        'it has its own topic.')
     right: str = setting('', ro=True, about="Right wheel: joint name, array index, or 'topic' "
                          '(odometer_right).')
     track_width: float = setting(0.0, 'm', 0.0, 20.0, about='Distance between the left and the '
@@ -75,43 +74,42 @@ class OdometerConfig:
 @dataclass(frozen=True, kw_only=True)
 class ImuConfig:
     grade: str = setting('consumer', choices=GRADES, about='Gyro and accelerometer quality; the '
-                         'figures below replace single ones.')
+                         'settings below override single values.')
     gyro_noise: float = setting(NAN, 'rad/s/sqrt(Hz)', 0.0, 1.0, about='White gyro noise; NaN: '
-                                "the grade's.")
+                                'value of the grade.')
     gyro_bias: float = setting(NAN, 'rad/s', 0.0, 1.0, about='Turn-on gyro bias, 1 sigma; NaN: '
-                               'as Imus of the grade are sold.')
+                               'typical value of IMUs sold in this grade.')
     gyro_bias_walk: float = setting(NAN, 'rad/s/sqrt(s)', 0.0, 1.0, about='Random walk of the '
-                                    "gyro bias; NaN: the grade's.")
+                                    'gyro bias; NaN: value of the grade.')
     accel_noise: float = setting(NAN, 'm/s^2/sqrt(Hz)', 0.0, 10.0, about='White accelerometer '
-                                 "noise; NaN: the grade's.")
+                                 'noise; NaN: value of the grade.')
     accel_bias: float = setting(NAN, 'm/s^2', 0.0, 10.0, about='Turn-on accelerometer bias, 1 '
-                                'sigma; NaN: as Imus of the grade are sold.')
+                                'sigma; NaN: typical value of IMUs sold in this grade.')
     accel_bias_walk: float = setting(NAN, 'm/s^2/sqrt(s)', 0.0, 10.0, about='Random walk of the '
-                                     "accelerometer bias; NaN: the grade's.")
+                                     'accelerometer bias; NaN: value of the grade.')
     gyro_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the gyro scale, '
-                                      "relative, 1 sigma; NaN: the grade's.")
+                                      'relative, 1 sigma; NaN: value of the grade.')
     accel_scale_sigma: float = setting(NAN, '1', 0.0, 1.0, about='Error of the accelerometer '
-                                       "scale, relative, 1 sigma; NaN: the grade's.")
-    misalignment_sigma: float = setting(NAN, 'rad', 0.0, 0.1, about='By how much each axis of '
-                                        'gyro and accelerometer is off a right angle, 1 sigma; '
-                                        "NaN: the grade's.")
-    gyro_by_force_sigma: float = setting(NAN, 'rad/s/(m/s^2)', 0.0, 0.01, about='What a force '
-                                         'makes the gyro show (g-sensitivity), 1 sigma; NaN: '
-                                         "the grade's.")
-    gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on turn rates as sent: '
-                                '0.017453292519943295 for an Imu that sends deg/s.')
-    accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on specific force as sent: '
-                                 '9.80665 for an Imu that sends g.')
+                                       'scale, relative, 1 sigma; NaN: value of the grade.')
+    misalignment_sigma: float = setting(NAN, 'rad', 0.0, 0.1, about='Axis misalignment of gyro '
+                                        'and accelerometer (non-orthogonality), 1 sigma; NaN: '
+                                        'value of the grade.')
+    gyro_by_force_sigma: float = setting(NAN, 'rad/s/(m/s^2)', 0.0, 0.01, about='g-sensitivity '
+                                         'of the gyro, 1 sigma; NaN: value of the grade.')
+    gyro_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on the published turn rates; '
+                                '0.017453292519943295 for an IMU in deg/s.')
+    accel_scale: float = setting(1.0, '1', 0.0, 1e3, about='Factor on the published specific '
+                                 'force; 9.80665 for an IMU in g.')
     mounting_rpy: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'rad', -6.3, 6.3, ro=True, about=(
-        'Nominal rotation that takes the Imu frame to the body frame b (forward, left, up), fixed '
-        'axes roll, pitch, yaw.'))
+        'Nominal rotation from the IMU frame to the body frame b (forward, left, up), fixed axes '
+        'roll, pitch, yaw.'))
     constants: str = setting('', ro=True, about='calibration.json of an earlier result of this '
-                             'vehicle, or its folder: what that tells of the Imu (scales, axes; '
-                             'not the mounting) counts as one more leg of the smoother.')
+                             'vehicle, or its folder: its IMU scales and axes (not the mounting) '
+                             'are used like one more leg of the smoother.')
     lever_arm: tuple[float, ...] = setting((0.0, 0.0, 0.0), 'm', -100.0, 100.0, ro=True, about=(
         'IMU position in base_link.'))
-    time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to Imu stamps.')
-    nominal_yaw: float = setting(NAN, 'rad', about='Yaw mounting angle expected; a result far '
+    time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to IMU stamps.')
+    nominal_yaw: float = setting(NAN, 'rad', about='Expected yaw mounting angle; a result far '
                                  'from it is a caution. NaN: not checked.')
 
 
@@ -124,15 +122,15 @@ class GnssConfig:
     time_offset: float = setting(0.0, 's', -1.0, 1.0, about='Added to fix stamps.')
     time_sigma: float = setting(0.05, 's', 0.0, 1.0, about='Unknown latency of fixes, 1 sigma; '
                                 'matters at marks set in motion.')
-    min_status: int = setting(0, '', -1, 2, about='Least NavSatStatus of a fix that is used.')
-    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Horizontal 1 sigma beyond which a fix '
-                               'is not used; 0: off.')
-    default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes that '
-                                   'come without a covariance.')
-    correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Time over which fix errors stay '
-                                      'alike; 0: white; NaN: estimated from the data.')
-    use_velocity: bool = setting(True, ro=True, about='Use the GNSS velocity (fix_velocity) '
-                                 'where it is sent.')
+    min_status: int = setting(0, '', -1, 2, about='Minimum NavSatStatus of a used fix.')
+    max_sigma: float = setting(3.0, 'm', 0.0, 1e4, about='Limit of the horizontal 1 sigma of a '
+                               'used fix; 0: off.')
+    default_sigma: float = setting(2.5, 'm', 1e-4, 1e4, about='Horizontal 1 sigma of fixes '
+                                   'without a covariance.')
+    correlation_time: float = setting(NAN, 's', 0.0, 1e4, about='Correlation time of fix errors; '
+                                      '0: white; NaN: estimated from the data.')
+    use_velocity: bool = setting(True, ro=True, about='Use the GNSS velocity (fix_velocity) if '
+                                 'it is published.')
     velocity_scale_sigma: float = setting(1e-3, '1', 0.0, 0.1, about='Relative scale error of the '
                                           'GNSS velocity, 1 sigma. Pure Doppler: 1e-5. A receiver '
                                           'that fuses wheel speeds: 0.05.')
@@ -141,32 +139,31 @@ class GnssConfig:
 @dataclass(frozen=True, kw_only=True)
 class LegConfig:
     min_distance: float = setting(100.0, 'm', 1.0, 1e5, about='Shorter legs are rejected.')
-    min_speed: float = setting(2.78, 'm/s', 0.1, 50.0, about='A leg that never reaches it is a '
-                               'caution.')
+    min_speed: float = setting(2.78, 'm/s', 0.1, 50.0, about='A leg that never reaches this '
+                               'speed is a caution.')
     max_yaw_rate: float = setting(0.02, 'rad/s', 0.0, 1.0, about='Turn rate up to which the '
                                   'vehicle counts as driving straight.')
-    max_duration: float = setting(7200.0, 's', 10.0, 14400.0, about='A live leg longer than this '
-                                  'is stopped.')
-    max_gap: float = setting(0.5, 's', 0.05, 10.0, about='Longest gap in the Imu that a leg '
-                             'survives uncut.')
-    standstill: float = setting(2.0, 's', 0.2, 600.0, about='Shortest stop that counts as one.')
-    preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Seconds kept before the start mark.')
-    compute_limit: int = setting(40, 'passes', 5, 1000, about='Passes that the fit of a leg may '
-                                 'take; a pass goes over one keyframe for each second of the leg. '
-                                 'At the limit the best estimate so far is stated, with a sigma '
-                                 'of four times what still moves.')
-    automatic: bool = setting(False, about='Legs begin and end by themselves, at standstills, '
-                              'else every leg.automatic_minutes; a change of the scale beyond 3 '
-                              'sigma is said.')
+    max_duration: float = setting(7200.0, 's', 10.0, 14400.0, about='A longer live leg is '
+                                  'stopped automatically.')
+    max_gap: float = setting(0.5, 's', 0.05, 10.0, about='Limit of an IMU gap; at a longer gap '
+                             'the leg is cut.')
+    standstill: float = setting(2.0, 's', 0.2, 600.0, about='Minimum duration of a standstill.')
+    preroll: float = setting(600.0, 's', 0.0, 7200.0, about='Data kept before the start mark.')
+    compute_limit: int = setting(40, 'passes', 5, 1000, about='Limit of passes of the fit of a '
+                                 'leg; a pass processes one keyframe per second of the leg. At '
+                                 'the limit the best estimate is stated, with a sigma of four '
+                                 'times the remaining change.')
+    automatic: bool = setting(False, about='Legs start and end automatically at standstills, '
+                              'otherwise every leg.automatic_minutes; a scale change beyond 3 '
+                              'sigma is reported.')
     automatic_minutes: float = setting(10.0, 'min', 1.0, 120.0, about='Longest leg of '
-                                       'leg.automatic; half of it suffices where the vehicle '
-                                       'stands.')
+                                       'leg.automatic; half of it is enough at a standstill.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentConfig:
-    heading_source: str = setting('auto', choices=HEADING_SOURCES, about='Where the heading of '
-                                  "the IMU's x axis comes from.")
+    heading_source: str = setting('auto', choices=HEADING_SOURCES, about='Source of the heading '
+                                  "of the IMU's x axis.")
     heading: float = setting(NAN, 'rad', about="Heading of the IMU's x axis at the start mark, "
                              'clockwise from north (a compass quantity).')
     heading_sigma: float = setting(0.0175, 'rad', 0.0, 3.2, about='Uncertainty of a fixed heading '
@@ -188,56 +185,57 @@ class WheelsConfig:
     radius: float = setting(0.0, 'm', 0.0, 10.0, about='Nominal wheel radius; 0: unknown.')
     pulses_per_revolution: float = setting(0.0, 'pulses', 0.0, 1e9, about='Pulses per turn of the '
                                            'wheel; with the radius it gives the nominal scale.')
-    radius_range: float = setting(0.0, '1', 0.0, 0.9, about='Half of the range searched about '
-                                  "each wheel's nominal factor, relative: twice the stated error; "
-                                  '0: 0.05.')
-    heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half of the range searched about '
-                                   'the heading at the start; 0: twice its sigma, 10 deg where it '
-                                   'is not known.')
-    levels: int = setting(7, '', 1, 49, about='Levels of each parameter in the first search; 3 or '
-                          'more: the next odd prime power (zero is a level), an orthogonal array.')
-    robust: bool = setting(False, about='Weight fixes by their covariance and bound the pull of '
-                           'outliers in the search.')
+    radius_range: float = setting(0.0, '1', 0.0, 0.9, about='Half width of the search range '
+                                  "around each wheel's nominal factor, relative: twice the "
+                                  'stated error; 0: 0.05.')
+    heading_range: float = setting(0.0, 'rad', 0.0, 3.2, about='Half width of the search range '
+                                   'around the heading at the start; 0: twice its sigma, or 10 '
+                                   'deg if unknown.')
+    levels: int = setting(7, '', 1, 49, about='Levels of each parameter in the first search, 3 '
+                          'or more: rounded up to an odd prime power (with zero as a level) for '
+                          'the orthogonal array.')
+    robust: bool = setting(False, about='Weight fixes by their covariance and limit the '
+                           'influence of outliers in the search.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectionConfig:
     kind: str = setting('leg', choices=('leg', 'gauss_krueger', 'utm'), about='Plane of the '
-                        'chord check: transverse Mercator about the leg, a Gauss-Krueger zone, or '
-                        'UTM.')
+                        'chord check: local transverse Mercator, a Gauss-Krueger zone, or UTM.')
     ellipsoid: str = setting('WGS84', choices=('WGS84', 'CGCS2000', 'Krassovsky'), about=(
         'Ellipsoid of the plane.'))
-    central_meridian: float = setting(NAN, 'deg', about='Central meridian; NaN: the zone of the '
-                                      'leg.')
+    central_meridian: float = setting(NAN, 'deg', about='Central meridian; NaN: zone of the leg.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictConfig:
-    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Asked relative sigma of the '
+    max_scale_sigma: float = setting(0.001, '1', 0.0, 1.0, about='Required relative sigma of the '
                                      'scale factor.')
-    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Asked sigma of the yaw '
+    max_yaw_sigma: float = setting(0.0087, 'rad', 0.0, 3.2, about='Required sigma of the yaw '
                                    'mounting angle.')
     min_legs: int = setting(1, '', 1, 100, about='Fewer legs are a caution.')
-    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='How far the scale '
-                                         'factor walks between legs, relative, 1 sigma (tyres).')
+    scale_drift_per_day: float = setting(1e-4, '1/sqrt(day)', 0.0, 1.0, about='Random walk of '
+                                         'the scale factor between legs, relative, 1 sigma '
+                                         '(tyres).')
 
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptConfig:
     scale_factor_min: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Least scale factor that passes: value minus 2 sigma must not lie below. NaN: not asked.'))
+        'Lower acceptance limit of the scale factor: value minus 2 sigma must not be below. NaN: '
+        'no limit.'))
     scale_factor_max: float = setting(NAN, 'm/pulse, m/rad or 1', about=(
-        'Greatest one: value plus 2 sigma must not lie above.'))
-    scale_ratio_min: float = setting(NAN, '1', about='The same of the scale factor over the '
-                                     'nominal one.')
+        'Upper acceptance limit: value plus 2 sigma must not be above.'))
+    scale_ratio_min: float = setting(NAN, '1', about='The same for the scale factor relative to '
+                                     'its nominal value.')
     scale_ratio_max: float = setting(NAN, '1', about='The same.')
-    yaw_mounting_angle_min: float = setting(NAN, 'rad', about='The same of the yaw mounting '
+    yaw_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the yaw mounting '
                                             'angle.')
     yaw_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
-    pitch_mounting_angle_min: float = setting(NAN, 'rad', about='The same of the pitch mounting '
+    pitch_mounting_angle_min: float = setting(NAN, 'rad', about='The same for the pitch mounting '
                                               'angle.')
     pitch_mounting_angle_max: float = setting(NAN, 'rad', about='The same.')
-    strict: bool = setting(False, about='A result with a caution does not pass: it is undecided.')
+    strict: bool = setting(False, about='A result with a caution does not pass; it is undecided.')
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.limits.items():
@@ -262,12 +260,11 @@ class Config:
 
     method: str = setting('auto', choices=(
         'auto', 'two_point', 'wheels', 'smoother', 'all', 'patent'), about=(
-        'Method whose figures are the result; auto, all: each value of the first of smoother and '
-        'two_point that has it; patent: smoother, with the search of CN104359492A beside it where '
-        'there are two wheels; wheels: another name for smoother.'))
-    vehicle: str = setting('', ro=True, about='Which vehicle this is, in any words: it stands in '
-                           'results and titles the report, and a result of another one is not '
-                           'restored.')
+        'Method that gives the result; auto, all: each value from smoother if available, '
+        'otherwise from two_point; patent: smoother, plus the search of CN104359492A for two '
+        'wheels; wheels: alias of smoother.'))
+    vehicle: str = setting('', ro=True, about='Name of the vehicle, shown in results and as '
+                           'title of the report; a result of another vehicle is not restored.')
     odometer: OdometerConfig = OdometerConfig()
     imu: ImuConfig = ImuConfig()
     gnss: GnssConfig = GnssConfig()

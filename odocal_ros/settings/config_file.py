@@ -49,7 +49,7 @@ def read_config_file(path: Path) -> dict[str, object]:
         The file cannot be read.
     BadConfig
         It is no parameter file, has no block for the calibrator, or holds an unknown setting or
-        a wrong value; the text tells file and line.
+        a wrong value; the text names file and line.
 
     """
     return _settings(Path(path), _root(Path(path)))
@@ -62,7 +62,8 @@ def _root(path: Path) -> Node:
     except OSError as error:
         raise BadUsage(f'{path}: cannot be read ({error.strerror}); check --config') from None
     except UnicodeDecodeError:
-        raise BadConfig(f'{path}: not a text file; want a ROS parameter file (YAML)') from None
+        raise BadConfig(f'{path}: not a text file; required: a ROS parameter file '
+                        '(YAML)') from None
 
 
 def _settings(path: Path, root: Node) -> dict[str, object]:
@@ -70,8 +71,8 @@ def _settings(path: Path, root: Node) -> dict[str, object]:
     ours = [block for key, block in blocks.items() if _means_us(key)]
     if not ours:
         there = f'; it has {", ".join(blocks)}' if blocks else ''
-        raise BadConfig(f'{path}: no block for the calibrator{there}; want a top key {WANTED} '
-                        f'with {PARAMETERS} under it')
+        raise BadConfig(f'{path}: no block for the calibrator{there}; required: a top-level key '
+                        f'{WANTED} that contains {PARAMETERS}')
     values: dict[str, object] = {}
     for name, node in (pair for block in ours for part in block for pair in _leaves(part, '')):
         if not NOT_OURS.match(name):
@@ -103,7 +104,7 @@ def parse_set(text: str) -> tuple[str, object]:
     name, equals, value = text.partition('=')
     name = name.strip()
     if not equals or not name:
-        raise BadUsage(f'--set {text}: want key=value, as in --set leg.min_distance=50')
+        raise BadUsage(f'--set {text}: required: key=value, such as --set leg.min_distance=50')
     try:
         node = composed(value, f'--set {name}')
     except BadConfig as error:
@@ -148,7 +149,7 @@ def _blocks(node: Node, prefix: str) -> dict[str, list[Node]]:
 
 
 def _means_us(key: str) -> bool:
-    """Return whether a node key, with the wildcards * and **, matches /calibrator."""
+    """Return True if a node key, with the wildcards * and **, matches /calibrator."""
     if len(key) > LONGEST:
         return False
     parts = {'**': r'(?:/\w+)*', '*': r'/\w+'}
@@ -157,7 +158,7 @@ def _means_us(key: str) -> bool:
 
 
 def _leaves(node: Node, prefix: str) -> Iterator[tuple[str, Node]]:
-    """Yield (dotted name, value node) of nested and dotted keys alike."""
+    """Yield (dotted name, value node) of nested and dotted keys."""
     import yaml
     for key, value in _pairs(node):
         name = f'{prefix}{key}'

@@ -76,9 +76,9 @@ GRADES: dict[str, Grade] = {
                                    2e-3, 1e-5),
 }
 
-# Turn-on biases of Imus as they are sold, 1 sigma: gyro rad/s, accelerometer m/s^2. Physical: by
+# Turn-on biases of IMUs as they are sold, 1 sigma: gyro rad/s, accelerometer m/s^2. Physical: by
 # data sheets and what is measured (docs/zoo.md), ten and more times those of a grade above, which
-# a driver has taken out or a standstill tells
+# removed by a driver or measured at a standstill
 TURN_ON = {'consumer': (math.radians(1.0), 25e-3 * G), 'industrial': (math.radians(0.1), 3e-3 * G),
            'tactical': (math.radians(5.0) / 3600.0, 1e-3 * G)}
 

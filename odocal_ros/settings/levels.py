@@ -8,7 +8,7 @@
 # the License.
 
 """
-What several rooms ask alike: how many sigmas make a word, and what land vehicles do.
+Limits of several packages: sigmas for a remark, and motions of land vehicles.
 
 A level is one of two sides of the normal law; beside each, how often chance alone reaches it.
 
@@ -32,9 +32,9 @@ INFORMED_SHARE = 0.5
 # statistical: sigmas by a median, which half of the values may spoil
 NORMAL_MEDIAN = 0.6745      # of |x|, x normal with sigma 1
 RAYLEIGH_MEDIAN = 1.1774    # of the length of two such: sqrt(2 ln 2)
-# m/s, judgement: to the side and up, of a body on its springs, that no wheel feels
+# m/s, judgement: to the side and up, of a sprung body, not measured by wheels
 SWAY = 0.05
-# judgement: stamps further back, so many in turn, are those of a time that began anew
+# judgement: stamps further back, so many in turn, mean that time restarted
 TIME_ANEW_NS, TIME_ANEW_ROWS = 10**9, 3
 CLOCK_APART = 0.5      # s between the stamps of two topics, judgement: no driver is as late
 # definition: units

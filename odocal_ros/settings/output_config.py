@@ -19,23 +19,22 @@ FORMATS = ('params', 'autoware', 'transform', 'ros2_control', 'devices', 'track'
 
 @dataclass(frozen=True, kw_only=True)
 class OutputConfig:
-    directory: str = setting('', about='Where results go; empty: odocal/ and the full name of '
-                             'the node in $ROS_HOME (~/.ros/odocal/calibrator)'
-                             '.')
+    directory: str = setting('', about='Folder of the results; empty: odocal/ and the full node '
+                             'name in $ROS_HOME (~/.ros/odocal/calibrator).')
     autosave: bool = setting(True, about='Write the result files after every leg that is not '
                              'rejected.')
-    automatic_kept: int = setting(100, '', 0, 10**6, about='Result folders that are kept of those '
-                                  'written with leg.automatic; the oldest go first, but never '
-                                  'what latest shows and the newest good one. 0: all.')
-    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written beside '
-                                       'calibration.json.')
+    automatic_kept: int = setting(100, '', 0, 10**6, about='Number of result folders kept with '
+                                  'leg.automatic; the oldest are deleted first, but never the '
+                                  'one that latest points to and the newest good one. 0: all.')
+    formats: tuple[str, ...] = setting(FORMATS, choices=FORMATS, about='Files written in '
+                                       'addition to calibration.json.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class JournalConfig:
-    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk for the journals of legs '
-                             '(journal/ under output.directory); the oldest go first. 0: no '
-                             'journal.')
+    max_bytes: int = setting(10 * 2**30, 'bytes', 0, 2**62, about='Disk space for the journals '
+                             'of legs (journal/ in output.directory); the oldest are deleted '
+                             'first. 0: no journal.')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +45,9 @@ class PublishConfig:
 @dataclass(frozen=True, kw_only=True)
 class FramesConfig:
     base: str = setting('base_link', ro=True, frame=True,
-                        about='Vehicle frame in the files written.')
+                        about='Vehicle frame in the result files.')
     imu: str = setting('', ro=True, frame=True,
-                       about='Imu frame; empty: that of the Imu messages.')
+                       about='IMU frame; empty: frame of the IMU messages.')
     local: str = setting('odocal_enu', ro=True, frame=True,
                          about='Frame of the published paths.')
 
@@ -56,4 +55,4 @@ class FramesConfig:
 @dataclass(frozen=True, kw_only=True)
 class UpdaterConfig:
     period: float = setting(1.0, 's', 0.1, 60.0, ro=True, about='Period of /diagnostics.')
-    use_fqn: bool = setting(False, ro=True, about='Full node name in /diagnostics.')
+    use_fqn: bool = setting(False, ro=True, about='Use the full node name in /diagnostics.')

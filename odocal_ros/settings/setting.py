@@ -73,7 +73,7 @@ class Setting:
             items = tuple(self._one(v, str if self.choices else float) for v in value)
             lengths = (3,) if self.default else (0, 4)
             if not self.choices and len(items) not in lengths:
-                raise BadConfig(f'{self.name}: {len(items)} values, want {lengths[-1]}')
+                raise BadConfig(f'{self.name}: {len(items)} values; required: {lengths[-1]}')
             return items
         return self._one(value, type(self.default))
 
@@ -95,22 +95,22 @@ class Setting:
             # no setting in SI units means a number beyond it; sums with it stay finite
             largest = 1e9
             if kind is float and abs(value) > largest:
-                raise BadConfig(f'{self.name} = {value:g}: want at most {largest:g}')
+                raise BadConfig(f'{self.name} = {value:g}: the limit is {largest:g}')
             below = self.low is not None and value < self.low
             if below or self.high is not None and value > self.high:
                 unit = '' if self.unit == '1' else self.unit
-                raise BadConfig(f'{self.name} = {value:g}: want {self.low:g} to {self.high:g} '
-                                f'{unit}'.rstrip())
+                raise BadConfig(f'{self.name} = {value:g}: required: {self.low:g} to '
+                                f'{self.high:g} {unit}'.rstrip())
         return value
 
     def _check_text(self, value: str) -> None:
         """Refuse what no name is: it would stand in files and on terminals."""
         if one_line(value) != value:
-            raise BadConfig(f"{self.name}: '{one_line(value)}' has characters that cannot be seen")
+            raise BadConfig(f"{self.name}: '{one_line(value)}' has invisible characters")
         # empty is one where that means something: as the default
         if self.frame and not is_frame(value) and value != self.default:
-            raise BadConfig(f'{self.name}: {value!r} is no frame name; want letters, digits and '
-                            '_ . / -, no / at its beginning')
+            raise BadConfig(f'{self.name}: {value!r} is not a frame name; allowed: letters, '
+                            'digits and _ . / -, without a leading /')
 
 
 def _settings(owner: Settings, prefix: str = '') -> Iterator[Setting]:
@@ -136,7 +136,7 @@ def with_settings(config: AnyConfig, changes: Mapping[str, Any]) -> AnyConfig:
     Raises
     ------
     BadConfig
-        Unknown name (the nearest ones are told), wrong type, out of range.
+        Unknown name (the text names similar ones), wrong type, out of range.
 
     """
     groups: dict[str, dict[str, Any]] = {}

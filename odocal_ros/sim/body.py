@@ -79,7 +79,7 @@ def drift(speed: Profile, yaw_rate: Profile, sideslip: float, t: Floats) -> Floa
 
 
 def rotation(motion: Motion, t: Floats) -> Floats:
-    """Return what takes the body's axes to the vehicle's at (n,) times: (n, 3, 3)."""
+    """Return the rotations from the body axes to the vehicle axes at (n,) times: (n, 3, 3)."""
     roll, pitch = (profile(t) for profile in motion.tilt)
     return matrix_from_rpy(np.stack([roll, pitch, np.zeros_like(roll)], -1))
 
@@ -89,7 +89,7 @@ def felt(motion: Motion, state: State,
     """
     Return turn rate (rad/s) and specific force (m/s^2) in the body's axes: (n, 3) each.
 
-    lever_arm : of the Imu in base_link with the body level, m.
+    lever_arm : of the IMU in base_link with the body level, m.
     """
     w_v, f_v = inertial_v(state, lever_arm)
     if not motion.tilt:

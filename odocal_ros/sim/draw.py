@@ -27,7 +27,7 @@ from odocal_ros.sim.real import Real
 from odocal_ros.sim.zoo import GRADES, plain, ROWS, SIZES, Vehicle
 
 KINDS = ('town', 'straight', 'out_and_back', 'motorway', 'yard')
-EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS     # all of them, in a drawn vehicle
+EFFECTS = draw_imu.EFFECTS | draw_road.EFFECTS     # all are part of a drawn vehicle
 RARE = draw_road.RARE
 ODOMETER_EFFECTS = ('coarse_speed', 'coarse_pulses')   # each asks for an odometer of its own
 
@@ -42,7 +42,7 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
     seed : int
         Of the vehicle, and of the noise of its drive.
     kind, grade : str
-        Scenario, and class of the Imu: consumer, industrial or tactical.
+        Scenario, and class of the IMU: consumer, industrial or tactical.
     effects : sequence of str, optional
         Those to be drawn; None: all, ``()``: the clean vehicle.
     given : dict
@@ -55,12 +55,12 @@ def drawn(seed: int, kind: str, grade: str, effects: Sequence[str] | None = None
 
     """
     if grade not in GRADES:
-        raise BadUsage(f'--vehicle real with --imu-grade {grade}: want one of '
+        raise BadUsage(f'--vehicle real with --imu-grade {grade}: required: one of '
                        f'{", ".join(GRADES)}')
     names = list(EFFECTS) if effects is None else list(effects)
     for name in names:
         if name not in EFFECTS | RARE:
-            raise BadUsage(f'--effect {name}: want one of {", ".join(EFFECTS | RARE)}')
+            raise BadUsage(f'--effect {name}: required: one of {", ".join(EFFECTS | RARE)}')
     if set(ODOMETER_EFFECTS) <= set(effects or ()):
         raise BadUsage(f'--effect {" and ".join(ODOMETER_EFFECTS)}: a vehicle has one odometer')
     own = given.pop('real', {})

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Effects of a drawn vehicle's Imu, after the tables of docs/zoo.md; C, I, T are its classes."""
+"""Effects of a drawn vehicle's IMU, after the tables of docs/zoo.md; C, I, T are its classes."""
 
 import math
 
@@ -20,7 +20,7 @@ from odocal_ros.sim.zoo import DEG, Drawn, G, lognormal, plain, Vehicle
 def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Scale of each axis, axes that are not square, a gyro turned against its accelerometer."""
     x, y, z = rng.normal(0.0, vehicle.size('between') / math.sqrt(2), 3)
-    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it each way
+    turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])    # half of it to each side
     figures = {}
     for name, sensor, sign in (('gyro_matrix', 'gyro', 1), ('accel_matrix', 'accelerometer', -1)):
         M = rng.normal(0.0, vehicle.size('cross'), (3, 3)) + sign * turned / math.sqrt(2)
@@ -32,12 +32,12 @@ def triads(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def g_sensitivity(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Let the gyro feel specific force."""
+    """Draw the g-sensitivity of the gyro."""
     return {}, {'g_sensitivity': plain(rng.normal(0.0, vehicle.size('g sensitivity'), 9))}
 
 
 def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Turn-on biases of the vehicle's table, and their wander in the run."""
+    """Turn-on biases of the vehicle's table, and their drift during the run."""
     return {}, {
         'gyro_bias': plain(rng.normal(0.0, vehicle.size('gyro bias'), 3)),
         'accel_bias': plain(rng.normal(0.0, vehicle.size('accelerometer bias'), 3) * [1, 1, 1.3]),
@@ -46,7 +46,7 @@ def bias(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Biases that ramp while the Imu warms; it may have been on for some minutes."""
+    """Biases that ramp while the IMU warms; it may have been on for some minutes."""
     tau = lognormal(rng, 300.0, 0.5)
     since = rng.uniform(0.0, 600.0)
     figures = {}
@@ -60,14 +60,14 @@ def temperature(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def vibration(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Shake the Imu by road and engine."""
+    """Shake the IMU by road and engine."""
     rms = G * rng.uniform(0.02, 0.1)
     return {}, {'vibration': float(rms), 'gyro_vibration': float(DEG * rng.uniform(0.1, 0.5)),
                 'rectification': float(vehicle.size('rectified') * rng.choice([-1, 1]))}
 
 
 def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Stamps late by the sensor's filter and the way to the computer, jittered, in batches."""
+    """Stamps late by filter and transport delay, with jitter, in batches."""
     shortest, longest = vehicle.row('filter')
     latency = rng.uniform(shortest, longest) + lognormal(rng, *vehicle.row('latency'))
     batches = vehicle.grade == 'industrial' and rng.uniform() < 0.3
@@ -78,8 +78,8 @@ def imu_stamps(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 def grade(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
     """Let ``imu.grade`` be set right, one too good, or one too modest (navigation, consumer)."""
     names = list(GRADES)
-    told = names.index(vehicle.grade) + int(rng.integers(-1, 2))
-    told_grade = names[max(0, min(told, len(names) - 1))]
+    stated = names.index(vehicle.grade) + int(rng.integers(-1, 2))
+    told_grade = names[max(0, min(stated, len(names) - 1))]
     return {}, {} if told_grade == vehicle.grade else {'told_grade': told_grade}
 
 

@@ -122,7 +122,7 @@ def covariance(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Lose the sky, and a fix in a hundred."""
+    """Outages, and a loss of one fix in a hundred."""
     spans, span = [], 500.0
     for _ in range(int(rng.poisson(3.0 if vehicle.city else 1.0)) + vehicle.alone):
         begin = float(rng.uniform(30.0, span))
@@ -131,18 +131,18 @@ def outages(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 
 
 def fused_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Fuse an odometer that is not calibrated into the fixes, as car head units do."""
+    """Fuse an uncalibrated odometer into the fixes, as car head units do."""
     return {}, {'receiver_odometer': float(rng.uniform(0.003, 0.02) * rng.choice((-1, 1))),
                 'receiver_odometer_time': lognormal(rng, 20.0, 0.5)}
 
 
 def tracked_fixes(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Filter position and velocity as receivers set for vehicles do."""
+    """Filter position and velocity, as receivers in vehicle mode do."""
     return {}, {'receiver_tracking': float(rng.uniform(0.3, 1.0))}
 
 
 def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
-    """Send a speed on until it has changed by a step, as buses do to save messages."""
+    """Hold a published speed until it has changed by a step, as many buses do."""
     ratio = vehicle.options['scale'] / vehicle.options['nominal_scale']
     return ({'odometer': 'speed', 'scale': ratio, 'nominal_scale': 1.0},
             {'speed_hold': KMH * float(rng.choice((0.2, 0.5)))})
@@ -151,5 +151,5 @@ def held_speed(rng: np.random.Generator, vehicle: Vehicle) -> Drawn:
 EFFECTS = {f.__name__: f for f in (
     coarse_speed, coarse_pulses, odometer_stamps, speed_law, warming, slip, sideslip, squat,
     lever_arms, receiver_lag, fix_stamps, slow_errors, multipath, covariance, outages)}
-# drawn where they are asked for by name: of receivers and buses that some vehicles have
+# only with --effect NAME: receivers and buses of some vehicles
 RARE = {f.__name__: f for f in (fused_fixes, tracked_fixes, held_speed)}

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A fleet with known truth: models, vehicles that differ, tyres changed, Imus moved."""
+"""A fleet with known truth: models, vehicles that differ, tyres changed, IMUs moved."""
 
 from dataclasses import dataclass, field, replace
 import math
@@ -19,7 +19,7 @@ from odocal_ros.sim.noise import stream
 from odocal_ros.sim.scenarios import Drive, SimOptions
 
 WALK = 1e-4              # judgement: of the scale, relative, per square root of a day
-# judgement: shares of the vehicles whose tyres are changed, Imu moved, counter broken; at least
+# judgement: shares of the vehicles whose tyres are changed, IMU moved, counter broken; at least
 # one of three
 FATES = {'scale_factor': 0.1, 'yaw_mounting_angle': 0.05, 'counter': 1 / 30}
 
@@ -63,7 +63,7 @@ class FleetVehicle:
     changes: tuple[FleetChange, ...] = field(default=())
 
     def broken(self, bag: int) -> bool:
-        """Return whether the counter was broken in a drive."""
+        """Return True if the counter was broken in a drive."""
         return any(change.what == 'counter' and change.bag <= bag for change in self.changes)
 
 

@@ -8,11 +8,11 @@
 # the License.
 
 """
-Two frames of one Imu: its housing, and the frame that its own axes make.
+Two frames of one IMU: its housing, and the frame that its own axes make.
 
 Gyro and accelerometer triads are not square with the housing, so yaw and pitch mean nothing
-before it is said of what. In the turn-and-push frame a turn about z is felt by the z gyro alone,
-and a push along x not by the y accelerometer. These are the angles that driving can tell.
+before it is said of what. In the measurement frame only the z gyro measures a turn about z,
+and the y accelerometer no acceleration along x. Driving determines these angles.
 """
 
 import numpy as np
@@ -36,14 +36,14 @@ def turn_and_push(gyro_matrix: Floats, accel_matrix: Floats) -> Floats:
     gyro, accel = np.eye(3) + gyro_matrix, np.eye(3) + accel_matrix
     z = np.linalg.solve(gyro, [0.0, 0.0, 1.0])
     z /= np.linalg.norm(z)
-    x = np.cross(accel[1], z)      # felt by no y accelerometer, square with z
+    x = np.cross(accel[1], z)      # not measured by the y accelerometer, perpendicular to z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], -1)
 
 
 def own_angles(C_vb: Floats, C_bi: Floats, gyro_matrix: Floats,
                accel_matrix: Floats) -> tuple[float, float, float, float]:
-    """Return yaw and pitch by the Imu's own axes, then by its housing, rad; matrices in i."""
+    """Return yaw and pitch by the IMU's own axes, then by its housing, rad; matrices in i."""
     d = np.asarray(C_vb)[0]
     R = turn_and_push(C_bi @ gyro_matrix @ C_bi.T, C_bi @ accel_matrix @ C_bi.T)
     return *angles(R.T @ d), *angles(d)

@@ -110,7 +110,7 @@ class Motion:
         """Return the state at times t, (n,) s."""
         t = np.asarray(t, dtype=float)
         node = np.clip(np.searchsorted(self._nodes, t, side='right') - 1, 0, None)
-        east, north, up, turned = self._stretch(self._nodes[node], t - self._nodes[node])
+        east, north, up, turned = self._section(self._nodes[node], t - self._nodes[node])
         latitude0, height0 = self._latitude[node], self._height[node]
         latitude, longitude = _walk(latitude0, height0 + up / 2, east, north)
         travel, speed, acceleration = self._travel(t), self.speed(t), self._acceleration.mean(t)
@@ -132,7 +132,7 @@ class Motion:
         breaks = [p.breaks for p in (self.speed, self.yaw_rate, *self.sway)]
         nodes = np.unique(np.concatenate([steps, [self.duration], *breaks]))
         self._nodes = nodes = nodes[nodes <= self.duration]
-        east, north, up, turned = self._stretch(nodes[:-1], np.diff(nodes))
+        east, north, up, turned = self._section(nodes[:-1], np.diff(nodes))
         self._height = _running(self.start.height, up)
         middle = (self._height[1:] + self._height[:-1]) / 2
         latitude = np.full(len(nodes), self.start.latitude)
@@ -146,7 +146,7 @@ class Motion:
         self._turned = _running(
             0.0, turned + longitude * np.sin((latitude[1:] + latitude[:-1]) / 2))
 
-    def _stretch(self, t: Floats, h: Floats) -> list[Floats]:
+    def _section(self, t: Floats, h: Floats) -> list[Floats]:
         """Return metres east, north, up and rad turned against the level, from t to t + h."""
         sums = [np.zeros(np.shape(t)) for _ in range(4)]
         for node, weight in GAUSS:
@@ -198,7 +198,7 @@ def _velocity_v(state: State) -> Floats:
 def inertial_v(state: State,
                lever_arm_v: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
     """
-    Return what a perfect IMU at ``lever_arm_v`` (m, in v) feels, in v's axes.
+    Return the output of a perfect IMU at ``lever_arm_v`` (m, in v), in axes v.
 
     Returns
     -------

@@ -30,7 +30,7 @@ class SimOptions:
     Choices for one drive; BY_SCENARIO is the scenario's own value.
 
     Lever arms are positions in base_link (rear axle, forward-left-up), m. Mounting angles are
-    those of docs/conventions.md; ``mounting_rpy`` is the nominal rotation from the Imu's frame to
+    those of docs/conventions.md; ``mounting_rpy`` is the nominal rotation from the IMU's frame to
     b that comes on top.
     """
 
@@ -49,18 +49,18 @@ class SimOptions:
     yaw: float = BY_SCENARIO   # rad, yaw mounting angle
     pitch: float = BY_SCENARIO   # rad, pitch mounting angle
     roll: float = 0.0                      # rad
-    mounting_rpy: Vector = NONE3          # rad, nominal, Imu frame to b
+    mounting_rpy: Vector = NONE3          # rad, nominal, IMU frame to b
     imu_lever_arm: Vector = NONE3
     gyro_scale_error: float = 0.0          # relative, of all axes
     accel_scale_error: float = 0.0         # relative, of all axes
-    orientation_sigma: float | None = None  # rad; None: the Imu sends no orientation
+    orientation_sigma: float | None = None  # rad; None: the IMU sends no orientation
 
     odometer: str = 'counts'               # counts, speed or angle (JointState position)
     odometer_rate: float = 50.0            # Hz
-    odometer_delay: float = 0.0            # s by which its stamps are late
+    odometer_delay: float = 0.0            # s, delay of the stamps
     odometer_lever_arm: Vector = NONE3    # wheel contact point; of two wheels: their middle
-    scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: what is to be found
-    nominal_scale: float = BY_SCENARIO   # K0, what the operator believes
+    scale: float = BY_SCENARIO   # m/pulse, 1 or m/rad: the true value
+    nominal_scale: float = BY_SCENARIO   # K0, configured by the operator
     speed_noise: float = 0.0               # m/s, white, of kind speed
     two_wheels: bool = False
     wheel_difference: float = 0.004        # K_right / K_left - 1
@@ -68,7 +68,7 @@ class SimOptions:
     slip_walk: float = 0.0                 # m/sqrt(s) while moving
     slip_events: float = 0.0               # per hour of motion
     slip_size: float = 0.1                 # m spun in each event
-    start_slip: float = 0.0                # share of the way rolled that is spun at each start
+    start_slip: float = 0.0                # wheel spin as a fraction of travel after each start
     start_slip_time: float = 5.0           # s from each start on
     sway: float = 0.0                      # m/s of side and up while moving, white at 10 Hz
 
@@ -76,7 +76,7 @@ class SimOptions:
     fix_noise: str = 'white'               # white, correlated or rtk
     fix_sigma: float = BY_SCENARIO   # m, horizontal, each axis; up: twice
     fix_correlation_time: float = 60.0     # s, of kind correlated
-    fix_delay: float = 0.0                 # s by which its stamps are late
+    fix_delay: float = 0.0                 # s, delay of the stamps
     antenna_lever_arm: Vector = NONE3
     outliers: float = 0.0                  # share of the fixes
     outlier_size: float = 20.0             # m
@@ -85,13 +85,13 @@ class SimOptions:
     heading_sigma: float | None = None     # rad; None: no heading topic
     heading_rate: float = 10.0             # Hz
 
-    velocity_sigma: float | None = None    # m/s, each axis; None: no velocity of the receiver
+    velocity_sigma: float | None = None    # m/s, each axis; None: no GNSS velocity
     velocity_rate: float = 10.0            # Hz
-    velocity_correlation_time: float = 0.0  # s, of its errors; 0: white
-    velocity_delay: float = 0.0            # s by which its stamps are late
-    velocity_lag: float = 0.0              # s over which the receiver smooths it, first order
+    velocity_correlation_time: float = 0.0  # s; 0: white
+    velocity_delay: float = 0.0            # s, delay of the stamps
+    velocity_lag: float = 0.0              # s, time constant of first-order smoothing
     velocity_scale_error: float = 0.0      # relative
-    velocity_outliers: float = 0.0         # share of it
+    velocity_outliers: float = 0.0         # share of outliers
 
     real: Real = Real()                    # what real sensors do beyond this
 
@@ -163,10 +163,10 @@ def _check(options: SimOptions) -> None:
             if isinstance(one, (int, float)) and not isinstance(one, bool):
                 _check_number(field.name, one)
     if options.two_wheels and options.odometer == 'speed':
-        raise BadUsage('--two-wheels goes with --odometer counts or angle, not with speed')
+        raise BadUsage('--two-wheels requires --odometer counts or angle, not speed')
     for begin, end in options.outages:
         if not 0 <= begin < end:
-            raise BadUsage(f'--outage {begin:g}:{end:g}: want A:B, seconds with 0 <= A < B')
+            raise BadUsage(f'--outage {begin:g}:{end:g}: required: A:B, seconds with 0 <= A < B')
     most = 20_000_000    # of one topic; more would not fit in memory
     if options.duration * options.imu_rate > most:
         raise BadUsage(f'--duration {options.duration:g} at --imu-rate {options.imu_rate:g}: more '
@@ -178,16 +178,16 @@ def _check_number(name: str, value: float) -> None:
     flag = '--' + name.replace('_', '-') + ('-deg' if degrees else '')
     shown = math.degrees(value) if degrees else value
     if not math.isfinite(value):
-        raise BadUsage(f'{flag} {value}: want a finite number')
+        raise BadUsage(f'{flag} {value}: required: a finite number')
     if name in POSITIVE and not value > 0:
-        raise BadUsage(f'{flag} {shown:g}: want a number above 0')
+        raise BadUsage(f'{flag} {shown:g}: required: a number above 0')
     if name in NOT_NEGATIVE and value < 0:
-        raise BadUsage(f'{flag} {shown:g}: want 0 or more')
+        raise BadUsage(f'{flag} {shown:g}: required: 0 or more')
     limit = (ANGLES | LIMITS).get(name, math.inf)
     if abs(shown) > limit * (1 + 1e-12):
-        raise BadUsage(f'{flag} {shown:g}: want at most {limit:g}')
+        raise BadUsage(f'{flag} {shown:g}: the limit is {limit:g}')
 
 
 def _choice(flag: str, name: str, names: Collection[str]) -> None:
     if name not in names:
-        raise BadUsage(f'{flag} {name}: want one of {", ".join(names)}')
+        raise BadUsage(f'{flag} {name}: required: one of {", ".join(names)}')

@@ -35,9 +35,9 @@ POSITIVE = ('warm_time', 'wander_time', 'warming_time', 'burst_time', 'stated_fa
 @dataclass(frozen=True, kw_only=True)
 class Real:
     """
-    The vehicle's own figures, SI and radians; the Imu's in its own frame i (the housing).
+    The vehicle's own figures, SI and radians; the IMU's in its own frame i (the housing).
 
-    The Imu reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
+    The IMU reads ``w_m = (I + M_g) w + b_g + G f + n`` and ``f_m = (I + M_a) f + b_a + n``.
     """
 
     gyro_matrix: Matrix = NONE9      # M_g: scale on the diagonal, misalignment beside it
@@ -62,7 +62,7 @@ class Real:
     speed_step: float = 0.0          # step of the speed sent, in its unit; 0: fine
     speed_rounding: str = 'floor'    # floor or round
     dead_band: float = 0.0           # speeds below are sent as 0
-    speed_hold: float = 0.0          # a speed is sent until it has changed by that
+    speed_hold: float = 0.0          # change of speed that is published
     odometer_jitter: float = 0.0     # s, 1 sigma, on top of odometer_delay
     speed_law: float = 0.0           # relative growth of the tyres at 36 m/s, as v^2
     warming: float = 0.0             # relative growth of the tyres, warm against cold
@@ -80,9 +80,9 @@ class Real:
     antenna_arm_error: Vector = NONE3
 
     receiver_lag: float = 0.0        # s, time constant of a first-order filter on positions
-    receiver_tracking: float = 0.0   # s, of a filter of position and velocity
-    receiver_odometer: float = 0.0   # relative error of an odometer that is fused into the fixes
-    receiver_odometer_time: float = 20.0    # s in which satellites take its places back
+    receiver_tracking: float = 0.0   # s, time constant of a filter of position and velocity
+    receiver_odometer: float = 0.0   # relative scale error of an odometer fused into the fixes
+    receiver_odometer_time: float = 20.0    # s in which satellites correct it
     # (sigma m of east and north, up twice; correlation s) each
     slow_errors: tuple[tuple[float, float], ...] = ()
     bursts: float = 0.0              # multipath bursts per hour
@@ -107,7 +107,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     """Return a figure as numbers and tuples of them, or say what is wrong with it."""
     if name in WORDS:
         if value not in WORDS[name] and value != default:
-            raise BadUsage(f'--real {name}={value}: want one of {", ".join(WORDS[name])}')
+            raise BadUsage(f'--real {name}={value}: required: one of {", ".join(WORDS[name])}')
         return value
     if value is None and default is None:
         return None
@@ -115,7 +115,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
     numbers = _numbers(name, value, default)
     if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
-        raise BadUsage(f'--real {name}: want finite numbers')
+        raise BadUsage(f'--real {name}: required: finite numbers')
     least = min(numbers, default=1.0)
     if (name not in SIGNED and least < 0 or name in POSITIVE and least <= 0
             or name == 'drops' and least >= 1 or name == 'imu_batch' and least != int(least)):
@@ -128,12 +128,12 @@ def _numbers(name: str, value: Any, default: Any) -> tuple[Any, ...]:
     if name == 'slow_errors':
         if not (isinstance(value, tuple) and all(isinstance(v, tuple) and len(v) == 2
                                                  and v[1] for v in value)):
-            raise BadUsage('--real slow_errors: want pairs of sigma and correlation time, such '
-                           'as ((1.2,60),(0.9,900))')
+            raise BadUsage('--real slow_errors: required: pairs of sigma and correlation time, '
+                           'such as ((1.2,60),(0.9,900))')
         return tuple(x for pair in value for x in pair)
     count = 3 if default is None else len(default) if isinstance(default, tuple) else 0
     if isinstance(value, tuple) != bool(count) or count and len(value) != count:
-        raise BadUsage(f'--real {name}: want {f"{count} numbers" if count else "one number"}')
+        raise BadUsage(f'--real {name}: required: {f"{count} numbers" if count else "one number"}')
     return value if count else (value,)
 
 
@@ -152,7 +152,7 @@ def parsed(text: str) -> tuple[str, Any]:
     names = [f.name for f in fields(Real)]
     if name not in names:
         near = difflib.get_close_matches(name, names, 3) or names
-        raise BadUsage(f'--real {name}: no such figure; near: {", ".join(near)}')
+        raise BadUsage(f'--real {name}: no such parameter; similar: {", ".join(near)}')
     try:
         return name, ast.literal_eval(value)
     except (ValueError, SyntaxError):

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a real receiver adds: a lag, slow errors, multipath, sigmas that are not those told."""
+"""Effects of a real receiver: lag, correlated errors, multipath, wrong stated sigmas."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ ONSET = (1.0, 3.0)   # s, judgement: in which a burst comes and goes
 
 
 def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floats, Floats]:
-    """Return latitude, longitude (rad), height (m) that a receiver without noise tells at t."""
+    """Return latitude, longitude (rad), height (m) of a receiver without noise at t."""
     real, true = options.real, _antenna(motion, t, options)
     out = true
     for weights, time in ((AVERAGING, real.receiver_lag), (TRACKING, real.receiver_tracking)):
@@ -50,14 +50,14 @@ def places(motion: Motion, t: Floats, options: SimOptions) -> tuple[Floats, Floa
 
 def _filtered(motion: Motion, t: Floats, options: SimOptions, weights: Floats,
               time: float) -> tuple[Floats, Floats, Floats]:
-    """Return places weighted by their age; before the first sample the vehicle stood."""
+    """Return positions weighted by their age; before the first sample the vehicle is at rest."""
     return tuple(sum(w * x for w, x in zip(weights, row, strict=True)) for row in zip(
         *(_antenna(motion, np.maximum(t - time * node, 0.0), options) for node in NODES),
         strict=True))
 
 
 def fused(t: Floats, errors: Floats, options: SimOptions) -> Floats:
-    """Return (n, 3) errors of satellites as a receiver with an odometer of its own has them."""
+    """Return (n, 3) satellite errors after fusion with the odometer of the receiver."""
     if not options.real.receiver_odometer:
         return errors
     left = np.exp(-np.diff(t) / options.real.receiver_odometer_time)

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a real Imu adds: crooked triads, g-sensitivity, warmth, vibration, late stamps."""
+"""What a real IMU adds: crooked triads, g-sensitivity, warmth, vibration, late stamps."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ APART_NS = 50_000    # judgement: between the stamps of one batch
 
 
 def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
-    """Return what the triads make of turn rate and specific force: (n, 3) each."""
+    """Return turn rate and specific force with the errors of the triads: (n, 3) each."""
     gyro, accel, G = (real.matrix(n) for n in ('gyro_matrix', 'accel_matrix', 'g_sensitivity'))
     w_m = w_i + w_i @ gyro.T if gyro.any() else w_i
     if G.any():
@@ -31,7 +31,7 @@ def crooked(w_i: Floats, f_i: Floats, real: Real) -> tuple[Floats, Floats]:
 
 
 def drifts(t: Floats, speed: Floats, options: SimOptions) -> list[Floats | float]:
-    """Return what warmth, wander and vibration add to gyro and accelerometer: (n, 3) or 0.0."""
+    """Return gyro and accelerometer errors by temperature, drift and vibration: (n, 3) or 0.0."""
     real = options.real
     warmth = real.warm_rise * -np.expm1(-t / real.warm_time)[:, None]
     added = []
@@ -62,7 +62,7 @@ def vibration(rng: np.random.Generator, rms: float, rate: float, n: int) -> Floa
     """
     Return shaking of a body that goes nowhere, (n, 3): around its resonances, nothing at 0 Hz.
 
-    Its power falls as f^4 below them, as that of the acceleration of a bounded way does.
+    Its power falls as f^4 below them, as for the acceleration of a bounded displacement.
     """
     f = np.fft.rfftfreq(n, 1 / rate)
     power = np.zeros_like(f)
@@ -84,7 +84,7 @@ def stamped(ns: Ints, rng: np.random.Generator, latency: float, jitter: float,
     """
     Return stamps (ns) of samples measured at ``ns``: late, in order, and in batches.
 
-    The mean of the jitter is none, but no stamp goes before its sample.
+    The mean of the jitter is none, but no stamp is before its sample.
     """
     late = np.maximum(latency + jitter * rng.standard_normal(len(ns)), 0.0)
     stamp = ns + np.rint(late * 1e9).astype(np.int64)

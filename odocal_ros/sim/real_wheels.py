@@ -44,27 +44,27 @@ def slip_share(state: State, real: Real) -> Floats:
 
 def tyre_slip(state: State, real: Real) -> Floats:
     """Return the metres spun beyond the ground by then: (n,)."""
-    way = np.diff(state.travel, prepend=state.travel[:1])
-    return np.cumsum(slip_share(state, real) * way)
+    path_length = np.diff(state.travel, prepend=state.travel[:1])
+    return np.cumsum(slip_share(state, real) * path_length)
 
 
 def leg_factor(state: State, real: Real) -> float:
     """
     Return true metres rolled over those of a wheel that neither grew nor slipped.
 
-    state : between the marks of the leg. The mean is by travel, to and fro alike.
+    state : between the marks of the leg. The mean is by travel in both directions.
     """
     if not (real.speed_law or real.warming or real.tyre_slip):
         return 1.0
-    way = np.diff(state.travel)
+    path_length = np.diff(state.travel)
     spun = np.diff(tyre_slip(state, real)) if real.tyre_slip else 0.0
     grown = growth(state, real) + np.zeros_like(state.t)
-    counted = (way + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
-    return float(np.abs(way).sum() / np.abs(counted).sum())
+    counted = (path_length + spun) / (1 + (grown[1:] + grown[:-1]) / 2)
+    return float(np.abs(path_length).sum() / np.abs(counted).sum())
 
 
 def coarse(speed: Floats, real: Real) -> Floats:
-    """Return speeds as a bus sends them: in steps, 0 below the dead band, or held."""
+    """Return the published speeds: in steps, 0 below the dead band, or held."""
     if real.speed_step:
         steps = np.abs(speed) / real.speed_step
         steps = np.floor(steps) if real.speed_rounding == 'floor' else np.floor(steps + 0.5)
@@ -75,7 +75,7 @@ def coarse(speed: Floats, real: Real) -> Floats:
 
 
 def held(speed: Floats, step: float) -> Floats:
-    """Return speeds each of which is sent until one is 0 or a step away."""
+    """Return speeds that repeat until one is 0 or differs by a step."""
     out = speed.tolist()
     for k, now in enumerate(out[1:], 1):
         if now and abs(now - out[k - 1]) < step:

@@ -71,17 +71,17 @@ def town(duration: float, rng: np.random.Generator) -> Route:
         stretches.append((speed, rate))
         left -= length
     if not stretches[1:]:
-        raise BadUsage(f'scenario town: --duration {duration:g} s holds no cycle of stop and go; '
-                       f'give {enough:g} s or more')
+        raise BadUsage(f'scenario town: --duration {duration:g} s is too short for a stop-and-go '
+                       f'cycle; give {enough:g} s or more')
     stretches.append((hold(15 + left), hold(15 + left)))
     return _route(stretches)
 
 
 def motorway(duration: float, rng: np.random.Generator) -> Route:
     """
-    Return a ramp, a long way at 25 to 36 m/s with gentle curves and changes of speed, a ramp.
+    Return a ramp, a long section at 25 to 36 m/s with gentle curves and changes of speed, a ramp.
 
-    Still for 40 s, up in 25 to 40 s with a curve at about 6 deg/s on the way; then stretches of
+    Still for 40 s, up in 25 to 40 s with a curve at about 6 deg/s; then sections of
     15 to 45 s that change the speed by up to 6 m/s or turn at 0.2 to 1.2 deg/s; 30 s down, still.
     """
     up, down = _tenth(rng.uniform(25, 40)), _tenth(rng.uniform(25, 40))
@@ -156,7 +156,7 @@ def _tenth(seconds: float) -> float:
 
 def _rest(name: str, duration: float, fixed: float, least: float = 10.0,
           enough: float | None = None) -> float:
-    """Return what is left beside the fixed parts, s; too little is told with what is enough."""
+    """Return the time left besides the fixed parts, s; raise an error if it is too short."""
     if not math.isfinite(duration) or duration < fixed + least:
         raise BadUsage(f'scenario {name}: --duration {duration:g} s is too short, '
                        f'give {enough or fixed + least:g} s or more')

@@ -50,7 +50,7 @@ class Truth:
 
     The scale of tyres that grow or slip is the mean of the leg by travel: true metres rolled
     between the marks over the change of the count there, before anything made it coarse; so are
-    its ratio and the wheels' own. Yaw and pitch are those of the Imu's own axes (turn-and-push
+    its ratio and the wheels' own. Yaw and pitch are those of the IMU's own axes (turn-and-push
     frame, ``housing.py``), which are its housing's where the triads are square.
     """
 
@@ -61,11 +61,11 @@ class Truth:
     pitch: float                 # rad, mounting
     heading: float               # rad from north, clockwise, of b's x axis at the start mark
     distance: float              # m rolled at the odometer's point
-    start_ns: int                # start mark: the last Imu sample before the vehicle first moves
-    stop_ns: int                 # stop mark: the last Imu sample
+    start_ns: int                # start mark: the last IMU sample before the vehicle first moves
+    stop_ns: int                 # stop mark: the last IMU sample
     gyro_bias: np.ndarray        # (3,) rad/s at turn-on, frame i
     accel_bias: np.ndarray       # (3,) m/s^2 at turn-on, frame i
-    yaw_housing: float           # rad, mounting of the Imu's housing
+    yaw_housing: float           # rad, mounting of the IMU's housing
     pitch_housing: float         # rad
 
 
@@ -164,12 +164,12 @@ def _truth(motion: Motion, options: SimOptions, imu: ImuSamples) -> Truth:
 
 
 def _angles(options: SimOptions) -> tuple[float, float, float, float]:
-    """Return yaw and pitch by the Imu's own axes, then by its housing, rad."""
+    """Return yaw and pitch by the IMU's own axes, then by its housing, rad."""
     real = options.real
     gyro, accel = real.matrix('gyro_matrix'), real.matrix('accel_matrix')
     if not (options.roll or gyro.any() or accel.any()):
         return (options.yaw, options.pitch) * 2
-    # with a roll the angles are those that tell forward: docs/conventions.md
+    # with a roll the angles are those of forward: docs/conventions.md
     return own_angles(matrix_from_rpy([options.roll, options.pitch, options.yaw]),
                       matrix_from_rpy(options.mounting_rpy), gyro, accel)
 

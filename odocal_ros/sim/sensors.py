@@ -10,7 +10,7 @@
 """
 Sensors on a true motion: what each would have sent.
 
-The Imu gives point samples, not means over the interval: the rate and the specific force at the
+The IMU gives point samples, not means over the interval: the rate and the specific force at the
 stamp; where the acceleration jumps, the mean of both sides. A trapezoid rule over the samples of a
 route whose kinks lie on them is then exact, a cubic one nearly so. White noise is drawn for the
 sample rate, so that sums over time have the stated density.
@@ -35,7 +35,7 @@ from odocal_ros.sim.noise import gauss_markov, random_walk, stream, white
 from odocal_ros.sim.options import SIM_GRADES, SimOptions
 from odocal_ros.sim.real import NONE3
 
-# s from the first Imu sample, so that no two topics sample together
+# s from the first IMU sample, so that no two topics sample together
 PHASE = {'odometer': 0.002, 'fix': 0.003, 'heading': 0.004}
 TRANSPORT = {'imu': 0.0005, 'fix': 0.05, 'heading': 0.01}     # s from measuring to arriving
 FIRST_COUNT = 10_000     # judgement: an encoder that was on before the recording
@@ -52,7 +52,7 @@ def stamps(duration: float, rate: float, phase: float = 0.0) -> tuple[Ints, Floa
 
 
 def imu_rotation(options: SimOptions) -> Floats:
-    """Return C_vi, which takes the Imu's own frame to the vehicle: C_vb C_bi."""
+    """Return C_vi, which takes the IMU's own frame to the vehicle: C_vb C_bi."""
     return (matrix_from_rpy([options.roll, options.pitch, options.yaw])
             @ matrix_from_rpy(options.mounting_rpy))
 
@@ -80,7 +80,7 @@ def imu_errors(options: SimOptions, n: int) -> tuple[Floats, Floats]:
 
 
 def imu(motion: Motion, options: SimOptions) -> ImuSamples:
-    """Return the Imu's samples over the whole drive."""
+    """Return the IMU's samples over the whole drive."""
     ns, t = stamps(motion.duration, options.imu_rate)
     state = motion.at(t)
     C_vi = imu_rotation(options)
@@ -198,11 +198,11 @@ def slip(state: State, options: SimOptions, side: str = 'L') -> Floats:
         for at in rng.choice(state.t[moving], spins):
             spun += options.slip_size * np.clip(state.t - at, 0.0, 1.0)
     if options.start_slip:
-        spun += options.start_slip * _way_after_starts(state, moving, options.start_slip_time)
+        spun += options.start_slip * _travel_after_starts(state, moving, options.start_slip_time)
     return spun
 
 
-def _way_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
+def _travel_after_starts(state: State, moving: Bools, seconds: float) -> Floats:
     """Return the metres rolled within so many seconds after each start, summed up: (n,)."""
     starts = np.flatnonzero(moving & ~np.roll(moving, 1)) - 1    # the last sample at rest
     starts = starts[starts >= 0]

@@ -33,7 +33,7 @@ def truth_entries(drive: Drive, bag: str) -> dict[str, Any]:
                   'wheels': list(truth.wheel_scales)},
         'yaw_mounting_deg': {'value': math.degrees(truth.yaw)},
         'pitch_mounting_deg': {'value': math.degrees(truth.pitch)},
-        # above by the Imu's own axes, here by its housing: alike where the triads are square
+        # above by the IMU's own axes, here by its housing: equal for perpendicular axes
         'yaw_mounting_housing_deg': {'value': math.degrees(truth.yaw_housing)},
         'pitch_mounting_housing_deg': {'value': math.degrees(truth.pitch_housing)},
         'roll_mounting_deg': {'value': math.degrees(options.roll)},
@@ -71,7 +71,7 @@ def _plain(value: Any) -> Any:
 
 
 def _told_arm(options: SimOptions, name: str) -> list[float]:
-    """Return a lever arm as configured: the true one and the error of whoever measured it."""
+    """Return a lever arm as configured: the true one plus the measurement error."""
     true, error = getattr(options, f'{name}_lever_arm'), getattr(options.real, f'{name}_arm_error')
     return [float(x + e) for x, e in zip(true, error, strict=True)]
 
@@ -108,7 +108,7 @@ def settings(drive: Drive,
 
 
 def topic_arguments(drive: Drive) -> list[str]:
-    """Return the topic options replay needs where a type alone does not tell."""
+    """Return the topic options replay needs if the type is not unique."""
     arguments = []
     if drive.options.two_wheels and drive.options.odometer == 'counts':
         arguments += ['--odometer-topic', '/odometer/left',

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a simulated receiver sends as its velocity: that of the antenna, east, north, up."""
+"""Velocity of a simulated receiver: of the antenna, east, north, up."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ from odocal_ros.sim.motion import Motion
 from odocal_ros.sim.noise import gauss_markov, stream
 from odocal_ros.sim.options import SimOptions
 
-HALF_STEP = 0.005       # s, judgement: differences of places are exact to 1e-4 m/s
+HALF_STEP = 0.005       # s, judgement: differences of positions are exact to 1e-4 m/s
 OUTLIER = 5.0           # m/s, judgement: a wrong Doppler in a street
 
 
 def velocity(motion: Motion, options: SimOptions) -> VelocitySamples:
-    """Return the velocity of the antenna as it is sent; none where no sigma is given."""
+    """Return the published velocity of the antenna; none without a sigma."""
     sigma = options.velocity_sigma
     if sigma is None:
         return no_velocity()

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What drawn vehicles are drawn from: a table by the class of the Imu, sources in docs/zoo.md."""
+"""What drawn vehicles are drawn from: a table by the class of the IMU, sources in docs/zoo.md."""
 
 from dataclasses import dataclass
 import math
@@ -63,7 +63,7 @@ class Vehicle:
     city: bool       # multipath, outages, worse covariances
     robot: bool      # small, slow, without springs
     options: dict[str, Any]    # SimOptions drawn so far
-    alone: bool      # the effect alone is asked for: let it be there
+    alone: bool      # the effect alone is requested: it must be present
 
     def size(self, name: str) -> float:
         """Return the number that a table has for the vehicle's class."""

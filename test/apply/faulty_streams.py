@@ -184,7 +184,7 @@ def run(drive, odometry, topics):
                 odometry.feed(slot, take(block, slice(a, b)), drive.form)
         path = odometry.restarts          # of what comes before a restart in it
         out += [(path, pose) for pose in odometry.poses()]
-        said += odometry.take_told()
+        said += odometry.take_notes()
     return out, said
 
 

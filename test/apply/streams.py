@@ -46,7 +46,7 @@ def poses_of(odometry, blocks, form, piece_ns=PIECE_NS):
 
 
 def samples_of(drive, begin_ns=0):
-    """Return a drive's samples by slot, from the Imu's row at a time on."""
+    """Return a drive's samples by slot, from the IMU's row at a time on."""
     early = {'imu': begin_ns, 'odometer': begin_ns - 10**9, 'odometer_right': begin_ns - 10**9}
     return {slot: take(block, block.stamp_ns >= early[slot])
             for slot, block in ((slot, getattr(drive, slot)) for slot in SLOTS)}
@@ -73,7 +73,7 @@ def odometry_of(drive, estimates=None, **changes):
 
 
 def alignment_of(drive, row, tilt=(0.003, -0.002, 0.01), bias=(2e-5, -1e-5, 3e-5)):
-    """Return an alignment at a row of the Imu, s since the start mark; not the true one."""
+    """Return an alignment at a row of the IMU, s since the start mark; not the true one."""
     stamp_ns = int(drive.imu.stamp_ns[row])
     state = drive.motion.at(np.array([(stamp_ns - drive.options.start_ns) * 1e-9]))
     q = quat_multiply(quat_from_rotvec(np.array(tilt)),

@@ -134,7 +134,7 @@ def test_what_a_counter_does_costs_little_of_the_path(counted, whole, fault):
                     if p.stamp_ns in wanted])
     assert len(off) > 1100
     assert np.abs(off).max() <= most
-    said = odometry.take_told()
+    said = odometry.take_notes()
     assert any('jumps by' in text for text in said) == (change in (reset, one_false))
     assert max(np.linalg.norm(p.velocity) for p in poses) < 25.0
 
@@ -194,7 +194,7 @@ def test_time_that_goes_back_begins_anew(counted):
     blocks = samples_of(counted)
     first = poses_of(odometry, blocks, counted.form)
     again = poses_of(odometry, blocks, counted.form)
-    assert any('begins anew' in text for text in odometry.take_told())
+    assert any('restarts' in text for text in odometry.take_notes())
     assert odometry.restarts == 1
     np.testing.assert_allclose(again[-1].position, first[-1].position, atol=1e-9)
 

@@ -30,7 +30,7 @@ SLOTS = {'/imu/data': 'imu', '/odometer': 'odometer', '/fix': 'fix'}
 
 
 def read(path):
-    """Return the Imu's rows and the notes of a bag."""
+    """Return the IMU's rows and the notes of a bag."""
     with open_bag(path) as bag:
         recorder = LegRecorder()
         bag.read({topic: make_reader(slot, bag.topics[topic].msgtype, Config())

@@ -93,7 +93,7 @@ def test_a_stream_that_unpacks_to_2_gib(tmp_path, bomb, kind):
         mcap(path, bomb, 2**31, index=kind == 'chunk')
     most, said = peak(path)
     assert most < MOST
-    assert 'unpacked, it takes more than' in said
+    assert 'unpacked, it exceeds the limit of' in said
     assert f'set {RAISE}=10' in said
 
 
@@ -103,7 +103,7 @@ def test_the_limit_can_be_raised(tmp_path, monkeypatch):
     mcap(path, packed, 100 * 2**20)
     assert peak(path)[1]
     monkeypatch.setenv(RAISE, '10')
-    assert 'takes more than' not in peak(path)[1]
+    assert 'exceeds the limit of' not in peak(path)[1]
 
 
 def test_an_index_that_names_a_chunk_many_times(tmp_path):
@@ -182,7 +182,7 @@ def test_a_definition_that_is_huge(tmp_path, kind, monkeypatch):
     db.close()
     most, said = peak(path)
     assert most < MOST
-    assert 'takes more than' in said or 'cannot be understood' in said
+    assert 'exceeds the limit of' in said or 'cannot be parsed' in said
 
 
 def test_annotations_cost_nothing():
@@ -199,9 +199,9 @@ def test_what_is_no_file(tmp_path):
     (path / 'metadata.yaml').symlink_to('/dev/zero')
     with open_bag(path) as bag:
         assert len(bag.files) == 1
-        assert 'a device' in bag.notes[0]
+        assert 'not a regular file' in bag.notes[0]
     for one in (path / 'x.mcap', '/dev/zero'):
-        with pytest.raises(BadBag, match='a pipe, a device'), open_bag(one):
+        with pytest.raises(BadBag, match='not a regular file'), open_bag(one):
             pass
 
 
@@ -209,7 +209,7 @@ def test_a_text_that_does_not_end(tmp_path):
     path = ros_bags.write(tmp_path / 'bag', ros_bags.drive(0.5))
     (path / 'metadata.yaml').write_text('#' * 2**22)
     with open_bag(path) as bag:
-        assert 'takes more than' in bag.notes[0]
+        assert 'exceeds the limit of' in bag.notes[0]
     assert issubclass(LimitReached, BadBag)
 
 
@@ -239,7 +239,7 @@ def test_empty_frames_cost_no_more_than_their_number(tmp_path, kind):
     before = time.process_time()
     _, said = peak(path)
     assert time.process_time() - before < 2.0
-    assert 'frames, the limit for it' in said
+    assert 'frames; if the file is valid' in said
 
 
 def metadata(folder, change):
@@ -268,7 +268,7 @@ def test_links_in_each_other_are_not_written_out(tmp_path):
 def test_a_text_of_very_many_keys_is_not_used(tmp_path):
     path = metadata(tmp_path, lambda text: text + ''.join(f'k{n}: {n}\n' for n in range(38_000)))
     with open_bag(path) as bag:
-        assert any('takes more than' in note and 'values' in note for note in bag.notes)
+        assert any('exceeds the limit of' in note and 'values' in note for note in bag.notes)
 
 
 def test_a_file_named_many_times_is_read_once(tmp_path):

@@ -170,7 +170,7 @@ def counts():
 
 def test_an_existing_bag_is_kept_unless_forced(tmp_path):
     path = write_bag(tmp_path / 'bag', counts())
-    with pytest.raises(BadUsage, match='is there already; give --force'):
+    with pytest.raises(BadUsage, match='already exists; give --force'):
         write_bag(path, counts())
     (path / 'old.mcap').touch()
     write_bag(path, counts(), force=True)
@@ -181,15 +181,15 @@ def test_an_existing_bag_is_kept_unless_forced(tmp_path):
 def test_force_never_replaces_what_is_no_bag(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.txt').write_text('ten years')
-    with pytest.raises(BadUsage, match='is no bag; choose another'):
+    with pytest.raises(BadUsage, match='is not a bag; choose another'):
         write_bag(tmp_path / 'home', counts(), force=True)
     assert (tmp_path / 'home' / 'thesis.txt').read_text() == 'ten years'
 
 
 @pytest.mark.parametrize(('storage', 'compression', 'told'), [
-    ('rar', 'none', '--storage rar: want one of mcap'),
-    ('mcap', 'lz77', '--compression lz77: want one of none'),
-    ('sqlite3', 'storage', '--compression storage is not there for --storage sqlite3')])
+    ('rar', 'none', '--storage rar: required: one of mcap'),
+    ('mcap', 'lz77', '--compression lz77: required: one of none'),
+    ('sqlite3', 'storage', '--compression storage is not available for --storage sqlite3')])
 def test_what_cannot_be_written_is_said(tmp_path, storage, compression, told):
     with pytest.raises(BadUsage, match=told):
         write_bag(tmp_path / 'bag', counts(), storage, compression)
@@ -198,7 +198,7 @@ def test_what_cannot_be_written_is_said(tmp_path, storage, compression, told):
 
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / 'file').touch()
-    with pytest.raises(BadUsage, match='cannot write there'):
+    with pytest.raises(BadUsage, match='cannot be written'):
         write_bag(tmp_path / 'file' / 'bag', counts())
 
 

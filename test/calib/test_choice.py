@@ -99,7 +99,7 @@ def test_a_rejected_method_is_named_where_one_behind_it_gives():
     fell = method('smoother', reasons=[NO_YAW, REFUSED, Reason(Code.NOT_CONVERGED, 'more')])
     found, = passed_over(several(method('two_point'), fell), 'auto')
     assert found.code is Code.METHOD_REJECTED
-    assert found.text == 'smoother is left out, it says CHORD_TOO_SHORT: a loop'
+    assert found.text == 'smoother is not used, because of CHORD_TOO_SHORT: a loop'
     # said by the leg already; behind the one that gives; nothing gives; not asked for
     assert passed_over(several(method('two_point'), fell), 'auto', {REFUSED.code}) == []
     loop = method('two_point', reasons=[REFUSED])
@@ -118,7 +118,7 @@ def test_methods_that_differ_beyond_their_sigmas_are_named_with_the_cause():
     assert disagreements(near) == []
     (found,) = disagreements(far)
     assert found.code is Code.METHODS_DISAGREE
-    assert 'scale by two_point differs from that by smoother by +2143 ppm, 3.0 sigma' in found.text
+    assert 'scale: two_point and smoother differ by +2143 ppm, 3.0 sigma' in found.text
     assert 'marks' in found.text
     (found,) = disagreements(several(method('smoother'), method('two_point', 1.9)))
     assert 'by -5.0 %, ' in found.text

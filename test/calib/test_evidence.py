@@ -170,7 +170,7 @@ def test_pauses_of_imu_and_odometer_are_kept_where_the_vehicle_moves():
     imu = t[(t <= 30.0) | (t >= 32.0)]
     rows = t[((t < 3.0) | (t >= 8.0)) & ((t <= 70.0) | (t >= 71.0))]     # stands until t = 10
     found = drive(t_imu=imu, travel=Travel(rows, 10.0 * np.clip(rows - 10.0, 0.0, None), 0.0))
-    assert [name for name, _, _ in found.gaps] == ['Imu', 'odometer']
+    assert [name for name, _, _ in found.gaps] == ['IMU', 'odometer']
     np.testing.assert_allclose([gap[1:] for gap in found.gaps], [(30.0, 32.0), (70.0, 71.0)],
                                atol=0.021)
     assert drive(t_imu=t, travel=Travel(t, t, 0.0)).gaps == ()

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The Imu's own errors: judged from the drive, held by the sigma."""
+"""The IMU's own errors: judged from the drive, held by the sigma."""
 
 from dataclasses import replace
 import re
@@ -62,7 +62,7 @@ def test_the_sigma_of_the_scale_holds_it(noise):
     graded = with_settings(config, {'imu.accel_scale_sigma': np.nan})     # that of its grade
     scale = smooth(leg, graded).estimates['scale_factor']
     assert abs(scale.value - drive.truth.scale) < 3.0 * scale.sigma       # 1 in 370
-    # of an Imu said to have none, the error is many sigmas: what this is for
+    # of an IMU said to have none, the error is many sigmas: what this is for
     wrong = smooth(leg, config).estimates['scale_factor']
     assert abs(wrong.value - drive.truth.scale) > 4.0 * wrong.sigma
 
@@ -150,8 +150,8 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
     assert 'gnss.lever_arm x by +0.8' in said[Code.LEVER_ARM_OFF]
-    assert ' 2.0 times as much' in said[Code.FIXES_NOISIER_THAN_SAID]
-    assert 'from slow to fast' in said[Code.SCALE_VARIES]
+    assert ' 2.0 times as large' in said[Code.FIXES_NOISIER_THAN_SAID]
+    assert 'from low to high speed' in said[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']
     true = 2 * real.speed_law / 36.0**2 * FAST_SPEED
     assert abs(slope['slope'] - true) < 3.0 * slope['sigma']

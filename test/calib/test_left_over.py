@@ -114,7 +114,7 @@ def test_a_wheel_that_slipped_is_seen_where_it_did():
     value, sigma = in_halves(left_over(leg, problem, fit)['left_odometer'])
     t, along = fit.state.t, value[:, 0]
     slipping = (t[1:] > begin) & (t[:-1] < begin + seconds)
-    # the fit has gone less far than the wheel said; the Imu tells the way of a second to 1 mm,
+    # the fit has gone less far than the wheel said; the IMU tells the way of a second to 1 mm,
     # and a share of 1 - (its variance over the slip's) of it is taken for slip
     assert along[slipping].sum() == pytest.approx(-metres, rel=0.05)
     assert np.abs(along[~slipping]).max() < 0.02

@@ -372,7 +372,7 @@ def test_a_dispute_names_leg_and_parameter(legs):
     whole = combine_legs([results[0], replace(results[1], border=changed), results[2]],
                          [0, 1, 2], config, [4, 7, 9])
     (said,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
-    assert said.startswith('yaw_mounting_angle differs between the 3 legs')
+    assert said.startswith('yaw_mounting_angle: the 3 legs differ')
     assert ', leg 7 most (+' in said
     assert whole.estimates[YAW].sigma > 0.002
     # and what is not disputed is as sharp as before
@@ -387,7 +387,7 @@ def test_two_legs_whose_scales_differ_dispute_it(legs, off):
     changed = replace(other.border, value=other.border.value + off * scale)
     whole = combine_legs([one, replace(other, border=changed)], [0, 1], config)
     (said,) = [r.text for r in whole.reasons if r.code is Code.LEGS_DISAGREE]
-    assert said.startswith('scale_factor differs between the 2 legs')
+    assert said.startswith('scale_factor: the 2 legs differ')
     e = whole.estimates[SCALE]
     assert 0.3 * abs(off) < e.sigma / e.value < 1.5 * abs(off)
     assert not any(r.code is Code.LEGS_DISAGREE
@@ -415,7 +415,7 @@ def test_a_yaw_that_no_leg_tells_may_come_of_all(legs):
     assert Code.YAW_NOT_DETERMINED not in {r.code for r in whole.reasons}
     two = combine([leg_result(refused(one), i) for i, one in enumerate(results[:2])], config)
     assert two.estimates[YAW].value is None
-    assert [r.text[:4] for r in two.reasons if r.code is Code.YAW_NOT_DETERMINED] == ['the ']
+    assert [r.text[:4] for r in two.reasons if r.code is Code.YAW_NOT_DETERMINED] == ['yaw ']
 
 
 def test_a_leg_that_is_rejected_is_left_out_and_named(legs):

@@ -46,7 +46,7 @@ def test_legs_of_one_vehicle_are_fine():
 
 def test_a_scale_that_no_tyre_makes():
     text, = said(leg(1, scale=0.0203), leg(2, scale=0.02), leg(3, scale=0.022))
-    assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: more than')
+    assert text.startswith('the scale of leg 3 is 10.0 % above that of leg 2: larger than')
 
 
 def test_a_mounting_that_was_moved():
@@ -73,7 +73,7 @@ def test_what_sigmas_allow_is_no_other_vehicle(more):
 
 def test_counts_and_speeds_have_no_mean():
     text, = said(leg(1), leg(2, scale=1.02, sigma=1e-4, unit='1'), leg(3))
-    assert text.endswith('their scales have no mean: m/pulse in leg 1, 3; 1 in leg 2')
+    assert text.endswith('so their scales cannot be combined: m/pulse in leg 1, 3; 1 in leg 2')
 
 
 def test_the_combination_is_rejected_and_its_sigma_judged():

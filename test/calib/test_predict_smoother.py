@@ -130,7 +130,7 @@ def test_the_scale_bounds_of_method_md_come_out(monkeypatch, drive, grade, white
 
 @pytest.fixture
 def town_sigmas():
-    # of an Imu whose gyro feels no force, which else is most of a consumer grade's pitch
+    # of an IMU whose gyro feels no force, which else is most of a consumer grade's pitch
     return Sigmas(config=with_settings(Config(), WHITE | {'imu.gyro_by_force_sigma': 0.0}))
 
 
@@ -146,7 +146,7 @@ def test_wider_keyframes_never_make_a_sigma_smaller(town_sigmas):
     fine, coarse = (sigmas_of(predict_smoother(drive, town_sigmas, spacing))
                     for spacing in (1.0, WIDEST_SPACING))
     # each keeps what a second has, but for what happens within, to the safe side: a tenth or so,
-    # twice that of the yaw, which how a turn sets in tells from axes of the Imu that are off
+    # twice that of the yaw, which how a turn sets in tells from axes of the IMU that are off
     assert (coarse >= fine).all()
     assert (coarse < 1.2 * fine).all()
     assert spacing_for(drive) == 1.0

@@ -69,7 +69,7 @@ def test_a_stretch_driven_backwards_is_found(begin, end, drift):
     assert not back[outside].any()
     (reason,) = against_travel(found, signed=True)
     assert reason.code is Code.TRACK_MISMATCH
-    assert f'on {back.sum()} of {len(back)} pieces' in reason.text
+    assert f'in {back.sum()} of {len(back)} sections' in reason.text
     assert 'the counter does not count down' in reason.text
     assert 'odometer.signed is false' in against_travel(found, signed=False)[0].text
 

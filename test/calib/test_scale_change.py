@@ -152,7 +152,7 @@ def test_a_result_on_the_disk_goes_on(session):
 
 
 def imu_of(legs, config, folder):
-    """Return settings with the Imu that a calibration of some legs left, and that Imu."""
+    """Return settings with the IMU that a calibration of some legs left, and that IMU."""
     path = folder / 'calibration.json'
     path.write_text(json.dumps(as_json(combine(legs, config), config, [], 'now')))
     own = with_settings(config, {'imu.constants': str(path)})
@@ -183,11 +183,11 @@ def test_an_imu_is_of_one_vehicle_and_no_leg_counts_twice(session, tmp_path):
     legs = legs_of(results)
     own, imu = imu_of(legs[:2], config, tmp_path)
     assert {name.split('_')[0] for name in imu.border.names} == {'gyro', 'accelerometer'}
-    # a leg that is in it already does not count twice, an Imu of another vehicle not at all
+    # a leg that is in it already does not count twice, an IMU of another vehicle not at all
     assert combine(legs[1:2], config, imu=imu).estimates[YAW].sigma == results[
         1].estimates[YAW].sigma
     for other in ({'vehicle': 'lorry'}, {'imu.mounting_rpy': (0.0, 0.0, 1.5)}):
-        with pytest.raises(BadUsage, match=f'of another {list(other)[0]}'):
+        with pytest.raises(BadUsage, match=f'has another {list(other)[0]}'):
             known_imu(with_settings(own, other))
 
 

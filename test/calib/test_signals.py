@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What the Imu's errors multiply: a signal, not the noise of sensor and road."""
+"""What the IMU's errors multiply: a signal, not the noise of sensor and road."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ SCALES = [name for name in CONSTANTS if name.startswith(('gyro_scale', 'accelero
 
 
 def scores(fitted):
-    """Return what noise alone says of the Imu's errors at the truth, in its sigmas."""
+    """Return what noise alone says of the IMU's errors at the truth, in its sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = Problem.of(leg, config), truth(drive, config, leg)
     weighted = Equations(problem, state, problem.sums(state), fitted=fitted).at(

@@ -90,7 +90,7 @@ def test_a_turn_is_no_braking():
 
 
 def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
-    """An Imu 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
+    """An IMU 0.6 m to the left feels 0.6 m times the change of the turn rate as a push ahead."""
     found = []
     for arm in ((0.0, 0.0, 0.0), (0.7, 0.6, 0.5)):
         drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0,
@@ -110,7 +110,7 @@ def test_tyres_and_springs_answer_to_the_push_of_the_axle_wherever_the_imu_is():
 
 
 def test_a_lean_is_level_though_the_imu_is_rolled():
-    """About axes of an Imu that is rolled by 5 deg a squat were a tenth of a sideslip too."""
+    """About axes of an IMU that is rolled by 5 deg a squat were a tenth of a sideslip too."""
     roll = 0.09
     drive, config, leg = made(imu_grade='perfect', fix_sigma=0.0, duration=150.0, roll=roll)
     problem, state = Problem.of(leg, config), truth(drive, config, leg)

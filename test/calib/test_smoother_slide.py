@@ -31,7 +31,7 @@ from odocal_ros.reasons import Code
 
 def said(method):
     """Tell whether the result says that a road's noise was assumed."""
-    return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'are assumed' in r.text
+    return any(r.code is Code.PARAMETER_NOT_DETERMINED and 'is assumed' in r.text
                for r in method.reasons)
 
 

@@ -65,7 +65,7 @@ def test_slip_of_seconds_is_said_with_place_and_size(noise, begin, length, share
 def test_slip_at_starts_is_said(noise):
     drive, config, leg = made(**SHORT, fix_noise=noise, start_slip=0.005)
     method = smooth(leg, config)
-    assert 'slips when the speed changes' in said(method)
+    assert 'slip while accelerating or braking' in said(method)
     assert off(drive, method) < 3.3
 
 

@@ -91,7 +91,7 @@ def test_truncation_or_rounding_is_found(how, share):
 def test_the_sentence_tells_the_step():
     _, result = calibrated()
     text = next(r.text for r in result.reasons if r.code is Code.SPEED_COARSE)
-    assert 'whole steps of 0.278 m/s (1 km/h)' in text
+    assert 'resolution is 0.278 m/s (1 km/h)' in text
 
 
 def test_a_smooth_speed_has_no_steps():

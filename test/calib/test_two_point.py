@@ -166,7 +166,7 @@ def test_a_closed_loop_is_refused_with_what_would_help():
     made = drive(scenario='out_and_back', duration=300.0, imu_grade='industrial')
     result = calibrate(made.leg(), settings(made))
     said = everything_said(result)
-    assert 'under a fifth of the' in said[Code.CHORD_TOO_SHORT]
+    assert 'less than a fifth of the' in said[Code.CHORD_TOO_SHORT]
     assert '--leg' in Code.CHORD_TOO_SHORT.remedy
     assert all(e.value is None for e in result.methods['two_point'].estimates.values())
     assert result.verdict.value == 'rejected'

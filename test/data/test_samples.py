@@ -47,7 +47,7 @@ def test_counters_stay_whole_and_speeds_stay_real():
     lambda: s.FixSamples([1], [1], [0.0], [0.0], [0.0], np.zeros((1, 9)), [0], [0]),
 ])
 def test_a_wrong_shape_is_refused_by_name(bad):
-    with pytest.raises(BadData, match=r'Samples\.\w+: want shape'):
+    with pytest.raises(BadData, match=r'Samples\.\w+: required shape'):
         bad()
 
 

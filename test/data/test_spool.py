@@ -23,7 +23,7 @@ from odocal_ros.data.leg import LegRecorder
 from odocal_ros.data.mapped import let_go
 from odocal_ros.data.samples import ImuSamples, take
 
-ROW = 104      # bytes of an Imu row
+ROW = 104      # bytes of an IMU row
 N = 20_000
 
 

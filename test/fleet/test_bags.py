@@ -41,7 +41,7 @@ def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
     some = find_bags([f'{fleet.folder}/*/bag_01'], r'/(?P<model>[a-z]+)_(?P<vehicle>\d+)/')
     assert {(b.model, b.vehicle) for b in some} == {
         tuple(row['vehicle'].split('_')) for row in fleet.rows}
-    for wrong, what in ((r'/(\d+)/x', 'does not fit'), ('no group', 'group'), ('(', '--vehicle')):
+    for wrong, what in ((r'/(\d+)/x', 'not match'), ('no group', 'group'), ('(', '--vehicle')):
         with pytest.raises(BadUsage, match=what):
             find_bags([str(fleet.folder)], wrong)
 
@@ -49,7 +49,7 @@ def test_bags_are_found_in_folders_and_by_globs_and_named_by_their_path(fleet):
 @pytest.mark.parametrize(('text', 'what'), [
     ('vehicle,model\na,b\n', 'no column bag'), ('vehicle,bag\n', 'no bag'),
     ('vehicle,bag\n,x\n', 'row 2: vehicle or bag is empty'),
-    ('vehicle,bag,odometer_km\na,x,far\n', "'far' is no number"), ('', 'cannot be read')])
+    ('vehicle,bag,odometer_km\na,x,far\n', "'far' is not a number"), ('', 'cannot be read')])
 def test_a_wrong_manifest_says_where(text, what, tmp_path):
     (tmp_path / 'm.csv').write_text(text)
     with pytest.raises(BadUsage, match=what):
@@ -93,7 +93,7 @@ def test_a_remote_bag_stays_in_its_folder_and_has_to_fit(tmp_path, monkeypatch):
         assert path.parent.parent == scratch
     monkeypatch.setattr(bags_module.shutil, 'disk_usage',
                         lambda folder: shutil._ntuple_diskusage(9, 9, 9))
-    with pytest.raises(BadBag, match='make room'), at_hand('memory://odd/..', str(scratch)):
+    with pytest.raises(BadBag, match='free disk space'), at_hand('memory://odd/..', str(scratch)):
         pass
 
 
@@ -118,7 +118,7 @@ def test_a_row_that_was_cut_is_computed_again(tmp_path, spoil):
     assert store.get(key) == row
     store.path(key).write_bytes(spoil(store.path(key).read_bytes()))
     assert store.get(key) is None
-    with pytest.raises(BadData, match='no row of a fleet'):
+    with pytest.raises(BadData, match='not a fleet row'):
         list(rows_of([store.path(key)]))
     for odd in (b'../../x', b'\xff\xfe', b''):
         (tmp_path / 'seen' / 'ab' / ('ab' * 20)).write_bytes(odd)

@@ -168,7 +168,7 @@ def test_limits_give_a_line_of_json_a_vehicle_and_the_exit_code(fleet, client, o
     assert {one['vehicle']: one['decision'] for one in told} == {
         v['vehicle']: 'UNDECIDED' if v['vehicle'] in broken else 'PASS' for v in fleet.truth}
     why, = [one['why'] for one in told if one['vehicle'] in broken]
-    assert re.match(r'rejected: ODOMETER_STILL: the last \d legs, from \S+ on, are all rejected: '
+    assert re.match(r'rejected: ODOMETER_STILL: the last \d legs, since \S+, are all rejected: '
                     'the fixes move', why)
     assert main([*argv, '--accept', 'scale_ratio=0.9:1.01']) == 1      # the shuttle is at 1.014
     told = {(one := json.loads(line))['vehicle']: one['decision']
@@ -196,7 +196,7 @@ def test_a_bag_that_hangs_and_one_that_is_none_stop_nobody(fleet, client, tmp_pa
         jobs[0] = replace(jobs[0], seconds=6.0)
         assert sorted(computed(client, jobs)[1]) == [DONE] * 3 + [FAILED] * 2
     rows = stored(tmp_path / 'out')
-    assert rows[url].reason == 'took longer than --task-timeout gives (6 s)'
+    assert rows[url].reason == 'exceeded the time limit --task-timeout (6 s)'
     assert 'no.mcap' in rows[bags[1].bag].reason
     assert {row.status for bag, row in rows.items() if bag in {b.bag for b in good}} == {DONE}
     # what failed is kept, and tried once more when asked
@@ -210,7 +210,7 @@ def test_a_bag_whose_worker_is_killed_is_a_row_that_says_so(fleet, client, tmp_p
         jobs = fleet.jobs(tmp_path, bags=[replace(good[0], bag=url), *good], seconds=0)
         threading.Thread(target=kill_at, args=(client, jobs[0])).start()
         assert sorted(computed(client, jobs)[1]) == [DONE] * 3 + [FAILED]
-    assert 'its worker was ended 1 times' in stored(tmp_path)[url].reason
+    assert 'its worker ended 1 times' in stored(tmp_path)[url].reason
     client.wait_for_workers(2)
 
 
@@ -228,7 +228,7 @@ def test_a_bag_that_needs_more_memory_than_it_may_is_a_row_that_says_so(fleet, c
     bag = find_bags([fleet.manifest], None)[0]
     jobs = fleet.jobs(tmp_path, '--method', 'smoother', bags=[bag], memory=2**23)
     assert computed(client, jobs) == (1, [FAILED])
-    assert 'more memory than --task-memory gives' in stored(tmp_path)[bag.bag].reason
+    assert 'exceeds the memory limit --task-memory' in stored(tmp_path)[bag.bag].reason
     # the worker lives, and has its memory back
     assert computed(client, fleet.jobs(tmp_path / 'b', bags=[bag])) == (1, [DONE])
 
@@ -276,11 +276,11 @@ def test_calibrate_bags_gives_a_frame_of_legs(fleet, client, tmp_path):
 
 
 @pytest.mark.parametrize(('argv', 'what'), [
-    (['*.none'], 'no bag is there'),
+    (['*.none'], 'no bag found'),
     (['{fleet}', '--set', 'leg.min_distance=x'], 'leg.min_distance'),
     (['{fleet}', '--accept', 'x=1:2'], '--accept'), (['{fleet}', '--leg', '3'], '--leg'),
     (['{fleet}', '--task-timeout', '0'], '--task-timeout'),
-    (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'nobody answers')])
+    (['{fleet}', '--scheduler', 'tcp://127.0.0.1:1'], 'no answer')])
 def test_wrong_usage_is_told_before_the_work(fleet, argv, what, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = [word.format(fleet=fleet.manifest) for word in argv]

@@ -178,14 +178,14 @@ def test_a_yaw_asked_better_than_its_heading_is_never_there(drive, config):
     yaw = foreseen(drive, asked, 150.0).yaw
     assert yaw.metres is None
     assert yaw.words('yaw', 'deg', math.degrees(1)) == (
-        'yaw: no drive brings it below its heading (0.17 deg)')
+        'yaw: limited by the heading uncertainty (0.17 deg)')
 
 
 def test_the_only_heading_is_the_course(drive, config):
     course = with_settings(config, {'alignment.heading_source': 'course'})
     yaw = foreseen(drive, course, 150.0).yaw
     assert (yaw.sigma, yaw.metres) == (None, None)
-    assert 'not told from the course over ground' in yaw.why
+    assert 'not separable from the course over ground' in yaw.why
 
 
 def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
@@ -205,7 +205,7 @@ def test_the_ends_have_no_last_word_before_the_smoother_has_spoken(drive):
     assert not told.complete
     still = replace(leg, imu=replace(leg.imu, f_i=np.zeros_like(leg.imu.f_i)))    # none to come
     never = forecast_of(still, thinned.fix_rate(), config, smoother=SmootherSoFar())
-    assert 'yaw: not told from the course over ground' in never.words()
+    assert 'yaw: not separable from the course over ground' in never.words()
 
 
 def test_an_orientation_that_is_sent_is_the_heading_foreseen(drive, config):
@@ -447,7 +447,7 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
     found = faults_in_cells(swapped, with_settings(Config(), {
         'odometer.track_width': 1.6, 'imu.grade': 'tactical'}))
     assert found[0].code is Code.WHEELS_SWAPPED
-    assert 'Exchange odometer.left' in found[0].remedy
+    assert 'Swap odometer.left' in found[0].remedy
 
 
 # what is said
@@ -455,14 +455,14 @@ def test_swapped_wheels_are_said_while_it_is_driven(two):
 GOOD = Prospect(430e-6, 1e-3, 0.0, (('fix_end', 3e-4), ('fix_start', 2.5e-4)))
 MORE = Prospect(1820e-6, 1e-3, 231.0)
 YAW = Prospect(0.005, 0.0087, 0.0)
-NO_YAW = Prospect(None, 0.0087, None, (), 'no drive brings it below its heading (1 deg)')
+NO_YAW = Prospect(None, 0.0087, None, (), 'limited by the heading uncertainty (1 deg)')
 
 
 def test_a_coarse_scale_is_said_in_per_cent():
     assert Prospect(0.138, 1e-3, 2108.0, now='1.02').words('scale', 'ppm', 1e6) == (
-        'scale 1.02 +- 13.8 % so far; 2200 m more bring it to the asked 0.1 %')
+        'scale 1.02 +- 13.8 % so far; drive 2200 m more for the limit of 0.1 %')
     assert Prospect(0.0099, 1e-3, 0.0).words('scale', 'ppm', 1e6) == (
-        'enough: scale 9900 ppm (asked 1000)')
+        'OK: scale 9900 ppm (limit 1000)')
 
 
 def said(forecast, **more):
@@ -476,17 +476,17 @@ def said(forecast, **more):
     (None, 0.0, 'stand still 10 s at the end point, then call ~/stop_leg'),
     (None, 5.0, 'stand still 5 s more, then call ~/stop_leg'),
     (None, 10.0, 'call ~/stop_leg'),
-    (Forecast(MORE, YAW), 5.0, 'scale would be good to 1820 ppm now; 240 m more bring it to '
-     'the asked 1000 ppm; enough: yaw 0.286 deg (asked 0.498)'),
-    (Forecast(GOOD, YAW), 10.0, 'enough: scale 430 ppm (asked 1000); enough: yaw 0.286 deg (asked '
+    (Forecast(MORE, YAW), 5.0, 'scale uncertainty so far: 1820 ppm; drive 240 m more for the '
+     'limit of 1000 ppm; OK: yaw 0.286 deg (limit 0.498)'),
+    (Forecast(GOOD, YAW), 10.0, 'OK: scale 430 ppm (limit 1000); OK: yaw 0.286 deg (limit '
      '0.498); call ~/stop_leg'),
-    (Forecast(GOOD, NO_YAW), 0.0, 'enough: scale 430 ppm (asked 1000); yaw: no drive brings it '
-     'below its heading (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
-    (Forecast(replace(MORE, metres=None, why='no 20 km more bring it to what is asked'), YAW),
-     10.0, 'scale 1820 ppm: no 20 km more bring it to what is asked; enough: yaw 0.286 deg (asked '
+    (Forecast(GOOD, NO_YAW), 0.0, 'OK: scale 430 ppm (limit 1000); yaw: limited by the heading '
+     'uncertainty (1 deg); stand still 10 s at the end point, then call ~/stop_leg'),
+    (Forecast(replace(MORE, metres=None, why='even 20 km more do not reach the limit'), YAW),
+     10.0, 'scale 1820 ppm: even 20 km more do not reach the limit; OK: yaw 0.286 deg (limit '
      '0.498); call ~/stop_leg'),
-    (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; 240 m more '
-     'bring it to the asked 1000 ppm; yaw: no drive brings it below its heading (1 deg)'),
+    (Forecast(replace(MORE, sigma=None), NO_YAW), 0.0, 'scale is not determined yet; drive 240 m '
+     'more for the limit of 1000 ppm; yaw: limited by the heading uncertainty (1 deg)'),
 ])
 def test_the_hint_says_what_is_enough_and_what_more_it_takes(forecast, still_s, text):
     assert said(forecast, still_s=still_s) == text

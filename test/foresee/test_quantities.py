@@ -20,7 +20,7 @@ pytest.importorskip('diagnostic_msgs', reason='no ROS here: pip install odocal_r
 from odocal_ros.calib.result import Calibration, Estimate
 from odocal_ros.data.samples import HeadingSamples
 from odocal_ros.foresee import ability as ability_module, quantities
-from odocal_ros.foresee.ability import ability, Heard, stated_variance
+from odocal_ros.foresee.ability import ability, Received, stated_variance
 from odocal_ros.foresee.forecast import better, Forecast, Prospect, WheelsForecast
 from odocal_ros.live import answers
 from odocal_ros.live.guidance import hint, manoeuvres, quantities_ok, seconds_to_stand, TURNS
@@ -165,9 +165,9 @@ def test_two_wheels_ask_for_turns_and_for_a_straight_stretch():
     assert manoeuvres(recording(**far, forecast=apart)) == [TURNS]
     neither = replace(apart, wheels=WheelsForecast(2e-3, None))
     assert hint(recording(**far, forecast=neither, still_s=10.0)) == (
-        'enough: scale 100 ppm (asked 1000); enough: yaw 0.286 deg (asked 0.498); go straight on '
-        'at speed until left and right wheel are told apart; turn by about 90 deg in all, or '
-        'more, for the track width; call ~/stop_leg')
+        'OK: scale 100 ppm (limit 1000); OK: yaw 0.286 deg (limit 0.498); drive straight at '
+        'speed until left and right wheel are separable; for the track width: turn by 90 deg in '
+        'total or more; call ~/stop_leg')
     both = replace(apart, wheels=WheelsForecast(2e-4, 0.01))
     assert manoeuvres(recording(**far, forecast=both)) == []
 
@@ -183,17 +183,17 @@ def test_a_configured_width_or_the_mean_of_both_asks_for_no_turn():
 def test_a_leg_that_would_be_rejected_is_said_before_all_else():
     enough = Forecast(GOOD, YAW, 0.001)
     dead = (Reason(Code.WHEEL_DEAD, 'the left'),)
-    now = recording(forecast=enough, distance_m=500.0, faults=dead, missing=['no Imu for 3 s'])
+    now = recording(forecast=enough, distance_m=500.0, faults=dead, missing=['no IMU for 3 s'])
     assert hint(now).startswith('call ~/cancel_leg and start again: the leg would be rejected: '
                                 'WHEEL_DEAD: the left. Check the sensor')
-    assert hint(now).endswith('; no Imu for 3 s')
+    assert hint(now).endswith('; no IMU for 3 s')
     assert set(quantities_ok(now).values()) == {'no', 'unknown'}
     assert (level(now), level(recording(forecast=enough))) == (b'\x02', b'\x00')
     # a caution is no reason to drive again: it is said, and the rest as before
     doubt = (Reason(Code.COUNTER_RESET, 'by -70'),)
     told = hint(recording(forecast=enough, distance_m=500.0, max_speed=10.0, two_wheels=False,
                           faults=doubt))
-    assert told.startswith('COUNTER_RESET: by -70; enough: ')
+    assert told.startswith('COUNTER_RESET: by -70; OK: ')
     assert level(recording(faults=doubt)) == b'\x01'
 
 
@@ -207,45 +207,44 @@ def test_seconds_to_stand():
 
 # what a drive can tell as configured
 
-@pytest.mark.parametrize(('settings', 'heard', 'said'), [
-    ({}, {}, 'this drive can tell the scale and the pitch; it cannot tell the yaw, since the '
-     'course over ground, which holds it, is the only heading: give another '
-     '(alignment.heading_source)'),
+@pytest.mark.parametrize(('settings', 'received', 'said'), [
+    ({}, {}, 'observable: the scale and the pitch; not observable: the yaw (the only heading is '
+     'the course over ground, which includes it: set alignment.heading_source)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {},
-     'this drive can tell the scale, the yaw (by the configured heading, 0.11 deg) and the pitch'),
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg) and the pitch'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.02}, {'height': False},
-     'this drive can tell the scale; it cannot tell the yaw to 0.5 deg, since the configured '
-     'heading is good to 1.1 deg; nor the pitch, since the fixes carry no height'),
+     'observable: the scale; not observable: the yaw to 0.5 deg (the configured heading has an '
+     'uncertainty of 1.1 deg); the pitch (fixes without height)'),
     ({}, {'variances': NONE | {'heading_topic': 0.001**2}},
-     'this drive can tell the scale, the yaw (by the heading topic, 0.057 deg) and the pitch'),
+     'observable: the scale, the yaw (from the heading topic, 0.057 deg) and the pitch'),
     ({'imu.grade': 'navigation'}, {'rested_s': 600.0},
-     'this drive can tell the scale, the yaw (by the gyrocompass, '),
+     'observable: the scale, the yaw (from the gyrocompass, '),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002}, {'two_wheels': True},
-     'this drive can tell the scale, the yaw (by the configured heading, 0.11 deg), the pitch, '
-     'left and right wheel and the track width (in turns)'),
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch, left '
+     'and right wheel and the track width (in turns)'),
     ({'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002, 'odometer.track_width': 1.6},
      {'two_wheels': True, 'rested_s': 1.0},
-     'this drive can tell the scale, the yaw (by the configured heading, 0.11 deg), the pitch '
-     'and left and right wheel; level and gyro bias come from the drive itself, since it starts '
+     'observable: the scale, the yaw (from the configured heading, 0.11 deg), the pitch and left '
+     'and right wheel; level and gyro bias are estimated from the drive, because it starts '
      'without a standstill'),
     ({'method': 'two_point', 'alignment.heading': 0.7, 'alignment.heading_sigma': 0.002},
-     {'two_wheels': True}, 'this drive can tell the scale, the yaw (by the configured heading, '
-     '0.11 deg) and the pitch; it cannot tell left from right wheel, since method two_point '
-     'takes their mean'),
+     {'two_wheels': True}, 'observable: the scale, the yaw (from the configured heading, 0.11 '
+     'deg) and the pitch; not observable: left and right wheel separately (method two_point uses '
+     'their mean)'),
 ])
-def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, heard, said):
+def test_what_can_be_told_is_said_beforehand(monkeypatch, settings, received, said):
     monkeypatch.setattr(ability_module, 'METHODS', ('two_point',))
-    known = Heard(**({'variances': NONE, 'rested_s': 30.0} | heard))
+    known = Received(**({'variances': NONE, 'rested_s': 30.0} | received))
     text = ability(with_settings(CONFIG, settings), known).words()
     assert text.startswith(said) if said.endswith(', ') else text == said
 
 
 def test_the_smoother_needs_no_heading_from_outside(monkeypatch):
     monkeypatch.setattr(ability_module, 'METHODS', ('two_point', 'smoother'))
-    can = ability(with_settings(CONFIG, {'method': 'smoother'}), Heard(NONE, 30.0)).can
-    assert 'the yaw (by stops, starts and turns)' in can
+    can = ability(with_settings(CONFIG, {'method': 'smoother'}), Received(NONE, 30.0)).can
+    assert 'the yaw (from stops, starts and turns)' in can
     only = with_settings(CONFIG, {'method': 'two_point'})
-    assert len(ability(only, Heard(NONE, 30.0)).cannot) == 1
+    assert len(ability(only, Received(NONE, 30.0)).cannot) == 1
 
 
 def test_an_orientation_without_a_variance_or_a_unit_length_is_none():
@@ -284,7 +283,7 @@ def test_a_restored_result_is_said_to_be_one():
     assert text == (
         'no leg is running; restored result of 2026-01-02T03:04:05Z: scale factor 1.00000 ± '
         '0.00010 m/pulse (1.00000 ± 0.00010 pulses/m), yaw mounting not determined, pitch '
-        'mounting not determined; from 2 legs. OK: scale. Next: drive a leg to renew it')
+        'mounting not determined; from 2 legs. OK: scale. Next: drive a leg to update it')
     success, text = answers.restored(replace(kept, valid=False), '', '')
     assert not success
     assert 'which was rejected' in text

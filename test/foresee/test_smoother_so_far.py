@@ -64,7 +64,7 @@ def looked(drive, config, looks=LOOKS):
 
 @pytest.fixture(scope='module')
 def config():
-    # an Imu without errors of scale and axes, as it is simulated
+    # an IMU without errors of scale and axes, as it is simulated
     return with_settings(Config(), {'imu.grade': 'industrial', 'method': 'smoother',
                                     'imu.accel_scale_sigma': 0.0, 'imu.misalignment_sigma': 0.0,
                                     'imu.gyro_by_force_sigma': 0.0})
@@ -127,7 +127,7 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, look
     with monkeypatch.context() as broken, warnings.catch_warnings():
         warnings.simplefilter('error')       # a node has no place for warnings
         broken.setattr(growing, 'best_fit', wild)
-        with pytest.raises(BadData, match='cannot solve the way so far: overflow'):
+        with pytest.raises(BadData, match='cannot solve the data so far: overflow'):
             so_far.look(looks[-1].leg, config)
     assert so_far.look(looks[-1].leg, config).method.estimates['scale_factor'].value is not None
 
@@ -239,9 +239,9 @@ def test_an_imu_that_faces_down_is_read_as_such(config, looks):
 
 
 @pytest.mark.parametrize(('changed', 'words'), [
-    ({'fix': slice(0, 5)}, '^5 fixes in [0-9]+ s: the smoother needs 10 in 20 s'),
-    ({'imu': slice(0, 0)}, 'of the Imu'), ({'imu': slice(0, 2)}, 'of the Imu'),
-    ({'odometer': slice(0, 1)}, 'of the odometer')])
+    ({'fix': slice(0, 5)}, '^5 fixes in [0-9]+ s; the smoother needs at least 10 fixes in 20 s'),
+    ({'imu': slice(0, 0)}, 'needs IMU'), ({'imu': slice(0, 2)}, 'needs IMU'),
+    ({'odometer': slice(0, 1)}, 'and odometer')])
 def test_too_little_is_said_and_no_look_is_lost_by_it(config, looks, changed, words):
     leg, so_far = looks[0].leg, SmootherSoFar()
     less = replace(leg, **{slot: take(getattr(leg, slot), rows) for slot, rows in changed.items()})
@@ -289,8 +289,8 @@ def test_what_the_leg_will_be_rejected_for_is_said_at_once(config, looks, method
     asked = with_settings(config, {'method': method})
     found = forecast_of(backwards, 5.0, asked, smoother=SmootherSoFar())
     fault = found.faults[0]
-    assert (fault.code, fault.text[:33]) == (Code.ODOMETER_REVERSED,
-                                             'the odometer runs against the Imu')
+    assert (fault.code, fault.text[:41]) == (Code.ODOMETER_REVERSED,
+                                             'odometer and IMU have opposite directions')
     assert found.estimates.get('scale_factor') is None      # no value that would be thrown away
     session = Session()
     session.start(1, asked)
@@ -330,13 +330,13 @@ def of_sigmas(seen, scale=1e-4, yaw=1e-3, agility=120.0, known=True):
 def test_the_yaw_asks_for_stops_and_starts_until_it_is_there(looks):
     # agility 120 by a sigma twice the asked: three times as much more, 30 for each stop and start
     found = of_sigmas(looks[-1], yaw=0.02)
-    assert found.yaw.lack == 'stop and start 12 times, or turn as often, for the yaw'
+    assert found.yaw.lack == 'for the yaw: stop and start 12 times, or make as many turns'
     assert found.yaw.metres == pytest.approx(1500.0)
     assert found.yaw.words('yaw', 'deg', math.degrees(1)).endswith(
-        ' +- 1.15 deg so far (asked 0.573)')
+        ' +- 1.15 deg so far (limit 0.573)')
     assert not found.complete
-    assert of_sigmas(looks[-1], yaw=0.0105).yaw.lack.startswith('stop and start 1 time,')
-    assert of_sigmas(looks[-1], yaw=0.2).yaw.lack.startswith('stop and start often,')
+    assert of_sigmas(looks[-1], yaw=0.0105).yaw.lack.startswith('for the yaw: stop and start 1 ')
+    assert of_sigmas(looks[-1], yaw=0.2).yaw.lack.startswith('for the yaw: stop and start often,')
     assert of_sigmas(looks[-1], yaw=0.2).yaw.metres is None
     never = of_sigmas(looks[-1], yaw=0.05, agility=0.0, known=False)
     assert never.yaw.words('yaw', 'deg', math.degrees(1)) == (
@@ -352,12 +352,12 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; 760 m more bring it to the asked 1000 ppm; yaw ' in told
-    assert told.endswith('; stop and start 12 times, or turn as often, for the yaw')
+    assert ' m/pulse +- 2000 ppm so far; drive 760 m more for the limit of 1000 ppm; yaw ' in told
+    assert told.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
-    assert '; as it was 40 s ago; ' in told
+    assert '; estimate is 40 s old; ' in told
     good = hint(SessionView(session, Config(), forecast=of_sigmas(looks[-1]), **known))
-    assert good.startswith('enough: scale 0.02')
+    assert good.startswith('OK: scale 0.02')
     assert good.endswith('stand still 10 s at the end point, then call ~/stop_leg')
 
 
@@ -377,8 +377,8 @@ def test_the_keys_hold_values_and_sigmas(looks):
 
 
 @pytest.mark.parametrize(('yaw', 'turn_rates', 'why'), [
-    (math.pi / 2, 1.0, 'speeding up pushes the Imu to the right'),
-    (0.0, 0.0, 'every turn rate is zero')])
+    (math.pi / 2, 1.0, 'accelerations point to the right'),
+    (0.0, 0.0, 'all turn rates are zero')])
 def test_an_imu_that_no_leg_can_use_is_told_at_once(config, yaw, turn_rates, why):
     drive = drive_of(yaw=yaw)
     leg = drive.leg()

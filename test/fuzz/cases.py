@@ -240,7 +240,7 @@ def judged(place, before, code, seconds, memory, said, truth) -> str:
         return f'exit {code}'
     if code == 2 and len(lines) != 1:
         return f'{len(lines)} lines for exit 2'
-    if 'Warning' in said or 'Traceback' in said or 'broke' in said or 'memory ran out' in said:
+    if 'Warning' in said or 'Traceback' in said or 'broke' in said or 'out of memory' in said:
         return 'more than a sentence on stderr'
     if seconds > SECONDS:
         return f'{seconds:.0f} s'

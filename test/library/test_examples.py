@@ -138,14 +138,14 @@ def test_live_result(tmp_path):
     node = rclpy.create_node('calibrator', context=context)
     for name, value in (('scale_factor', 0.0213), ('scale_factor_sigma', 2e-6)):
         node.create_publisher(Float64, f'/calibrator/{name}', latched).publish(Float64(data=value))
-    listener = subprocess.Popen([sys.executable, EXAMPLES / 'live_result.py'], text=True,
+    hearer = subprocess.Popen([sys.executable, EXAMPLES / 'live_result.py'], text=True,
                                 stdout=subprocess.PIPE, cwd=tmp_path, env=os.environ)
-    watchdog = threading.Timer(60.0, listener.kill)     # for a machine where nothing is heard
+    watchdog = threading.Timer(60.0, hearer.kill)     # for a machine where nothing is heard
     watchdog.start()
     try:
-        assert listener.stdout.readline() == 'scale factor 0.0213 +- 2e-06\n'
+        assert hearer.stdout.readline() == 'scale factor 0.0213 +- 2e-06\n'
     finally:
         watchdog.cancel()
-        listener.kill()
-        listener.communicate()
+        hearer.kill()
+        hearer.communicate()
         rclpy.shutdown(context=context)

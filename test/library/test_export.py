@@ -135,10 +135,10 @@ def test_the_command_puts_them_beside_the_results(town, tmp_path, capsys):
     out = tmp_path / 'out'
     argv = ['replay', str(town[1]), '--method', 'two_point', '--leg', '0:', '--output', str(out)]
     assert main([*argv, '--export', 'residual.csv']) == 2
-    assert 'there are trajectory.tum, track.kml' in capsys.readouterr().err
+    assert 'available: trajectory.tum, track.kml' in capsys.readouterr().err
     assert not out.exists()
     assert main([*argv, '--export', 'residuals.csv, trajectory.csv']) == 2
-    assert 'no leg has a fit of the smoother' in capsys.readouterr().err
+    assert 'no leg has a result of the smoother' in capsys.readouterr().err
     assert (out / 'calibration.json').exists()
     assert (out / 'residuals.csv').exists()
 

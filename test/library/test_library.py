@@ -90,7 +90,7 @@ def test_biases_are_those_of_the_drive(town, calibration):
 
 
 def test_of_a_rejected_drive_the_values_are_there_and_none(town, tmp_path):
-    """An Imu that is turned by a right angle: no leg is computed, so no method gave a value."""
+    """An IMU that is turned by a right angle: no leg is computed, so no method gave a value."""
     turned = calibrate_bag(town[1], config={'imu.mounting_rpy': (0.0, 0.0, np.pi / 2)})
     assert turned.verdict.value == 'rejected'
     assert not turned.result.estimates
@@ -215,7 +215,7 @@ def test_legs_that_are_none_are_refused(town, legs):
 def test_what_is_said_on_the_way_is_kept(town):
     bag = town[1]
     found = calibrate_bag([bag, bag], config={'method': 'two_point'}, legs='0:')
-    assert found.notes == (f'{bag} is given twice: it is read once',)
+    assert found.notes == (f'{bag} is given twice; it is read once',)
     assert len(found.result.legs) == 1
 
 

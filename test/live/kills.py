@@ -35,7 +35,7 @@ class Remains:
     """What a killed leg has left."""
 
     moment_s: float        # wall time from the mark to the kill
-    lost_s: float          # wall time from the newest Imu message in the journal to the kill
+    lost_s: float          # wall time from the newest IMU message in the journal to the kill
     told_s: float          # how long the leg was by the last status, in the time that it played
     short_s: float         # by how much the journal is shorter than that
     files: int

@@ -95,7 +95,7 @@ def _a_day_later(found, node, client, player, drive):
     with player.playing(drive.later, SPEED):
         client.until(state='recording', automatic='leg')
         found.start = client.call('start_leg')
-        found.operators = client.until(automatic='leg of the operator')
+        found.operators = client.until(automatic='started by the operator')
         found.cancel = client.call('cancel_leg')
         found.waits = client.until(automatic='waiting')
         client.until(state='recording', automatic='leg')
@@ -115,7 +115,7 @@ def test_legs_begin_and_end_by_themselves(seen, drive):
     assert seconds(seen.one) == pytest.approx([19.4, 189.5], abs=0.5)
     assert seconds(seen.two) == pytest.approx([189.5, 361.4], abs=0.5)
     assert seen.next['leg_start_ns'] == seen.one['leg_stop_ns']
-    assert 'the leg ends by itself, at a standstill or within' in seen.recording['hint']
+    assert 'the leg ends automatically at a standstill, or within' in seen.recording['hint']
     assert 'stop_leg' not in seen.recording['hint'] + seen.two['hint'] + seen.one['hint']
     assert 'ready' in seen.node.text
     assert '~/start_leg' not in seen.node.text
@@ -126,7 +126,7 @@ def test_how_far_a_leg_is_computed_is_said(seen):
     assert shares == sorted(shares)
     assert shares[-1] < 100
     for status in seen.computing:
-        stage = status['computing_stage'] or 'begun'
+        stage = status['computing_stage'] or 'started'
         assert status['hint'].startswith(f'computing: {stage}')
         assert '%' not in status['hint']
     assert seen.next['computing_percent'] == '0.0'
@@ -167,7 +167,7 @@ def test_a_recording_gives_the_legs_and_the_result_of_the_node(seen, drive, tmp_
 
 
 def test_the_next_day_goes_on_from_what_was_saved(seen, drive):
-    assert 'goes on from' in seen.again.text
+    assert 'continues ' in seen.again.text
     assert seen.later['carried_legs'] == '2'
     assert seen.carried['legs'] == 3
     latest = json.loads((seen.folder / 'latest' / 'calibration.json').read_text())
@@ -183,5 +183,5 @@ def test_the_operator_goes_before(seen):
     assert int(seen.operators['leg_id']) == 2
     assert '~/stop_leg' in seen.operators['hint']
     assert seen.cancel.success
-    assert 'drive off' in seen.waits['hint']
+    assert 'start driving' in seen.waits['hint']
     assert seen.stop.success

@@ -28,30 +28,30 @@ def test_each_thing_is_said_once_or_seldom():
                                       warning=lambda x: said.append(('warning', x))))
     session = Session()
 
-    def tell(second, **known):
+    def report(second, **known):
         before = len(said)
-        console.tell(SessionView(session, Config(), **known), second * SECOND)
+        console.report(SessionView(session, Config(), **known), second * SECOND)
         return said[before:]
 
-    nothing = {'missing': ['no Imu on /imu/data']}
-    times = [s for s in range(1, 300) if tell(s, **nothing)]
+    nothing = {'missing': ['no IMU on /imu/data']}
+    times = [s for s in range(1, 300) if report(s, **nothing)]
     assert times[:3] == [6, 16, 36]                      # 5 s, then ever more seldom
     assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 60
-    assert tell(300, rates_hz={'imu': 100.0})[0] == (
+    assert report(300, rates_hz={'imu': 100.0})[0] == (
         'info', 'ready (imu 100 Hz): stand still for 10 s, then call ~/start_leg')
-    assert tell(301) == []
-    assert tell(302, **nothing) == [('warning', 'no Imu on /imu/data')]       # at once now
-    assert tell(303, **nothing) == []
-    assert tell(304) == [('info', 'all inputs are there again')]
+    assert report(301) == []
+    assert report(302, **nothing) == [('warning', 'no IMU on /imu/data')]       # at once now
+    assert report(303, **nothing) == []
+    assert report(304) == [('info', 'all inputs are available again')]
     two = {'doubled': ['/ticks has 2 publishers (/a, /b)']}
-    assert tell(305, **two) == [('warning', two['doubled'][0])]
-    assert tell(306, **two) == []
-    gap = {'faults': (Reason(Code.IMU_GAP, 'the Imu is missing for 3 s'),)}
+    assert report(305, **two) == [('warning', two['doubled'][0])]
+    assert report(306, **two) == []
+    gap = {'faults': (Reason(Code.IMU_GAP, 'no IMU data for 3 s'),)}
     for _ in range(2):                                   # of each leg
         session.start(1, Config())
-        (level, text), = tell(307, **gap)
-        assert text.startswith(f'leg {session.leg_id}: IMU_GAP: the Imu is missing for 3 s. Mend')
-        assert tell(308, **gap) == []
+        (level, text), = report(307, **gap)
+        assert text.startswith(f'leg {session.leg_id}: IMU_GAP: no IMU data for 3 s. Fix')
+        assert report(308, **gap) == []
         session.cancel()
 
 
@@ -63,7 +63,7 @@ def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connec
     for _ in range(2):
         client.node.create_publisher(Int64, '/odometer', 10)
     line = wait_for(lambda: next((x for x in node.lines if 'waiting: ' in x), ''), 'a word')
-    assert 'no Imu on /imu/data: 0 publishers found' in line
+    assert 'no IMU on /imu/data: 0 publishers found' in line
     assert '(did you mean /my_imu?)' in line
     named = f'/odometer has 2 publishers (/{client.node.get_name()}'
     wait_for(lambda: any(named in x for x in node.lines), 'who publishes')

@@ -95,19 +95,19 @@ def test_without_take_message_the_executor_carries_all(embedded):
     wait_for(publisher.get_subscription_count, 'the subscription')
     got = []
 
-    def heard(words):
+    def received(words):
         publisher.publish(String(data=words))
         return wait_for(lambda: got.extend(raw for raw, _ in waiting.take()) or (
             got and deserialize_message(got[-1], String).data == words), words)
 
-    assert heard('taken')
+    assert received('taken')
     assert not waiting.gate.is_open
     kept, waiting._subscription = waiting._subscription, SimpleNamespace(
         handle=nullcontext(), msg_type=String)      # no take_message
-    assert heard('carried')
+    assert received('carried')
     assert waiting.gate.is_open
     waiting.follow_clock()
-    assert heard('and on')
+    assert received('and on')
     assert len(got) == 3
     node.destroy_subscription(kept)
 

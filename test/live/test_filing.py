@@ -56,7 +56,7 @@ def test_a_worse_result_needs_the_second_save(save):
     assert save(GOOD)[1]
     text, latest = save(BAD)
     assert not latest
-    assert 'latest stays where it was: the new one is rejected (NO_FIX)' in text
+    assert 'latest is unchanged: the new result is rejected (NO_FIX)' in text
     assert 'call ~/save again' in text
     assert save(BAD)[1]
 

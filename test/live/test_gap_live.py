@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The Imu falls silent in a leg: said at once, the leg is cut there, its parts make the result."""
+"""The IMU falls silent in a leg: said at once, the leg is cut there, its parts make the result."""
 
 import json
 from pathlib import Path
@@ -70,7 +70,7 @@ def seen(tmp_path_factory, domain):
 
 def test_it_is_said_while_the_leg_is_driven(seen):
     assert seen.told['level'] == b'\1'
-    assert 'the Imu is missing for 3.02 s at t = ' in seen.told['hint']
+    assert 'no IMU data for 3.02 s at t = ' in seen.told['hint']
     assert 'the leg is cut there' in seen.told['hint']
     assert 'cancel_leg' not in seen.told['hint']
     warned, = [line for line in seen.node.lines if 'WARN' in line and 'LEG_CUT' in line]
@@ -93,7 +93,7 @@ def test_its_parts_make_the_result(seen):
     scale = seen.written['result']['scale_factor']
     assert abs(scale['value'] - seen.truth.scale) < 4 * scale['sigma']
     assert 'LEG_CUT' in {r['code'] for r in seen.written['reasons']}
-    assert seen.undone.message == 'leg 1 is undone, none is left'
+    assert seen.undone.message == 'leg 1 is undone; no leg is left'
 
 
 def test_a_replay_of_the_journal_gives_the_same(seen, tmp_path):

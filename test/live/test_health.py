@@ -313,7 +313,7 @@ def test_scale_for_the_hint_comes_from_what_is_known_best():
 
 
 def test_a_row_that_always_arrives_just_after_the_imu_is_compared_too():
-    """Two sensors in step: the tick always brings the Imu's row first and the other's last."""
+    """Two sensors in step: the tick always brings the IMU's row first and the other's last."""
     clocks, config = Clocks(), Config()
     for i in range(20):
         arrival = 1000.0 + 0.05 * i + np.array([0.0, 0.025])

@@ -101,7 +101,7 @@ def test_a_journal_replays_to_the_last_bit_without_options(session):
     same(session.live, result, session.kept)
     assert result['inputs'][0]['topics'] == {
         'imu': '/front/imu', 'odometer': '/odometer', 'fix': '/gps/fix'}
-    assert 'is a journal: settings and topics from' in said
+    assert 'is a journal: settings and topics come from' in said
 
 
 def test_it_is_one_bag_with_the_preroll_and_every_message_once(session):

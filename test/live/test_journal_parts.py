@@ -122,7 +122,7 @@ def test_a_leg_that_needs_all_of_the_limit_is_kept_up_to_there(tmp_path, monkeyp
     one = leg(tmp_path, 500_000)
     for k in range(20):
         one.put([chunk(k)])
-    assert 'journal.max_bytes is used up' in one.trouble
+    assert 'the limit journal.max_bytes is reached' in one.trouble
     one.finish()
     folder, = journals(tmp_path)
     assert size_of(folder) <= 500_000
@@ -147,7 +147,7 @@ def test_what_the_disk_does_not_take_waits_but_not_without_bound(tmp_path, monke
     monkeypatch.setattr(one._bag, 'append', lambda _: (_ for _ in ()).throw(OSError(28, 'full')))
     for k in range(4, 9):
         one.put([chunk(k)])
-    assert 'it is not tried again in this leg' in one.trouble
+    assert 'no further attempt in this leg' in one.trouble
     assert not one._waiting
     monkeypatch.undo()
     one.put([chunk(9)])                # a hole would be worse than an end
@@ -185,7 +185,7 @@ def test_a_replay_takes_the_topics_of_the_journal(tmp_path, capsys):
     bag = ros_bags.write(tmp_path / 'leg', sorted(rows + twice, key=lambda row: row[1]))
     ask = ['replay', str(bag), '--output', str(tmp_path / 'out'), '--force']
     assert main(ask) == 2
-    assert '2 topics could be the Imu' in capsys.readouterr().err
+    assert '2 topics can be the IMU' in capsys.readouterr().err
     topics = {'imu': '/imu/data', 'odometer': '/odometer', 'heading': '/not/in/it'}
     (bag / JOURNAL).write_text(journal_text(Config(), 1, 1, topics))
     assert main(ask) == 1      # too short a drive, but calibrated

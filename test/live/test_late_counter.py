@@ -54,7 +54,7 @@ class Load:
 
 
 def messages(drive, begin_ns):
-    """Return the messages of Imu, fixes and a counter for each leg, by when they go out."""
+    """Return the messages of IMU, fixes and a counter for each leg, by when they go out."""
     def moved(samples):
         stamps = samples.stamp_ns + begin_ns - drive.imu.stamp_ns[0]
         return replace(samples, stamp_ns=stamps, received_ns=stamps)
@@ -128,6 +128,6 @@ def test_lateness_is_no_slip_and_slip_is_found(domain, tmp_path):
         assert (told['vehicle'], told['inputs'][0]['node']) == (name, f'/{name}/calibrator')
     text = answers['slip'].message
     assert 'WHEEL_SLIP' in text
-    size, at = text.split('vehicle moved: ')[1].split(' s (')[0].split(' m at t = ')
+    size, at = text.split('travel of the vehicle: ')[1].split(' s (')[0].split(' m at t = ')
     assert float(size) == pytest.approx(SLIP_M, abs=0.15)
     assert float(at) == pytest.approx(SLIP_S - START_S, abs=1.5)

@@ -51,8 +51,8 @@ def test_signals_end_the_node_cleanly_even_in_a_leg(start, connect, sent, how):
     assert 'Traceback' not in node.text
     assert 'rror' not in node.text
     kept = node.lines[-1]
-    assert kept.startswith('calibrator: leg 1 was not stopped: what was driven is in /')
-    assert kept.endswith('_leg_1 computes it')
+    assert kept.startswith('calibrator: leg 1 was not stopped: the data is in /')
+    assert kept.endswith('_leg_1')
 
 
 def test_a_signal_before_anything_ran_is_clean_too(start, connect):
@@ -66,7 +66,7 @@ def test_a_signal_before_anything_ran_is_clean_too(start, connect):
     (['--help'], 0, 'usage: calibrator [--ros-args'), (['-h'], 0, '~/start_leg'),
     (['--help', '--ros-args', '-p', 'imu.grade:=tactical'], 0, 'config/calibrator.yaml'),
     (['--version'], 0, f'odocal_ros {__version__}\n'),
-    (['--config', 'x.yaml'], 1, 'calibrator: --config means nothing here: settings are ROS')])
+    (['--config', 'x.yaml'], 1, 'calibrator: --config is unknown: settings are ROS')])
 def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments, code, words):
     ended = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=PATIENCE,
                            env=os.environ | {'PYTHONPATH': str(ROOT)}, check=False)
@@ -79,17 +79,17 @@ def test_help_is_shown_and_what_is_no_ros_argument_is_refused(domain, arguments,
     ('leg.min_distance:=3', "'3' of type 'INTEGER', expecting type 'DOUBLE'; write it as a decim"),
     ('leg.min_distance:=0.5', 'leg.min_distance out of range'),
     ('gnss.min_status:=9', 'gnss.min_status out of range'),
-    ('imu.gyro_noise:=5.0', 'imu.gyro_noise = 5: want 0 to 1'),
-    ('odometer.lever_arm:=[1.0, 2.0]', 'odometer.lever_arm: 2 values, want 3'),
+    ('imu.gyro_noise:=5.0', 'imu.gyro_noise = 5: required: 0 to 1'),
+    ('odometer.lever_arm:=[1.0, 2.0]', 'odometer.lever_arm: 2 values; required: 3'),
     ('method:=magic', "method: 'magic' is not one of auto, two_point"),
     ('odometer.type:=no_msgs/msg/Such', "'no_msgs/msg/Such' cannot be imported here"),
     ('result.valid:=7', 'result.valid: 7 is not of type bool'),
-    ('result.scale_factor:=-0.5', 'result.scale_factor: its value is not positive; take the file'),
+    ('result.scale_factor:=-0.5', 'result.scale_factor: its value is not positive; use the file'),
     ('result.scale_factor_sigma:=-1.0', 'result.scale_factor: its sigma is negative'),
     ('result.yaw_mounting_angle:=.inf', 'result.yaw_mounting_angle: its value is not finite'),
     ('result.track_width:=0.0', 'result.track_width: its value is not positive'),
-    ('result.legs:=-5', 'result.legs: -5 is no number of legs'),
-    ('result.stamp:="a\\eb"', 'is no date'),
+    ('result.legs:=-5', 'result.legs: -5 is not a number of legs'),
+    ('result.stamp:="a\\eb"', 'is not a date'),
     ('frames.base:=$(x)', 'frames.base: '),
     ('use_sim_time:=abc', 'use_sim_time'),
     ('qos_overrides./imu/data.subscription.reliability:=often', 'qos_overrides'),
@@ -127,8 +127,8 @@ def test_parameters_take_good_values_and_refuse_bad_ones(start, connect):
     for value, words in (({'leg__min_distance': 0.5}, 'out of range'),
                          ({'leg__min_distance': 3}, 'Wrong parameter type'),
                          ({'leg__min_distance': math.nan}, 'out of range'),
-                         ({'imu__gyro_noise': 2.0}, 'want 0 to 1'),
-                         ({'reference__start': [40.0]}, '1 values, want 4'),
+                         ({'imu__gyro_noise': 2.0}, 'required: 0 to 1'),
+                         ({'reference__start': [40.0]}, '1 values; required: 4'),
                          ({'imu__grade': 'golden'}, 'not one of consumer'),
                          ({'odometer__type': 'std_msgs/msg/Int64'}, 'read-only'),
                          ({'result__valid': True}, 'set by the node')):
@@ -143,7 +143,7 @@ def test_a_parameter_that_does_not_exist_is_named(start, connect):
                  '-p', 'result.gyro_bias_x:=1.0')
     connect().until(state='waiting')
     assert 'no parameter leg.min_distanse: did you mean leg.min_distance?' in node.text
-    assert 'no parameter imu.colour. It is not taken.' in node.text
+    assert 'no parameter imu.colour. It is ignored.' in node.text
     assert 'somebody' not in node.text
     assert 'gyro_bias' not in node.text
     assert node.text.count('WARN') == 2
@@ -207,7 +207,8 @@ def test_a_restored_result_gives_way_to_a_leg_and_comes_back_when_it_is_undone(
     player = Player(client.node, sent[0])
     wait_for(player.matched, 'subscriptions')
     player.play(part(sent[1], 0, 5), 20)
-    assert 'with the result restored of an unknown date' in client.until(state='idle')['message']
+    assert ('including the result restored from an unknown '
+            'date') in client.until(state='idle')['message']
     assert client.call('start_leg').success
     player.play(part(sent[1], 5, 20), 20)
     stopping = client.ask('stop_leg')
@@ -224,7 +225,7 @@ def test_an_input_that_never_spoke_is_an_error_in_the_diagnostics(start, connect
     client = connect()
     imu = wait_for(lambda: client.health.get('calibrator: imu'), 'diagnostics')
     assert imu['level'] == b'\x02'         # as diagnostic_updater has it; STALE is not ours to say
-    assert imu['message'].startswith('no Imu on /imu/data')
+    assert imu['message'].startswith('no IMU on /imu/data')
     player = Player(client.node, sent[0])
     wait_for(player.matched, 'subscriptions')
     with player.playing(sent[1], 10):
@@ -338,7 +339,7 @@ def test_the_odometer_type_is_taken_from_its_publisher(start, connect, sent):
     assert not answer.success
     assert 'CLOCKS_DIFFER' in answer.message
     assert 'days ahead of' in answer.message       # no setting reaches so far
-    assert 'no time_offset reaches so far' in answer.message
+    assert 'exceeds the range of time_offset' in answer.message
     assert 'use_sim_time' in answer.message
 
 
@@ -360,7 +361,7 @@ def test_waiting_says_why(start, connect, sent):
     from sensor_msgs.msg import Image, Imu, NavSatFix
     start()
     client = connect()
-    client.until(state='waiting', hint='no Imu on /imu/data: 0 publishers found; start the '
+    client.until(state='waiting', hint='no IMU on /imu/data: 0 publishers found; start the '
                  'driver or remap imu/data')
     silent = client.node.create_publisher(
         Imu, 'imu/data', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
@@ -368,8 +369,8 @@ def test_waiting_says_why(start, connect, sent):
     client.node.create_publisher(Image, 'odometer', 1)
     wait_for(lambda: 'sensor_msgs/msg/Image' in client.status['missing'], 'the foreign type')
     client.node.create_publisher(Image, 'fix', 1)
-    wait_for(lambda: '/fix is published as sensor_msgs/msg/Image, want sensor_msgs/msg/NavSatFix'
-             in client.status['missing'], 'the foreign type of the fix')
+    foreign = '/fix is published as sensor_msgs/msg/Image; required: sensor_msgs/msg/NavSatFix'
+    wait_for(lambda: foreign in client.status['missing'], 'the foreign type of the fix')
     assert silent.topic_name == '/imu/data'
     assert NavSatFix.__name__ in client.status['missing']
 
@@ -413,7 +414,7 @@ def test_the_result_of_another_vehicle_is_not_restored(start, connect):
     refused = NodeProcess(*of_three, '-p', 'vehicle:=car 4')
     assert refused.wait() == 1
     line, = refused.lines
-    assert "the result given is of vehicle 'car 3', and this node is of 'car 4'" in line
+    assert "the result belongs to vehicle 'car 3', but this node to 'car 4'" in line
     start(*of_three, '-p', 'vehicle:=car 3')
     client = connect()
     assert 'of vehicle car 3' in client.call('stop_leg').message

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A leg by an Imu without accelerometer, over DDS: what is told of it, and replay's figures."""
+"""A leg by an IMU without accelerometer, over DDS: what is told of it, and replay's figures."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ FIRST_S, MARK_S, STOP_S, END_S = 45, 60, 115, 117     # of the drive: played, an
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate a straight drive, all stamped; the Imu sends zeros for its acceleration."""
+    """Simulate a straight drive, all stamped; the IMU sends zeros for its acceleration."""
     made = simulate(SimOptions(scenario='straight', duration=180.0, imu_rate=50.0,
                                odometer_rate=25.0, odometer='speed', fix_noise='rtk'))
     return replace(made, imu=replace(made.imu, f_i=np.zeros_like(made.imu.f_i)))
@@ -61,8 +61,8 @@ def session(drive, domain, tmp_path_factory):
 
 def test_the_start_says_what_the_leg_cannot_tell(session):
     assert session.start.success, session.start.message
-    assert 'this drive can tell the scale; it cannot tell the yaw' in session.start.message
-    assert 'the pitch, since the Imu sends no acceleration' in session.start.message
+    assert 'observable: the scale; not observable: the yaw' in session.start.message
+    assert 'the pitch (IMU without acceleration)' in session.start.message
 
 
 def test_the_stop_gives_the_scale_and_says_what_the_angles_need(session, drive):
@@ -75,9 +75,9 @@ def test_the_stop_gives_the_scale_and_says_what_the_angles_need(session, drive):
 def test_it_is_what_replay_finds(session, drive):
     recorder, config = LegRecorder(), Config()
     types, sent = messages_of(drive)
-    heard = part(sent, FIRST_S, END_S)
+    received = part(sent, FIRST_S, END_S)
     for slot, msgtype in types.items():
-        reader, mine = make_reader(slot, msgtype, config), [m for m in heard if m.slot == slot]
+        reader, mine = make_reader(slot, msgtype, config), [m for m in received if m.slot == slot]
         for name, block in reader.rows([m.raw for m in mine], [m.stamp_ns for m in mine], None):
             recorder.feed(name, block)
         recorder.form = reader.form or recorder.form

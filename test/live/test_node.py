@@ -150,10 +150,10 @@ def replayed(drive, status):
     """Compute the leg that a status marks from the recorded messages, read as one block each."""
     config = with_settings(Config(), SETTINGS | {'alignment.heading': drive.heading})
     recorder = LegRecorder()
-    heard = part(drive.sent, 45, 117)
+    received = part(drive.sent, 45, 117)
     for slot, msgtype in drive.types.items():
         reader = make_reader(slot, msgtype, config)
-        mine = [one for one in heard if one.slot == slot]
+        mine = [one for one in received if one.slot == slot]
         for name, block in reader.rows([one.raw for one in mine], [one.stamp_ns for one in mine],
                                        None):
             recorder.feed(name, block)
@@ -223,9 +223,9 @@ def test_the_result_is_the_truth(session, drive):
 
 
 def test_nothing_was_lost(session, drive):
-    heard = part(drive.sent, 45, 127)
+    received = part(drive.sent, 45, 127)
     for slot, name in (('imu', 'imu'), ('odometer', 'odometer'), ('fix', 'gnss')):
-        count = str(sum(one.slot == slot for one in heard))
+        count = str(sum(one.slot == slot for one in received))
 
         def complete(name=name, count=count):
             health = session.client.health.get(f'calibrator: {name}', {})
@@ -235,7 +235,7 @@ def test_nothing_was_lost(session, drive):
 
 
 def test_before_anything_came_every_command_says_what_to_do(session):
-    words = {'start_leg': 'no Imu on /imu/data: 0 publishers found', 'stop_leg': '~/start_leg',
+    words = {'start_leg': 'no IMU on /imu/data: 0 publishers found', 'stop_leg': '~/start_leg',
              'cancel_leg': 'no leg is running', 'undo_leg': 'no leg to undo',
              'save': 'nothing to save'}
     for name, text in words.items():
@@ -269,7 +269,7 @@ def test_status_has_every_key_and_bare_numbers(session):
     assert session.calibrated['leg_event'] == 'stopped'
     marks = [int(session.calibrated[f'leg_{end}_ns']) for end in ('start', 'stop')]
     assert float(session.calibrated['duration_s']) == pytest.approx((marks[1] - marks[0]) * 1e-9)
-    # a mark is an Imu stamp: 20 ms apart, on the sensors' clock
+    # a mark is an IMU stamp: 20 ms apart, on the sensors' clock
     assert all(mark % 20_000_000 == session.imu_phase_ns for mark in marks)
     assert float(session.recording['imu_rate_hz']) == pytest.approx(50, rel=0.01)
     assert float(session.recording['odometer_rate_hz']) == pytest.approx(25, rel=0.02)
@@ -305,14 +305,14 @@ def test_nothing_is_foreseen_but_of_a_leg_that_is_recorded(session):
 
 def test_live_distance_is_near_the_computed_one(session):
     live, final = (float(s['distance_m']) for s in (session.computing, session.calibrated))
-    # by the nominal scale of 1 where the true one is 1.02; speeds may have run ahead of the Imu
+    # by the nominal scale of 1 where the true one is 1.02; speeds may have run ahead of the IMU
     # by what a busy machine delays: 0.1 s, at 30 times 12 m/s
     assert live == pytest.approx(final / 1.02, abs=36.0)
 
 
 def test_parameters_are_frozen_during_a_leg(session):
     assert not session.set_in_leg.successful
-    assert 'frozen' in session.set_in_leg.reason
+    assert 'fixed; end it' in session.set_in_leg.reason
     assert not session.set_result.successful
     assert 'set by the node' in session.set_result.reason
     assert session.set_between.successful

@@ -33,7 +33,7 @@ BIAS, TILT = (2e-5, -1e-5, 3e-5), (0.01, -0.02)     # rad/s; rad: any, but one f
 
 @pytest.fixture(scope='module')
 def drive():
-    """Simulate two minutes of a hilly town, the Imu at a rate of which replay uses all."""
+    """Simulate two minutes of a hilly town, the IMU at a rate of which replay uses all."""
     return simulate(SimOptions(scenario='town', duration=135.0, slope=0.03, imu_rate=50.0,
                                odometer_rate=20.0, odometer='speed', fix_noise='rtk',
                                imu_grade='tactical'))
@@ -70,7 +70,7 @@ def given(replayed):
 
 
 @pytest.fixture(scope='module')
-def heard(drive, replayed, domain):
+def received(drive, replayed, domain):
     """Play the drive to a node with that calibration; keep what it publishes."""
     from geometry_msgs.msg import TwistWithCovarianceStamped
     from nav_msgs.msg import Odometry
@@ -107,20 +107,20 @@ def stamp_of(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def test_its_path_is_that_of_replay_as_calibrated(heard, drive, replayed):
-    assert heard.node.text.count('odometry begins') == 1, heard.node.text
-    assert 'jumps' not in heard.node.text
-    rows = np.searchsorted(drive.imu.stamp_ns, [stamp_of(m) for m in heard.odometry])
+def test_its_path_is_that_of_replay_as_calibrated(received, drive, replayed):
+    assert received.node.text.count('odometry starts') == 1, received.node.text
+    assert 'jumps' not in received.node.text
+    rows = np.searchsorted(drive.imu.stamp_ns, [stamp_of(m) for m in received.odometry])
     path = np.array([[getattr(m.pose.pose.position, axis) for axis in 'xyz']
-                     for m in heard.odometry])
+                     for m in received.odometry])
     wanted = replayed.result.track_n[rows - replayed.row] - replayed.result.track_n[0]
     assert len(path) > 1000
     assert np.linalg.norm(wanted[-1]) > 200.0
     assert np.abs(path - wanted).max() < 1e-9
 
 
-def test_messages_are_what_robot_localization_takes(heard):
-    pose, twist = heard.odometry[500], heard.twists[500]
+def test_messages_are_what_robot_localization_takes(received):
+    pose, twist = received.odometry[500], received.twists[500]
     assert (pose.header.frame_id, pose.child_frame_id) == ('odom', 'base_link')
     assert (twist.header.frame_id, twist.header.stamp) == ('base_link', pose.header.stamp)
     assert pose.twist == twist.twist

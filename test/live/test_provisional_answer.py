@@ -123,19 +123,19 @@ def test_it_holds_the_running_estimate_as_the_status_had_it(seen):
     value, sigma = (float(seen.recording[f'estimate_scale_factor{end}'])
                     for end in ('', '_sigma'))
     text = seen.first.answer.message
-    assert f'its running estimate is scale factor {with_sigma(value, sigma)},' in text
+    assert f'the running estimate is scale factor {with_sigma(value, sigma)},' in text
     for end in ('', '_sigma'):
         angle = f'estimate_yaw_mounting_angle{end}_rad'
         assert seen.computing[angle] == seen.recording[angle] != 'nan'
     assert text == seen.again.answer.message
-    assert 's before its end' in text
+    assert 's before the end' in text
 
 
 def test_nothing_in_it_can_be_taken_for_the_result(seen):
     text = seen.first.answer.message
     for word in ('accepted', 'caution', 'rejected', 'OK:'):
         assert word not in text
-    assert 'The final result has a verdict and replaces this' in text
+    assert 'The final result with its verdict follows on ~/status' in text
     assert '~/status' in text
     assert seen.valid_before == [False]
     assert (seen.computing['verdict'], seen.computing['scale_factor']) == ('', 'nan')
@@ -167,7 +167,7 @@ def test_the_result_follows_on_the_status_in_the_parameters_and_to_who_asks_agai
 
 
 def test_a_leg_without_running_estimate_says_so_and_may_be_dropped(seen):
-    assert 'leg 2 is being computed; it has no running estimate' in seen.short.answer.message
+    assert 'leg 2 is being computed; there is no running estimate' in seen.short.answer.message
     assert 'The final result of all legs' in seen.short.answer.message
     assert (seen.cancelled.success, seen.cancelled.message) == (False, 'leg 2 is cancelled')
 
@@ -176,6 +176,6 @@ def test_a_leg_that_would_be_rejected_is_no_good_news():
     session = Session()
     session.start(1, Config())
     now = SessionView(session, Config(), faults=(
-        Reason(Code.IMU_GAP, 'the Imu is missing for 9 s'),), forecast_age_s=math.nan)
-    assert ('As driven it would be rejected: IMU_GAP: the Imu is missing for 9 s. '
+        Reason(Code.IMU_GAP, 'no IMU data for 9 s'),), forecast_age_s=math.nan)
+    assert ('Now it would be rejected: IMU_GAP: no IMU data for 9 s. '
             in answers.provisional(now))

@@ -175,6 +175,6 @@ def test_a_day_of_legs_keeps_their_numbers_and_the_tracks_of_the_newest():
     assert both.estimates == full.estimates
     content = [as_json(one, config, [], '') for one in (full, both)]
     assert content[0] == content[1]
-    assert 'No figures here of leg 1, ' in report_html(both, config, content[1])
+    assert 'of the newest legs only, none of leg 1.' in report_html(both, config, content[1])
     track, = geojson(both, config, content[1]).values()
     assert {one['properties']['leg'] for one in json.loads(track)['features']} == {2}

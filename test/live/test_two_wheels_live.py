@@ -80,10 +80,10 @@ def test_the_start_says_what_to_drive_and_what_it_can_tell(session):
     assert TURNS in text
     assert 'then stand still 10 s and call ~/stop_leg' in text
     assert text.endswith(
-        'As configured, this drive can tell the scale, the yaw (by stops, starts and turns), the '
-        'pitch, left and right wheel and the track width (in turns)')
+        'With these settings, observable: the scale, the yaw (from stops, starts and turns), '
+        'the pitch, left and right wheel and the track width (in turns)')
     assert session.first['hint'].split(', ', 1)[1] in text        # the same text in the status
-    assert session.first['can_tell'].startswith('the scale, the yaw (by')
+    assert session.first['can_tell'].startswith('the scale, the yaw (from')
     assert (session.first['cannot_tell'], session.first['track_width_ok']) == ('', 'unknown')
     assert TURNS in session.first['manoeuvres']
 

@@ -29,18 +29,18 @@ def test_hint_and_values_are_latched_in_standard_types(start, connect):
     from std_msgs.msg import Float64, String
     start('-p', 'result.scale_factor:=0.02', '-p', 'result.scale_factor_sigma:=0.00001', '-p',
           'result.valid:=true')
-    client, heard = connect(), {}
+    client, received = connect(), {}
     client.until(state='waiting')
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     for name, kind in (('hint', String), ('scale_factor', Float64),
                        ('scale_factor_sigma', Float64), ('yaw_mounting_angle', Float64)):
         client.node.create_subscription(
             kind, f'/calibrator/{name}',
-            lambda message, name=name: heard.update({name: message.data}), latched)
-    wait_for(lambda: len(heard) == 4, 'latched values')     # to one who comes late
-    assert heard['hint'] == client.status['hint']
-    assert (heard['scale_factor'], heard['scale_factor_sigma']) == (0.02, 1e-5)
-    assert math.isnan(heard['yaw_mounting_angle'])
+            lambda message, name=name: received.update({name: message.data}), latched)
+    wait_for(lambda: len(received) == 4, 'latched values')     # to one who comes late
+    assert received['hint'] == client.status['hint']
+    assert (received['scale_factor'], received['scale_factor_sigma']) == (0.02, 1e-5)
+    assert math.isnan(received['yaw_mounting_angle'])
 
 
 def test_without_the_library_a_sentence_says_what_to_install(tmp_path):
@@ -59,7 +59,7 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no Imu on /imu/data', 'way', 'asked 1000 ppm'):
+    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'way', 'limit 1000 ppm'):
         assert words in ended.stdout
 
 
@@ -92,9 +92,9 @@ def test_the_bars_are_shares_of_what_is_asked():
     done = {'state': 'calibrated', 'asked_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
             'scale_factor_sigma': '0.00004', 'asked_yaw_sigma_deg': '0.5',
             'yaw_mounting_angle_sigma_rad': repr(math.radians(0.25))}
-    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, asked 1000 ppm')
-    assert shares(done)['yaw'] == (1.0, '0.25 deg, asked 0.5 deg')
-    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, asked 1000 ppm')
+    assert shares(done)['scale'] == (pytest.approx(0.5), '2000 ppm, limit 1000 ppm')
+    assert shares(done)['yaw'] == (1.0, '0.25 deg, limit 0.5 deg')
+    assert shares(done | {'state': 'recording'})['scale'] == (0.0, 'not known, limit 1000 ppm')
     assert shares({'state': 'computing', 'computing_percent': '40.0'}) == {}
 
 

@@ -150,7 +150,7 @@ def test_two_values_of_unknown_sides_are_kept_apart_for_their_mean():
     assert [(slot, block.value.tolist()) for slot, block in pairs] == [
         ('odometer', [4]), ('odometer_right', [5])]
     assert not reader.form.sides
-    assert 'the mean of 0 and 1 is taken' in reader.form.chosen
+    assert 'the mean of 0 and 1 is used' in reader.form.chosen
 
 
 def test_a_longer_array_is_refused_with_the_settings_that_name_its_wheels():
@@ -200,7 +200,7 @@ def test_joint_by_name_wherever_it_stands_and_not_in_messages_without_it():
     assert pairs[0][1].value.tolist() == [1, 4]
     assert pairs[0][1].stamp_ns.tolist() == [2, 3]
     assert reader.unreadable == 2
-    assert 'its names are arm' in reader.trouble
+    assert 'names: arm' in reader.trouble
 
 
 def test_two_wheels_in_one_message():
@@ -272,12 +272,12 @@ def test_a_sensors_type_as_an_odometer_is_read_by_its_field():
 # ---- what is refused -----------------------------------------------------------------------
 
 @pytest.mark.parametrize(('slot', 'msgtype', 'settings_', 'error', 'says'), [
-    ('imu', 'std_msgs/msg/String', {}, BadData, 'give a topic of sensor_msgs/msg/Imu'),
+    ('imu', 'std_msgs/msg/String', {}, BadData, 'give a topic of type sensor_msgs/msg/Imu'),
     ('fix', 'sensor_msgs/msg/Imu', {}, BadData, 'sensor_msgs/msg/NavSatFix'),
     ('fix_velocity', 'geometry_msgs/msg/Twist', {}, BadData, 'TwistWithCovarianceStamped'),
     ('odometer', 'std_msgs/msg/String', {}, BadData, 'set odometer.field'),
-    ('odometer', 'std_msgs/msg/Int64', {'odometer.field': 'value'}, BadData, 'it has data'),
-    ('odometer', 'std_msgs/msg/Int64', {'odometer.field': 'a..b]'}, BadConfig, 'is no path'),
+    ('odometer', 'std_msgs/msg/Int64', {'odometer.field': 'value'}, BadData, 'values: data'),
+    ('odometer', 'std_msgs/msg/Int64', {'odometer.field': 'a..b]'}, BadConfig, 'is not a path'),
     ('odometer', 'std_msgs/msg/Int32MultiArray', {'odometer.field': 'data'}, BadConfig,
      r'data\[0\]'),
     ('odometer', 'std_msgs/msg/Int64', {'odometer.left': 'a', 'odometer.right': 'b'}, BadConfig,
@@ -309,7 +309,7 @@ def test_a_joint_no_message_has_gives_no_rows_but_the_reason():
     pairs, reader = read('odometer', [make.joints(1, ['a'], [1.0])],
                          config(odometer__field='velocity[b]'))
     assert pairs == []
-    assert reader.trouble == 'no velocity[b] in a sensor_msgs/msg/JointState, its names are a'
+    assert reader.trouble == 'no velocity[b] in a sensor_msgs/msg/JointState; names: a'
 
 
 # ---- block path == message path ------------------------------------------------------------

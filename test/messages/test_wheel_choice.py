@@ -87,15 +87,15 @@ def test_a_long_list_is_cut():
 def test_the_mean_of_two_wheels_of_unknown_sides_is_calibrated_and_said():
     made = drive(scenario='straight', duration=200.0, two_wheels=True, seed=3)
     leg = made.leg()
-    blind = replace(leg, form=replace(leg.form, sides=False, chosen='the mean is taken'))
+    blind = replace(leg, form=replace(leg.form, sides=False, chosen='the mean is used'))
     config = settings(made, method='auto')
     result = calibrate(blind, config)
     assert 'scale_factor_left' not in result.methods['smoother'].estimates
-    assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is taken'
+    assert everything_said(result)[Code.ODOMETER_CHOSEN] == 'the mean is used'
     both = calibrate(leg, config)
     assert both.methods['smoother'].estimates['scale_factor_left'].value is not None
     # named, but a straight way does not tell whether rightly
-    assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('no turn tells')
+    assert everything_said(both)[Code.ODOMETER_CHOSEN].startswith('too few turns')
     assert result.methods['two_point'].estimates['scale_factor'].value == \
         both.methods['two_point'].estimates['scale_factor'].value
 

@@ -29,7 +29,7 @@ DRAWS = 400
 
 def rest(C_nb, latitude=LATITUDE, gyro_bias=0.0, accel_bias=0.0, grade=None, rng=None,
          seconds=SECONDS):
-    """Return t, w_b, f_b of an Imu at rest; noise and bias walk of grade drawn from rng."""
+    """Return t, w_b, f_b of an IMU at rest; noise and bias walk of grade drawn from rng."""
     t = np.arange(0.0, seconds + 1e-9, 1 / RATE)
     w = np.tile(C_nb.T @ earth_rate_n(latitude) + gyro_bias, (len(t), 1))
     f = np.tile(C_nb.T @ [0.0, 0.0, gravity(latitude, 0.0)] + accel_bias, (len(t), 1))

@@ -158,7 +158,7 @@ def test_mounting_angles_and_forward_axis_undo_each_other(yaw, pitch, K):
 
 
 def test_signs_of_the_mounting_angles():
-    """Yaw > 0: the Imu's x axis lies left of forward; pitch > 0: below it."""
+    """Yaw > 0: the IMU's x axis lies left of forward; pitch > 0: below it."""
     assert forward_b(0.1, 0.0)[1] < 0
     assert forward_b(0.0, 0.1)[2] > 0
     assert_allclose(mounting_from_forward(np.array([1.0, -0.1, 0.0])), [np.arctan(0.1), 0])

@@ -79,9 +79,9 @@ def test_the_table_reads_well(run):
 @pytest.mark.parametrize(('content', 'truth', 'match'), [
     (calibration(scale=None), SIMULATED, 'no scale factor to compare'),
     (calibration(), {}, 'no scale factor to compare'),
-    ([], SIMULATED, 'not the file meant'),
-    ({'config': {}}, SIMULATED, 'not the file meant'),
-    (calibration(), [1], 'not the file meant'),
+    ([], SIMULATED, 'wrong file'),
+    ({'config': {}}, SIMULATED, 'wrong file'),
+    (calibration(), [1], 'wrong file'),
 ])
 def test_what_cannot_be_compared_is_said(run, content, truth, match):
     code, out, err = run(content, truth)
@@ -92,7 +92,7 @@ def test_what_cannot_be_compared_is_said(run, content, truth, match):
 
 def test_files_that_cannot_be_read(tmp_path, capsys):
     assert main([]) == 2
-    assert 'want two files' in capsys.readouterr().err
+    assert 'required: two files' in capsys.readouterr().err
     assert main([str(tmp_path / 'no.json'), str(tmp_path / 'no.yaml')]) == 2
     assert 'cannot be read' in capsys.readouterr().err
     (tmp_path / 'a.json').write_text('{')

@@ -46,4 +46,4 @@ def test_what_is_installed_is_shown(capsys, tmp_path, monkeypatch):
 def test_what_is_lacking_is_named(capsys, monkeypatch):
     monkeypatch.setattr(doctor, 'NEEDED', ('numpy', 'no-such-thing'))
     assert main(['doctor']) == 1
-    assert 'lacking: no-such-thing' in capsys.readouterr().out
+    assert 'missing: no-such-thing' in capsys.readouterr().out

@@ -39,7 +39,8 @@ def test_a_method_that_breaks_leaves_a_trace_file(bag, tmp_path, monkeypatch, ca
     code = main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--quiet'])
     line, = capsys.readouterr().err.strip().splitlines()
     assert code in (0, 1)
-    assert line.startswith('odocal: method smoother broke; please report it with ')
+    assert line.startswith('odocal: method smoother failed with an internal error; please report '
+                           'it with ')
     trace = Path(line.split()[-1]).read_text()
     assert 'ZeroDivisionError: by nothing' in trace
     assert 'in breaks' in trace
@@ -72,4 +73,4 @@ def test_memory_that_runs_out_is_called_so(bag):
     ran = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
                          check=False)
     assert ran.returncode == 2
-    assert ran.stderr.startswith('odocal: memory ran out')
+    assert ran.stderr.startswith('odocal: out of memory')

@@ -27,7 +27,7 @@ from odocal_ros.nav.rotations import matrix_from_rpy
 from odocal_ros.offline.cli import main
 
 K = 0.02                   # m per pulse
-RATE = 25                  # Hz, Imu
+RATE = 25                  # Hz, IMU
 G = 9.81
 
 
@@ -45,7 +45,7 @@ def drive(seconds=150, C_ib=None, gyro=1.0, accel=1.0, lag=0.0, status=0, loop=F
     """
     Return rows of a planar drive.
 
-    C_ib takes b to the Imu frame; gyro, accel: factors on what is sent; lag: s, added to the
+    C_ib takes b to the IMU frame; gyro, accel: factors on what is sent; lag: s, added to the
     fixes' stamps; loop: half way round a circle and back to the start.
     """
     t, v, w, a = planar(seconds)
@@ -119,8 +119,8 @@ def test_comma(data_dir, capsys):
     assert pulses['timing']['headerless']
     assert (pulses['odometer']['quantity'], pulses['rate_hz']) == (
         'cumulative', pytest.approx(82.9, abs=0.1))
-    for line in ('looks z-down', 'no header: stamped by its arrival', 'never at rest',
-                 'no covariance', '3 topics could be the odometer', '[180, 0, 0] deg'):
+    for line in ('looks z-down', 'no header: arrival time', 'never at rest',
+                 'no covariance', '3 topics can be the odometer', '[180, 0, 0] deg'):
         assert line in text
 
 
@@ -145,13 +145,13 @@ def test_husky(data_dir, capsys):
     assert all(leg['chord'] > 0.9 * leg['way'] for leg in told['straight'])
     # the whole drive gives the smoother more than its straight sides: 1.7 % instead of 3.3 %
     assert '--leg' not in told['command']
-    alone = text[text.index('of the two-point method alone'):]
+    alone = text[text.index('affects the two-point method only'):]
     for code in ('NO_STANDSTILL', 'CHORD_TOO_SHORT', 'YAW_NOT_SEPARABLE'):
         assert text.count(f'{code}:') == alone.count(f'{code}:') == 1
     told, text = inspect(path, capsys, '--set', 'method=two_point')
     assert '--leg' in told['command']
     assert 'mounted on its side' in text
-    assert 'of the two-point method alone' not in text
+    assert 'affects the two-point method only' not in text
 
 
 def test_the_command_it_tells_runs(data_dir, capsys, tmp_path):
@@ -170,7 +170,7 @@ def test_bags_without_any_input(data_dir, capsys, name):
     told, text = inspect(data_dir / 'reader_bags' / name, capsys)
     assert codes(told) == {'NO_IMU', 'NO_ODOMETER', 'NO_FIX'}
     assert told['command'] == ''
-    assert 'replay needs help: no odometer' in text
+    assert 'replay needs options: no odometer' in text
     unwrapped = ' '.join(text.split())       # a long path moves the line breaks
     assert ('metadata.yaml is missing' in unwrapped) == ('no_metadata' in name)
 
@@ -196,7 +196,7 @@ def test_a_good_drive_lacks_only_a_heading(tmp_path, capsys):
     assert told['mounting'] == told['mounting'] | {'rpy': [0, 0, 0], 'needed': False}
     assert told['command'] == f'odocal replay {tmp_path / "bag"}'
     assert told['open'] == ''
-    assert 'imu.mounting_rpy is right: [0, 0, 0] deg' in text
+    assert 'imu.mounting_rpy is correct: [0, 0, 0] deg' in text
 
 
 @pytest.mark.parametrize('rpy', [
@@ -239,9 +239,9 @@ def test_units(tmp_path, capsys):
     assert f'--set imu.gyro_scale={math.pi / 180!r}' in told['command']
     told, text = inspect(ros_bags.write(tmp_path / 'twice', drive(gyro=2.0)), capsys)
     assert told['drive']['gyro_over_course'] == pytest.approx(2, abs=0.1)
-    assert 'IMU_UNITS: the gyro turns 2.' in text
+    assert 'IMU_UNITS: the gyro shows 2.' in text
     told, text = inspect(tmp_path / 'twice', capsys, '--set', f'odometer.nominal_scale={4 * K}')
-    assert 'as a counter of the four edges of a pulse would be' in ' '.join(text.split())
+    assert 'typical for a counter of the four edges of a pulse' in ' '.join(text.split())
     told, _ = inspect(ros_bags.write(tmp_path / 'sign', drive(gyro=-1.0)), capsys)
     assert 'GYRO_SIGN' in codes(told)
 
@@ -256,7 +256,7 @@ def test_clocks_and_stamps(tmp_path, capsys):
     rows[imu[100]][2].header.stamp.nanosec = 0
     rows[imu[200]][2].header.stamp.sec -= 5         # backward, once
     rows[imu[301]] = (*rows[imu[301]][:2], rows[imu[300]][2])    # a row sent twice
-    gone = set(imu[2000:2600])                      # 12 s of Imu
+    gone = set(imu[2000:2600])                      # 12 s of IMU
     rows = [row for i, row in enumerate(rows) if i not in gone]
     told, text = inspect(ros_bags.write(tmp_path / 'odd', rows), capsys)
     timing = topic(told, '/imu/data')['timing']
@@ -305,9 +305,9 @@ def test_orientation_as_heading(tmp_path, capsys):
             covariance=covariance)) for name, ns, m in drive()]
 
     for q, variance, says in (((0, 0, 0.6, 0.8), 1e-6, None),
-                              ((0, 0, 0.6, 0.8), 0.01, 'sigma of 5.7 deg'),
-                              ((0, 0, 0.6, 0.8), 0.0, 'without a covariance'),
-                              ((0, 0, 0, 1), 0.0, 'sends no orientation')):   # a default
+                              ((0, 0, 0.6, 0.8), 0.01, 'uncertainty of 5.7 deg'),
+                              ((0, 0, 0.6, 0.8), 0.0, 'has no covariance'),
+                              ((0, 0, 0, 1), 0.0, 'publishes no orientation')):   # a default
         path = ros_bags.write(tmp_path / f'{variance}{q[2]}', with_orientation(q, variance))
         told, _ = inspect(path, capsys)
         texts = [f['text'] for f in told['findings'] if f['code'] == 'YAW_NOT_SEPARABLE']
@@ -334,7 +334,7 @@ def test_short_slow_and_odd_values(tmp_path, capsys):
     assert topic(told, '/imu/data')['imu']['not_finite'] == 1
     nan = [('/speed', T0 + i, make.real(math.nan)) for i in range(5)]
     told, text = inspect(ros_bags.write(tmp_path / 'nan', nan), capsys)
-    assert 'no value is a number' in text
+    assert 'no valid value' in text
     single = [row for row in drive(1) if row[1] < T0 + 3]
     told, _ = inspect(ros_bags.write(tmp_path / 'single', single), capsys)
     assert told['messages'] == 3
@@ -356,7 +356,7 @@ def test_topic_named_by_the_user(tmp_path, capsys):
     path = ros_bags.write(tmp_path / 'bag', rows)
     told, _ = inspect(path, capsys)
     assert told['mapping']['odometer'] == '/odometer'     # a counter before a speed
-    assert '2 topics could be the odometer' in told['open']
+    assert '2 topics can be the odometer' in told['open']
     assert '--odometer-topic /odometer' in told['command']
     told, _ = inspect(path, capsys, '--odometer-topic', 'speed')
     assert told['mapping']['odometer'] == '/speed'
@@ -364,7 +364,7 @@ def test_topic_named_by_the_user(tmp_path, capsys):
     assert main(['inspect', str(path), '--fix-topic', '/gps']) == 2
     assert ' --fix-topic /gps: no such topic' in capsys.readouterr().err
     assert main(['inspect', str(path), '--imu-topic', '/fix']) == 2
-    assert 'which cannot be the Imu' in capsys.readouterr().err
+    assert 'which cannot be used as IMU' in capsys.readouterr().err
 
 
 def test_a_drive_is_screened_once(tmp_path, capsys, monkeypatch):

@@ -158,6 +158,6 @@ def test_a_leg_outside_the_bag_is_refused_with_the_span_there_is(out_and_back):
 
 def test_a_recording_that_broke_off_at_its_start_mark_says_so():
     bag = SimpleNamespace(name='2026-01-02T03-04-05Z_leg_1')
-    with pytest.raises(BadData, match='broke off at its start mark.* drive it again'):
+    with pytest.raises(BadData, match='ended at the start mark.* drive it again'):
         _marked([(10, 0)], 10, bag)
     assert _marked([(10, 0)], 11, bag) == [(10, 11)]

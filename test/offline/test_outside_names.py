@@ -25,7 +25,7 @@ FRAME = "imu$(command 'touch ran')\x1b[2J\ntouch ran; `touch ran`"
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
-    """Write a drive whose Imu frame and folder name are commands."""
+    """Write a drive whose IMU frame and folder name are commands."""
     drive = simulate(SimOptions(scenario='straight', duration=200.0, imu_grade='tactical',
                                 imu_rate=50.0, odometer_rate=20.0))
     topics = [t for t in drive_topics(drive) if t.name != '/imu/data']
@@ -81,4 +81,4 @@ def test_a_journal_that_names_an_evil_frame_is_refused_in_one_line(bag, tmp_path
         assert main(['replay', str(bag), '--output', str(tmp_path / 'o')]) == 2
     finally:
         (bag / 'journal.yaml').unlink()
-    assert 'is no frame name' in capsys.readouterr().err
+    assert 'is not a frame name' in capsys.readouterr().err

@@ -24,7 +24,7 @@ def drive():
 
 
 @pytest.fixture(autouse=True)
-def once(drive, monkeypatch):
+def unique_paths(drive, monkeypatch):
     monkeypatch.setattr(patent, 'driven', lambda fix_noise, seed: drive)
 
 

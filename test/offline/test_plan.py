@@ -75,7 +75,7 @@ def test_changes_are_computed_not_told(capsys):
     before = answer['methods']['two_point']['estimates']
     scale, yaw = (before[n]['sigma'] for n in ('scale_factor', 'yaw_mounting_angle'))
     changes = {c['text']: c for c in answer['changes']}
-    longer = next(c for text, c in changes.items() if 'straight on' in text)
+    longer = next(c for text, c in changes.items() if 'straight ahead' in text)
     assert longer['scale_factor'] == pytest.approx(scale / 2, rel=0.01)    # twice the way
     # white fixes alone make the scale: RTK is 75 times better, the rest is below 0.04 ppm
     assert changes['RTK fixes (0.02 m)']['scale_factor'] == pytest.approx(scale / 75, rel=0.05)
@@ -86,7 +86,7 @@ def test_changes_are_computed_not_told(capsys):
     assert other['scale_factor'] == pytest.approx(scale * first / math.hypot(scale, first),
                                                   rel=1e-3)
     assert other['yaw_mounting_angle'] == pytest.approx(yaw, rel=1e-3)
-    better = next(c for text, c in changes.items() if text.startswith('a heading known'))
+    better = next(c for text, c in changes.items() if text.startswith('a heading with'))
     assert better['yaw_mounting_angle'] == pytest.approx(yaw / 2, rel=0.01)
 
 
@@ -105,13 +105,13 @@ def test_the_screen_ranks_by_gain_and_fits(capsys, drive):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 45
     assert max(map(len, lines)) < 120
-    begin = lines.index('  what would help the scale most')
-    end = lines.index('  what would help the yaw most')
+    begin = lines.index('  largest improvements of the scale')
+    end = lines.index('  largest improvements of the yaw')
     after = [float(line.split('->')[1].split()[0]) for line in lines[begin + 1:end]]
     assert len(after) > 2
     assert after == sorted(after)
     assert 'RTK' in lines[begin + 1]
-    # a better Imu has straighter axes too
+    # a better IMU has straighter axes too
     wanted = 'heading' if 'method=two_point' in drive else 'stop and go'
     assert any(wanted in line for line in lines[end + 1:end + 3])
 
@@ -121,12 +121,12 @@ def test_an_out_and_back_is_no_two_point_drive_but_the_smoothers(capsys):
     assert main(['plan', *drive, '--duration', '300']) == 0
     out = capsys.readouterr().out
     assert 'CHORD_TOO_SHORT' in out
-    assert 'the result: all by smoother' in out
+    assert '(result: all by smoother' in out
     answer = asked(capsys, *drive, *TWO_POINT)
     assert answer['methods']['two_point']['estimates']['scale_factor']['sigma'] is None
     assert answer['verdict'] == 'rejected'
     assert answer['estimates']['scale_factor'] == {'sigma': None, 'method': None}
-    half = next(c for c in answer['changes'] if 'farthest off' in c['text'])
+    half = next(c for c in answer['changes'] if 'the farthest point' in c['text'])
     motion = motion_of(resolved(SimOptions(scenario='out_and_back')))
     t = np.arange(0.0, motion.duration, 0.1)
     moving = np.flatnonzero(np.abs(motion.speed(t)) > 1e-6)
@@ -158,7 +158,7 @@ def test_the_smoother_gives_what_it_can_and_is_planned_as_it_is_predicted(capsys
     assert 'YAW_NOT_SEPARABLE' not in {r['code'] for r in answer['reasons']}
     changes = {c['text']: c for c in answer['changes']}
     stop = predict_smoother(stop_and_start(drive), sigmas)
-    assert changes['a stop and a start on the way']['yaw_mounting_angle'] == pytest.approx(
+    assert changes['one more stop and start']['yaw_mounting_angle'] == pytest.approx(
         stop.estimates['yaw_mounting_angle'].sigma, rel=1e-12)
     # own errors are halved in variance, those shared by legs stay; of what is imperfect two legs
     # together tell a little more, in the next digit
@@ -172,17 +172,17 @@ def test_a_yaw_that_no_method_gives_says_why_and_what_would(tmp_path, capsys):
     path = str(gpx(tmp_path / 'a.gpx', rest=0.0, corner=0.0, count=60))
     assert main(['plan', '--gpx', path, '--imu-grade', 'consumer']) == 0
     out = capsys.readouterr().out
-    # an Imu whose axes are off by half a degree: without turns no pitch against the plane of them
-    assert 'the result: scale by smoother, yaw and pitch unknown' in out
+    # an IMU whose axes are off by half a degree: without turns no pitch against the plane of them
+    assert '(result: scale by smoother, yaw and pitch unknown' in out
     said = ' '.join(out.split())
-    assert 'YAW_NOT_DETERMINED: the drive tells the yaw mounting to' in said
+    assert 'YAW_NOT_DETERMINED: yaw mounting uncertainty is' in said
     assert 'Drive with stops, starts and turns' in said
     answer = asked(capsys, '--gpx', path, '--imu-grade', 'consumer')
     assert answer['estimates']['yaw_mounting_angle'] == {'sigma': None, 'method': None}
     changes = {c['text']: c['yaw_mounting_angle'] for c in answer['changes']}
     assert changes['5 min more, stop and go with turns'] < math.radians(0.05)
     lines = out.splitlines()
-    begin = lines.index('  what would help the yaw most')
+    begin = lines.index('  largest improvements of the yaw')
     assert 'unknown ->' in lines[begin + 1]
 
 
@@ -295,8 +295,8 @@ def test_a_gpx_route_without_times_needs_a_speed(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    (b'no xml at all', 'is no GPX file'), (b'<gpx></gpx>', 'holds 0 track points'),
-    (b'\xff\xfe\x00', 'is no GPX file'), (b'', 'is no GPX file'),
+    (b'no xml at all', 'is not a GPX file'), (b'<gpx></gpx>', 'holds 0 track points'),
+    (b'\xff\xfe\x00', 'is not a GPX file'), (b'', 'is not a GPX file'),
     (b'<gpx><trkpt lat="x" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'not readable'),
     (b'<gpx><trkpt lat="91" lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
     (b'<gpx><trkpt lon="1"/><trkpt lat="1" lon="1"/></gpx>', 'in range'),
@@ -332,19 +332,19 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
 @pytest.mark.parametrize(('argv', 'words'), [
     ([], 'give one drive'),
     (['--scenario', 'paper', '--distance', '5'], 'not --scenario and --distance'),
-    (['--scenario', 'moon'], 'want one of paper'),
+    (['--scenario', 'moon'], 'required: one of paper'),
     (['--scenario', 'paper', '--duration', '10'], 'too short'),
     (['--distance', '500'], '--distance needs --speed'),
     (['--distance', '500', '--speed', '0'], '--speed 0'),
     (['--distance', '0', '--speed', '10'], '--distance 0'),
     (['--distance', '-5', '--speed', '10'], '--distance -5'),
-    (['--distance', '1e9', '--speed', '10'], 'at most'),
+    (['--distance', '1e9', '--speed', '10'], 'the limits are'),
     (['--distance', '500', '--speed', '10', '--standstill', '-1'], '--standstill -1'),
     (['--distance', '500', '--speed', '10', '--acceleration', '0'], '--acceleration 0'),
     (['--distance', '500', '--speed', '10', '--turns', '99'], '--turns 99'),
     (['--distance', '500', '--speed', '10', '--turns', '-1'], '--turns -1'),
-    (['--scenario', 'paper', '--turns', '2'], 'go with --distance'),
-    (['--gpx', 'a.gpx', '--duration', '2'], '--duration goes with --scenario'),
+    (['--scenario', 'paper', '--turns', '2'], 'require --distance'),
+    (['--gpx', 'a.gpx', '--duration', '2'], '--duration requires --scenario'),
     (['--scenario', 'paper', '--fix-sigma', '0'], 'fix sigma 0'),
     (['--scenario', 'paper', '--fix-sigma', '-2'], 'fix sigma -2'),
     (['--scenario', 'paper', '--fix-rate', '0'], 'fix rate 0'),
@@ -355,7 +355,7 @@ def test_a_bag_is_planned_by_its_own_drive_and_fixes(tmp_path, capsys):
     (['--scenario', 'paper', '--pulse', '-1'], 'size of a count -1'),
     (['--scenario', 'paper', '--sway', '-1'], 'sway -1'),
     (['--scenario', 'paper', '--slip-walk', 'nan'], 'slip nan'),
-    (['--scenario', 'paper', '--rtk', '--fix-sigma', '1'], 'give one'),
+    (['--scenario', 'paper', '--rtk', '--fix-sigma', '1'], 'exclude each other'),
     (['--scenario', 'paper', '--set', 'imu.gyro_nois=1'], 'imu.gyro_noise'),
     (['--distance', '4', '--speed', '2', '--standstill', '0', '--fix-rate', '0.1'],
      'less than one fix interval'),

@@ -49,8 +49,8 @@ def test_a_better_one_that_went_is_named(tmp_path, capsys, quiet):
     for said in (not quiet, False):      # the second time a rejected one goes: nothing is lost
         assert replay._report(Calibration(worse), tmp_path, args) == 1
         err = capsys.readouterr().err
-        assert ('a better calibration was replaced, as --force asks: the new one is rejected '
-                '(NO_FIX), the old one is accepted' in err) == said
+        assert ('--force replaced a better calibration: the new result is rejected (NO_FIX), the '
+                'old one is accepted' in err) == said
         assert bool(err) == said
     assert json.loads((tmp_path / 'calibration.json').read_text())['verdict'] == 'rejected'
 

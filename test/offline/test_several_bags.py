@@ -50,8 +50,8 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
     told = capsys.readouterr()
     assert told.out == ''
     line, = told.err.splitlines()
-    assert line.startswith('odocal: 4 of 6 bags cannot be used, nothing was calibrated: ')
-    for name, why in (('nofix', 'no fix (a topic'), ('wheels', '2 topics could be the odometer'),
+    assert line.startswith('odocal: 4 of 6 bags cannot be used; nothing was calibrated: ')
+    for name, why in (('nofix', 'no fix (a topic'), ('wheels', '2 topics can be the odometer'),
                       ('foreign.txt', 'is no bag'), ('nosuch', 'no such file')):
         assert f'{bags / name}: {why}' in line
     assert not (tmp_path / 'out').exists()
@@ -59,7 +59,7 @@ def test_each_bag_that_cannot_be_used_is_named_before_any_is_read(bags, tmp_path
 
 def test_a_leg_asked_for_in_vain_says_of_which_bag(bags, tmp_path, capsys):
     assert replay(bags, ['one', 'other'], tmp_path / 'out', '--leg', '1000:2000') == 2
-    assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 holds nothing' in \
+    assert f'odocal: {bags / "one"}: the leg 1000.00:2000.00 is empty' in \
         capsys.readouterr().err
 
 
@@ -67,7 +67,7 @@ def test_a_counter_and_a_speed_have_no_mean(bags, tmp_path, capsys):
     assert replay(bags, ['one', 'speed'], tmp_path / 'out') == 2
     line, = (x for x in capsys.readouterr().err.splitlines() if x.startswith('odocal: '))
     assert str(bags / 'speed') in line
-    assert 'm per m (a speed), that of the bags before in m/pulse (a counter)' in line
+    assert 'm per m (a speed), that of the previous bags in m/pulse (a counter)' in line
 
 
 def test_two_vehicles_are_rejected(bags, tmp_path, capsys):
@@ -89,7 +89,7 @@ def test_a_truncated_bag_goes_with_a_whole_one(bags, tmp_path, capsys):
 def test_a_bag_given_twice_is_read_once(bags, tmp_path, capsys):
     assert replay(bags, ['one', f'../{bags.name}/one'], tmp_path / 'out', '--json') == 0
     told = capsys.readouterr()
-    assert 'is given twice: it is read once' in told.err
+    assert 'is given twice; it is read once' in told.err
     assert len(json.loads(told.out)['legs']) == 1
 
 
@@ -110,8 +110,8 @@ def test_the_settings_of_the_last_bag_that_is_used_count(bags, tmp_path, capsys,
         result = json.loads(told.out)
         text, = (r['text'] for r in result['reasons'] if r['code'] == 'MORE_LEGS_NEEDED')
         assert text.endswith('of 5' if 'other' in names else 'of 3'), names
-    assert 'verdict.min_legs: not the same in all journals' in said['one other']
-    assert 'are by those of other' in said['one other']
+    assert 'verdict.min_legs: differ between the journals' in said['one other']
+    assert 'use those of other' in said['one other']
     assert 'not the same' not in said['one dropped'] + said['one']
 
 

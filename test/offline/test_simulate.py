@@ -121,7 +121,7 @@ def test_nothing_is_replaced_unasked(tmp_path, capsys):
     assert odocal(*SHORT, '--out', out, '--quiet') == 0
     first = (tmp_path / 'truth.yaml').read_text()
     assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
-    assert 'truth.yaml is there already; give --force' in capsys.readouterr().err
+    assert 'truth.yaml already exists; give --force' in capsys.readouterr().err
     # another bag has a truth of its own beside it, and leaves this one alone
     for _ in range(2):
         assert odocal(*SHORT, '--out', tmp_path / 'other', '--seed', 2, '--force') == 0
@@ -131,7 +131,7 @@ def test_nothing_is_replaced_unasked(tmp_path, capsys):
     (tmp_path / 'truth.yaml').unlink()
     (tmp_path / 'calibrator.yaml').unlink()
     assert odocal(*SHORT, '--out', out, '--seed', 2) == 2
-    assert 'drive is there already; give --force' in capsys.readouterr().err
+    assert 'drive already exists; give --force' in capsys.readouterr().err
     assert not (tmp_path / 'truth.yaml').exists()
     assert odocal(*SHORT, '--out', out, '--seed', 2, '--force', '--quiet') == 0
     assert (tmp_path / 'truth.yaml').read_text() != first
@@ -146,17 +146,18 @@ def test_force_keeps_an_operators_own_settings(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(('asked', 'told'), [
-    (['--scenario', 'moon'], '--scenario moon: want one of paper'),
-    (['--imu-grade', 'best'], '--imu-grade best: want one of'),
+    (['--scenario', 'moon'], '--scenario moon: required: one of paper'),
+    (['--imu-grade', 'best'], '--imu-grade best: required: one of'),
     (['--duration', '5'], 'scenario town: --duration 5 s is too short'),
-    (['--duration', 'nan'], '--duration nan: want a finite number'),
+    (['--duration', 'nan'], '--duration nan: required: a finite number'),
     (['--imu-rate', 'fast'], "invalid float value: 'fast'"),
-    (['--outage', '5'], '5: want A:B, two numbers of seconds'),
-    (['--outage', '9:5'], '--outage 9:5: want A:B'),
-    (['--pitch-deg', '90'], '--pitch-deg 90: want at most 45'),
-    (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: want 0 to 180'),
-    (['--storage', 'tape'], '--storage tape: want one of mcap'),
-    (['--storage', 'sqlite3', '--compression', 'storage'], 'is not there for --storage sqlite3'),
+    (['--outage', '5'], '5: required: A:B, two numbers of seconds'),
+    (['--outage', '9:5'], '--outage 9:5: required: A:B'),
+    (['--pitch-deg', '90'], '--pitch-deg 90: the limit is 45'),
+    (['--known-heading-sigma-deg', '-1'], '--known-heading-sigma-deg -1: required: 0 to 180'),
+    (['--storage', 'tape'], '--storage tape: required: one of mcap'),
+    (['--storage', 'sqlite3', '--compression', 'storage'], 'is not available for --storage '
+     'sqlite3'),
     (['--frobnicate'], 'unrecognized arguments: --frobnicate')])
 def test_wrong_usage_is_one_line_and_exit_2(tmp_path, capsys, asked, told):
     assert odocal(*SHORT, '--out', tmp_path / 'drive', *asked) == 2
@@ -205,12 +206,12 @@ def test_one_effect_or_one_figure_comes_alone(tmp_path):
 
 
 @pytest.mark.parametrize(('words', 'told'), [
-    (['--real', 'squad=1'], 'no such figure; near: squat'),
-    (['--real', 'squat'], 'want finite numbers'),
-    (['--effect', 'rust'], '--effect rust: want one of triads'),
-    (['--vehicle', 'real', '--odometer', 'speed'], 'has an odometer of its own'),
-    (['--vehicle', 'clean', '--effect', 'squat'], 'leave one of them away'),
-    (['--vehicle', 'real', '--imu-grade', 'navigation'], 'want one of consumer')])
+    (['--real', 'squad=1'], 'no such parameter; similar: squat'),
+    (['--real', 'squat'], 'required: finite numbers'),
+    (['--effect', 'rust'], '--effect rust: required: one of triads'),
+    (['--vehicle', 'real', '--odometer', 'speed'], 'has its own odometer'),
+    (['--vehicle', 'clean', '--effect', 'squat'], 'omit one of them'),
+    (['--vehicle', 'real', '--imu-grade', 'navigation'], 'required: one of consumer')])
 def test_a_vehicle_that_cannot_be_drawn_is_said(tmp_path, capsys, words, told):
     assert odocal(*SHORT, '--out', tmp_path / 'drive', *words) == 2
     assert told in capsys.readouterr().err

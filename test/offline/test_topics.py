@@ -43,11 +43,10 @@ def test_one_of_each():
 
 
 def test_several_are_listed_with_their_option():
-    with pytest.raises(BadUsage, match=r'3 topics could be the odometer: name one with '
-                       r'--odometer-topic of /odometer \(std_msgs/msg/Int64\), /speed'):
+    with pytest.raises(BadUsage, match=r'3 topics can be the odometer; choose one with '
+                       r'--odometer-topic: /odometer \(std_msgs/msg/Int64\), /speed'):
         choose(topics(speed=TWIST, wheels='sensor_msgs/msg/JointState'))
-    with pytest.raises(BadUsage, match='could be the Imu.*--imu-topic.*could be the fix.*'
-                       '--fix-topic'):
+    with pytest.raises(BadUsage, match='can be the IMU.*--imu-topic.*can be the fix.*--fix-topic'):
         choose(topics(imu__raw=IMU, phone=FIX))       # all at once
     assert choose(topics(speed=TWIST), {'odometer': 'speed'})['odometer'] == '/speed'
     assert choose(topics(speed=TWIST), odometer__type=TWIST)['odometer'] == '/speed'
@@ -55,18 +54,19 @@ def test_several_are_listed_with_their_option():
 
 
 def test_missing_lists_what_there_is():
-    with pytest.raises(BadUsage, match=r'no Imu \(a topic of sensor_msgs/msg/Imu\) in the bag; '
+    with pytest.raises(BadUsage, match=r'no IMU \(a topic of sensor_msgs/msg/Imu\) in the bag; '
                        r'the bag has /odometer \(std_msgs/msg/Int64\), /fix'):
         choose(topics(imu__data=None))
     with pytest.raises(BadUsage, match='--fix-topic /gps: no such topic; the bag has /imu/data'):
         choose(topics(), {'fix': '/gps'})
     # not as if the others were missing, which it would be taken from
-    with pytest.raises(BadUsage, match='^--imu-topic /fix: the topic is of sensor_msgs/msg/'
-                       'NavSatFix, which cannot be the Imu; the bag has /imu/data'):
+    with pytest.raises(BadUsage, match='^--imu-topic /fix: the topic is of '
+                       'sensor_msgs/msg/NavSatFix, which cannot be used as IMU; the bag has '
+                       '/imu/data'):
         choose(topics(), {'imu': '/fix'})
     for slot, topic in (('odometer', '/imu/data'), ('odometer_right', '/fix'),
                         ('fix', '/odometer'), ('heading', '/fix'), ('fix_velocity', '/odometer')):
-        with pytest.raises(BadUsage, match='which cannot be the '):
+        with pytest.raises(BadUsage, match='which cannot be used as '):
             choose(topics(), {slot: topic})
     foreign = topics(ticks='my_msgs/msg/Ticks')
     assert choose(foreign, {'odometer': '/ticks'})['odometer'] == '/ticks'
@@ -120,9 +120,9 @@ def test_heading():
     with pytest.raises(BadUsage, match='no heading'):
         choose(topics(imu__data=None, imu=IMU), {'imu': '/imu'},
                alignment__heading_source='heading_topic')
-    with pytest.raises(BadUsage, match=r'^no heading \(a topic of sensor_msgs/msg/Imu beside '
-                       r'that of the Imu\) in the bag; the bag has /imu/data'):
-        choose(topics(), alignment__heading_source='heading_topic')      # the Imu is there
+    with pytest.raises(BadUsage, match=r'^no heading \(a topic of sensor_msgs/msg/Imu besides '
+                       r'the IMU\) in the bag; the bag has /imu/data'):
+        choose(topics(), alignment__heading_source='heading_topic')      # the IMU is there
     assert choose(topics(other=IMU), {'heading': 'other'})['imu'] == '/imu/data'
 
 

@@ -86,9 +86,9 @@ def test_a_person_at_a_terminal_is_asked(bag, asked, monkeypatch, capsys):
     at_a_terminal(monkeypatch, 'x\n3\n2\n')
     assert main(['try', bag, '--no-browser']) == 0
     out = capsys.readouterr().out
-    assert '2 topics could be the odometer:\n  1  /odometer  std_msgs/msg/Int64, ' in out
+    assert '2 candidate topics for the odometer:\n  1  /odometer  std_msgs/msg/Int64, ' in out
     assert out.count('enter a number from 1 to 2') == 2
-    assert 'odometer: /wheel/ticks, because you chose it' in out
+    assert 'odometer: /wheel/ticks, because you selected it' in out
     assert asked[0].odometer_topic == '/wheel/ticks'
     at_a_terminal(monkeypatch, '\n')
     assert main(['try', bag, '--no-browser', '--force']) == 0
@@ -111,7 +111,7 @@ def test_what_the_user_asks_goes_on_to_the_replay(bag, tmp_path, capsys):
     assert content['legs'][0]['stop'] - content['legs'][0]['start'] == pytest.approx(190, abs=0.1)
     capsys.readouterr()
     assert main(['try', bag, '--output', 'out']) == 2
-    assert 'is there already; give --force' in capsys.readouterr().err
+    assert 'already exists; give --force' in capsys.readouterr().err
 
 
 def test_the_report_opens_where_there_is_a_display(bag, asked, tmp_path, monkeypatch, capsys):
@@ -121,7 +121,7 @@ def test_the_report_opens_where_there_is_a_display(bag, asked, tmp_path, monkeyp
     for name in ('DISPLAY', 'WAYLAND_DISPLAY', 'BROWSER'):
         monkeypatch.delenv(name, raising=False)
     assert main(['try', bag]) == 0
-    assert f'no browser could be started: open {report}' in capsys.readouterr().out
+    assert f'no browser can be started; open {report}' in capsys.readouterr().out
     monkeypatch.setenv('DISPLAY', ':0')
     assert main(['try', bag, '--force', '--no-browser']) == 0
     assert not opened

@@ -55,16 +55,16 @@ def test_unnamed_joints_are_told_apart_by_how_they_move(tmp_path, capsys):
     told, wheels, text = inspect(path, capsys)
     assert [v['side'] for v in wheels['values']] == ['', 'right', 'left']
     assert [v['rolls'] for v in wheels['values']] == [False, True, True]
-    assert 'which of the joints j1, j2, j3 are the wheels is not clear' in wheels['trouble']
+    assert 'the wheels among the joints j1, j2, j3 are not clear' in wheels['trouble']
     assert told['command'].endswith('--set odometer.left=j3 --set odometer.right=j2')
-    assert 'j1 moves' in text
+    assert 'j1 travels' in text
 
 
 def test_the_sides_of_two_counters_are_told_and_their_replay_runs(tmp_path, capsys):
     path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.whole_array(
         [int(right * 50), int(left * 50)])))
     told, wheels, text = inspect(path, capsys)
-    assert 'the mean of 0 and 1 is taken' in wheels['chosen']
+    assert 'the mean of 0 and 1 is used' in wheels['chosen']
     options = ['--set', 'odometer.left=1', '--set', 'odometer.right=0']
     assert told['command'].split()[-4:] == options
     assert main(['replay', str(path), *options, '--output', str(tmp_path / 'out'), '--json']) < 2
@@ -78,7 +78,7 @@ def test_wheels_told_by_their_names_are_shown_with_the_settings_to_write(tmp_pat
     path = ros_bags.write(tmp_path / 'bag', drive(lambda ns, i, left, right: make.joints(
         ns, names, velocity=[0.1, left, 0.1, right])))
     told, wheels, _ = inspect(path, capsys)
-    assert 'left_wheel is taken for the left wheel and right_wheel for the right' in \
+    assert 'left_wheel is used as left wheel, right_wheel as right' in \
         wheels['chosen']
     assert told['command'].endswith(
         '--set odometer.left=left_wheel --set odometer.right=right_wheel')

@@ -24,7 +24,7 @@ from odocal_ros.calib.result import (
 )
 from odocal_ros.reasons import Code, Reason
 
-PITCH_LOST = Reason(Code.PITCH_NOT_DETERMINED, 'the fixes give no height')
+PITCH_LOST = Reason(Code.PITCH_NOT_DETERMINED, 'the heights of the fixes are too inaccurate')
 GAP = Reason(Code.TOPIC_GAP, 'odometer gap of 1.2 s at t = 3.1 s')
 START_NS = 1_533_200_000_500_000_000        # 2018-08-02 08:53:20.5 UTC
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])    # Rz(-90 deg)

@@ -32,8 +32,8 @@ def test_json_has_the_fixed_shape(good):
     assert content['software'] == f'odocal_ros {__version__}'
     assert content['verdict'] == 'accepted'
     assert content['reasons'][1] == {
-        'code': 'PITCH_NOT_DETERMINED', 'text': 'the fixes give no height',
-        'remedy': 'Use a receiver that gives ellipsoidal height.'}
+        'code': 'PITCH_NOT_DETERMINED', 'text': 'the heights of the fixes are too inaccurate',
+        'remedy': 'Use a receiver that publishes ellipsoidal height.'}
     assert content['result']['scale_factor'] == {
         'value': 0.05, 'sigma': 1.2e-6, 'unit': 'm/pulse', 'method': 'two_point'}
     assert content['result']['imu_rotation'] == {

@@ -34,7 +34,7 @@ from odocal_ros.settings.config import Config, with_settings
 CREATED, MADE = '2026-01-02T03:04:05+00:00', '2026-01-02 03:04:05 UTC'
 INPUTS = [{'bag': 'drive', 'sha256': 'ab' * 32, 'topics': {'imu': '/imu/data'}}]
 VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
-ALL_ODD = ('fix not used', 'no Imu', 'no odometer', 'fitted to here', 'slip')
+ALL_ODD = ('fix not used', 'no IMU', 'no odometer', 'fitted to here', 'slip')
 FIGURES = ('Track', 'Residuals', 'Scale by section', 'Speed and turn rate', 'Fix quality')
 
 
@@ -129,15 +129,15 @@ def page_of(calibration, config=None, inputs=INPUTS):
 
 def test_a_leg_is_told_whole(good):
     page, text, parsed = page_of(drawn(good))
-    assert 'accepted : fit for use; scale factor 0.0500000 ± 0.0000012 m/pulse' in text
+    assert 'accepted : ready to use; scale factor 0.0500000 ± 0.0000012 m/pulse' in text
     for part in ('20.00000 ± 0.00048 pulses/m', '24 ppm', '+250000 ± 30 ppm',
                  '-1.0000 ± 0.0029 deg', '-0.017453 ± 0.000050 rad', 'not determined',
-                 'TOPIC_GAP', 'odometer gap of 1.2 s', 'Mend the stream',
+                 'TOPIC_GAP', 'odometer gap of 1.2 s', 'Fix the data stream',
                  '1500 m', '0.10 m', '2018-08-02 08:53:20 UTC', 'ab' * 32, '/imu/data',
                  '1 of 202 fixes status below 0; first at t = 7.0 s', MADE, *FIGURES):
         assert part in text, part
     assert parsed.tags['svg'] == parsed.tags['figure'] == 5
-    for words in ('east of the start, km', 'along, m', 'scale less result, ppm', 'speed, km/h',
+    for words in ('east of the start, km', 'along, m', 'scale minus result, ppm', 'speed, km/h',
                   'turn rate, deg/s', 'sigma of a fix, m', 'distance driven, km'):
         assert words in text, words
 
@@ -181,7 +181,7 @@ def test_the_method_that_gave_the_result_comes_first(good):
 
 def test_each_panel_of_the_comparison_has_the_rows_that_have_a_value(good):
     page, _, _ = page_of(three_methods(good))
-    (panels,) = re.findall(r'<svg[^>]*aria-label="Each bar.*?</svg>', page, re.DOTALL)
+    (panels,) = re.findall(r'<svg[^>]*aria-label="Bars: one sigma.*?</svg>', page, re.DOTALL)
     # scale: three methods, of all and of two legs; yaw: not by the wheels
     assert len(re.findall('>leg [12], wheels<', panels)) == 2
     assert len(re.findall('>leg [12], smoother<', panels)) == 4
@@ -193,7 +193,7 @@ def test_what_is_rejected_or_missing_renders_too(rejected, nothing, good):
     assert text.index('GYRO_SIGN') < text.index('TOPIC_GAP')
     _, text, _ = page_of(nothing, inputs=[])
     assert 'NO_FIX' in text
-    assert 'No figures of this leg' in text
+    assert 'No figures for this leg' in text
     broken = replace(good, estimates=good.estimates | {
         'scale_factor': Estimate(math.nan, math.nan, 'm/pulse'),
         'yaw_mounting_angle': Estimate(0.0, math.nan, 'rad'),
@@ -229,7 +229,7 @@ def test_what_is_odd_is_marked_on_the_track(good):
         with look():
             return unescape(leg_figures(found, 'one', smoothed=smoothed)[0][2])
     plain = evidence()
-    odd = replace(plain, gaps=(('Imu', 100.0, 103.0), ('odometer', 200.0, 201.0),
+    odd = replace(plain, gaps=(('IMU', 100.0, 103.0), ('odometer', 200.0, 201.0),
                                ('odometer', 300.0, 300.5)), t_fit=480.0)
     assert {text: words(odd).count(f'>{text}<') for text in ALL_ODD} == dict.fromkeys(ALL_ODD, 1)
     assert [text for text in ALL_ODD if f'>{text}<' in words(plain)] == ['fix not used', 'slip']
@@ -248,7 +248,7 @@ def test_many_legs_stay_within_the_size(good, monkeypatch):
     leg = replace(good.legs[0], evidence=evidence())
     legs = tuple(replace(leg, start_ns=leg.start_ns + k * 10**12) for k in range(3))
     _, text, _ = page_of(replace(good, legs=legs))
-    assert 'No figures here of legs 1, 2, to keep the page small' in text
+    assert 'figures of the newest legs only, none of legs 1, 2.' in text
     # one alone is shown however large it is: the newest
     monkeypatch.setattr(report, 'MOST_BYTES', 10)
     told, _, missing = report._drawn(replace(good, legs=legs))
@@ -295,7 +295,7 @@ def test_a_report_that_fails_costs_no_number(good, tmp_path, monkeypatch, error)
     write_results(good, Config(), tmp_path, INPUTS, CREATED, tell=told.append)
     assert (tmp_path / 'calibration.json').exists()
     assert len(told) == 1
-    assert 'report.html: not drawn' in told[0]
+    assert 'report.html: could not be drawn' in told[0]
     page, why = report_or_why(good, Config(), {})
     assert 'calibration.json' in page
     assert '<odd>' not in page
@@ -365,5 +365,5 @@ def test_a_leg_without_tracks_has_its_numbers(good):
     assert isinstance(bare, LegResult)
     _, text, parsed = page_of(replace(good, legs=(bare,)))
     assert parsed.tags['svg'] == 0
-    assert 'No figures of this leg' in text
+    assert 'No figures for this leg' in text
     assert '4 fixes see the reasons' in text

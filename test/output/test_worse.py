@@ -42,7 +42,7 @@ def later(calibration, **estimates):
 
 
 def test_a_rejected_one_is_worse_than_any_good_one(why, good, rejected):
-    assert why(good, later(rejected)).startswith('the new one is rejected (')
+    assert why(good, later(rejected)).startswith('the new result is rejected (')
     assert 'GYRO_SIGN' in why(good, later(rejected))
     assert why(good, rejected)        # of the same drive too
 
@@ -57,12 +57,12 @@ def test_a_sigma_twice_as_large_is_worse(why, good, name, factor, worse):
     old = good.estimates[name]
     said = why(good, later(good, **{name: replace(old, sigma=old.sigma * factor)}))
     assert bool(said) == worse
-    assert not worse or f'{name.replace("_", " ")} is 2.1 times less certain' in said
+    assert not worse or f'{name.replace("_", " ")} is 2.1 times larger' in said
 
 
 def test_a_value_lost_is_worse_and_one_gained_is_not(why, good):
     lost = later(good, yaw_mounting_angle=Estimate(None, None, 'rad'))
-    assert why(good, lost) == ('the new one has no yaw mounting angle, the old one has '
+    assert why(good, lost) == ('the new result has no yaw mounting angle, the old one has '
                                '-1.0000 ± 0.0029 deg')
     assert why(lost, later(later(good))) == ''
 

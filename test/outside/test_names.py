@@ -90,7 +90,7 @@ def test_a_setting_that_is_no_frame_is_refused(name, frame):
 @pytest.mark.parametrize('name', ['odometer.field', 'odometer.left', 'output.directory'])
 def test_text_that_cannot_be_seen_is_no_setting(name):
     for text in ('a\nb', 'a\x1b[2J', 'a\x00', 'a\udcff', 'a\u202eb'):
-        with pytest.raises(BadConfig, match='cannot be seen'):
+        with pytest.raises(BadConfig, match='invisible characters'):
             with_settings(Config(), {name: text})
     assert with_settings(Config(), {name: "ü $(x) 'y'"})
 

@@ -36,7 +36,7 @@ def sent(drive, form=COUNTER, imu_gap=(0, 0), only_counts=False):
     """
     Return slot -> rows of a drive: a list of (seconds, m/s), 50 counts a metre.
 
-    imu_gap : s in which the Imu is silent.   only_counts : a row only where there is a new count.
+    imu_gap : s in which the IMU is silent.   only_counts : a row only where there is a new count.
     """
     ends = np.cumsum([length for length, _ in drive])
     t = np.arange(0.01, ends[-1], 0.05)

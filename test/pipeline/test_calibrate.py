@@ -85,7 +85,7 @@ def test_speeds_that_are_said_are_by_the_calibrated_scale(town):
     result = calibrate(leg, settings(town, heading_sigma=None, method='smoother',
                                      leg__min_speed=50.0, gnss__max_sigma=0.0))
     text, = (r.text for r in result.reasons if r.code is Code.SPEED_TOO_LOW)
-    said = float(text.split('the fastest second was ')[1].split(' m/s')[0])
+    said = float(text.split('highest speed (mean over 1 s) ')[1].split(' m/s')[0])
     t = (town.odometer.stamp_ns - town.odometer.stamp_ns[0]) * 1e-9
     way = town.odometer.value * town.truth.scale
     fastest = (np.interp(t + 0.5, t, way) - np.interp(t - 0.5, t, way))[20:-20].max()
@@ -182,7 +182,7 @@ def test_sigmas_are_honest_over_many_drives(grade, noise):
         error = 1e-3 * np.random.default_rng(seed).standard_normal()
         config = with_settings(settings(made), {
             'alignment.heading': float(made.truth.heading + error), 'verdict.max_yaw_sigma': 1.0,
-            'imu.misalignment_sigma': 0.0})      # the axes of this Imu are square
+            'imu.misalignment_sigma': 0.0})      # the axes of this IMU are square
         z.append(list(errors_in_sigmas(calibrate(made.leg(), config), made.truth).values()))
     z = np.array(z)
     assert z.shape == (runs, 3)

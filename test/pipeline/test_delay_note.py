@@ -23,8 +23,8 @@ from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config
 
 ROUTE = {'scenario': 'town', 'duration': 180.0, 'seed': 6, 'two_wheels': True}
-SAID = re.compile(r'stamps of the (\w+) are ([\d.]+) s \(\+-([\d.]+) s\) (late|early).*? '
-                  r'(gnss|odometer)\.time_offset = (-?[\d.]+)')
+SAID = re.compile(r'(\w+) stamps are ([\d.]+) s \(\+-([\d.]+) s\) (late|early).*? '
+                  r'set (gnss|odometer)\.time_offset to (-?[\d.]+)')
 
 
 def said(made, method, **changes):
@@ -41,7 +41,7 @@ def said(made, method, **changes):
 def test_late_and_early_fixes_are_said(late):
     made = drive(**ROUTE, fix_delay=late)
     what, size, sigma, name, offset = said(made, 'smoother')
-    assert (what, name) == ('fixes', 'gnss')
+    assert (what, name) == ('fix', 'gnss')
     # a belief of 50 ms (gnss.time_sigma) pulls it towards none by (sigma / prior)^2 of itself
     pull = abs(late) * (sigma / 0.05)**2
     assert abs(size - late) < 4 * sigma + pull + 0.001

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A leg cut where the Imu was silent: its parts tell what a leg without the gap would."""
+"""A leg cut where the IMU was silent: its parts tell what a leg without the gap would."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def made():
 
 
 def silent(leg, *gaps):
-    """Return the leg with no Imu rows within some spans, s since the start mark."""
+    """Return the leg with no IMU rows within some spans, s since the start mark."""
     t, keep = seconds(leg, leg.imu), np.ones(len(leg.imu.stamp_ns), bool)
     for begin, end in gaps:
         keep &= (t < begin) | (t >= end)
@@ -56,7 +56,7 @@ def test_a_leg_is_cut_at_each_gap_and_nowhere_else(made):
     stop = (leg.stop_ns - leg.start_ns) * 1e-9
     assert parts_of(leg, 0.5) == [leg]
     assert of(leg, (50.0, 50.4)) == [(0.0, stop)]
-    row = 0.0201      # s, of the Imu
+    row = 0.0201      # s, of the IMU
     assert of(leg, (50.0, 53.0), (120.0, 121.0)) == [
         (0.0, pytest.approx(50.0, abs=row)), (pytest.approx(53.0, abs=row),
                                               pytest.approx(120.0, abs=row)),
@@ -84,7 +84,7 @@ def test_the_parts_of_a_leg_with_a_gap_are_combined(made):
     whole = combine(results, config)
     assert whole.verdict is Verdict.ACCEPTED
     assert [r.text for r in whole.reasons if r.code is Code.LEG_CUT][0].startswith(
-        'leg 1: this is the leg from 0.0 to 200.0 s')
+        'leg 1: this section covers 0.0 to 200.0 s')
     truth = made.truth
     for name, true in ((SCALE, truth.scale), (YAW, truth.yaw), (PITCH, truth.pitch)):
         e = whole.estimates[name]

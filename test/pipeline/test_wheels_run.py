@@ -198,7 +198,7 @@ def test_a_track_width_given_wrong_is_said(made):
     given = 1.1 * made.options.track_width
     leg = calibrate(made.leg(), settings(made, odometer__track_width=given))
     text = everything_said(leg)[Code.TRACK_WIDTH_FAR_FROM_GIVEN]
-    assert f'odometer.track_width says {given:.4g} m' in text
+    assert f'odometer.track_width is {given:.4g} m' in text
     near = calibrate(made.leg(), settings(made, odometer__track_width=made.options.track_width))
     assert Code.TRACK_WIDTH_FAR_FROM_GIVEN not in everything_said(near)
 

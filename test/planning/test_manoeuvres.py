@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from odocal_ros.planning.drive import from_rates
-from odocal_ros.planning.manoeuvres import stop_and_start, town_driving, turns_both_ways
+from odocal_ros.planning.manoeuvres import left_and_right_turns, stop_and_start, town_driving
 
 
 def straight(rest=30.0):
@@ -36,7 +36,7 @@ def test_a_stop_on_the_way_adds_its_braking_and_its_rest():
 
 def test_turns_both_ways_lead_back_to_the_direction_they_began_with():
     drive = straight()
-    changed = turns_both_ways(drive)
+    changed = left_and_right_turns(drive)
     assert changed.yaw[-1] == pytest.approx(drive.yaw[-1])
     assert np.ptp(changed.yaw) == pytest.approx(np.pi / 2)
     assert changed.yaw.max() > drive.yaw[0] + 1.5           # first to the left

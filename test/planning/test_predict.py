@@ -279,7 +279,7 @@ def test_impossible_drives_are_refused():
         from_rates(t, np.zeros_like(t), np.zeros_like(t))
     with pytest.raises(BadUsage, match='not finite'):
         PlannedDrive(t, np.full_like(t, np.nan), t, t)
-    with pytest.raises(BadUsage, match='later than the last'):
+    with pytest.raises(BadUsage, match='increasing times'):
         PlannedDrive(t[::-1], t, t, t)
     with pytest.raises(BadUsage, match='one speed, yaw and slope for each time'):
         PlannedDrive(t, t[1:], t, t)

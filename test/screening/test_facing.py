@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Where the Imu faces, seen in how speeding up pushes it; what a leg says when it is far off."""
+"""Where the IMU faces, seen in how speeding up pushes it; what a leg says when it is far off."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
         assert axes_reasons(Facing(yaw * DEG, 1 * DEG), np.nan) == ()
     left, = axes_reasons(Facing(-90 * DEG, 1 * DEG), np.nan)
     assert left.code is Code.IMU_AXES
-    assert 'pushes the Imu to the left (yaw mounting -90 deg, +-1)' in left.text
+    assert 'to the left in the IMU frame (yaw mounting -90 deg, +-1)' in left.text
     right, = axes_reasons(Facing(90 * DEG, 1 * DEG), np.nan)
     assert 'to the right' in right.text
     back, = axes_reasons(Facing(-179 * DEG, 1 * DEG), np.nan)
@@ -77,10 +77,10 @@ def test_what_is_far_off_is_said_by_its_side_and_size():
     # said as it is seen, whatever the nominal
     ahead, = axes_reasons(Facing(0.0, 1 * DEG), np.pi)
     assert ahead.code is Code.ODOMETER_REVERSED
-    assert 'pushes the Imu forwards (yaw mounting +0 deg, +-1, nominal +180)' in ahead.text
+    assert 'forwards in the IMU frame (yaw mounting +0 deg, +-1, nominal +180)' in ahead.text
     ahead, = axes_reasons(Facing(0.0, 1 * DEG), 90 * DEG)
     assert ahead.code is Code.IMU_AXES
-    assert 'pushes the Imu forwards' in ahead.text
+    assert 'accelerations point forwards' in ahead.text
 
 
 def test_only_a_far_forward_axis_is_turned():
@@ -111,7 +111,7 @@ def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
     assert Code.YAW_FAR_FROM_NOMINAL in said
     yaw = result.methods['smoother'].estimates['yaw_mounting_angle']
     assert abs(yaw.value - made.truth.yaw) < 4 * yaw.sigma
-    # an Imu that faces backwards, and is said to
+    # an IMU that faces backwards, and is said to
     made = town(180.0)
     result = calibrate(made.leg(), settings(made, heading_sigma=None, method='auto',
                                             imu__nominal_yaw=np.pi))
@@ -121,7 +121,7 @@ def test_an_imu_turned_on_purpose_is_calibrated_and_no_wheel_slips():
 
 
 def test_driven_backwards_all_along_by_a_counter_that_counts_down():
-    """The counter of a vehicle that reverses, Imu turned half: it is pushed as the counts say."""
+    """The counter of a vehicle that reverses, IMU turned half: it is pushed as the counts say."""
     made = town(180.0)
     leg = made.leg()
     backwards = replace(leg, odometer=changed(leg.odometer, value=lambda n: 20_000 - n))

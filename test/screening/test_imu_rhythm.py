@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Imu rows on their rhythm: jitter of the stamps goes, uneven sampling stays."""
+"""IMU rows on their rhythm: jitter of the stamps goes, uneven sampling stays."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ JITTER = 1e-3
 
 
 def signals(t, rng, vibration=1.0, noise=0.01):
-    """Return rates and forces of an Imu that shakes at 12 Hz, taken at times: (n, 3) each."""
+    """Return rates and forces of an IMU that shakes at 12 Hz, taken at times: (n, 3) each."""
     phases = rng.uniform(0, 2 * np.pi, 6)
     x = vibration * np.sin(2 * np.pi * 12.0 * t[:, None] + phases)
     x = x + noise * rng.standard_normal(x.shape)

@@ -37,14 +37,14 @@ def told(leg, config):
 @pytest.mark.parametrize('kind', [
     {}, {'two_wheels': True}, {'odometer': 'speed', 'speed_noise': 0.05},
     {'slope': 0.05, 'imu_grade': 'consumer'}, {'yaw': np.pi, 'imu_grade': 'consumer'}],
-    ids=['counts', 'two wheels', 'speed', 'hills', 'Imu facing back'])
+    ids=['counts', 'two wheels', 'speed', 'hills', 'IMU facing back'])
 def test_a_counter_that_counts_up_in_reverse_is_seen_off_the_stop(route, kind):
     drive_ = made(ROUTES[route], **kind)
     leg = drive_.leg()
     assert Code.REVERSING_UNSIGNED not in told(leg, settings(drive_))
     text = told(without_direction(leg), settings(drive_))[Code.REVERSING_UNSIGNED]
     times = '2 times' if route == 'three point turn' else '1 time'
-    assert text.startswith(f'{times} the Imu is pushed the other way')
+    assert text.startswith(f'{times} the acceleration has the opposite sign')
     # how far: to a tenth, by a rough scale and the blur of its ends
     metres = sum(float(m) for m in re.findall(r', ([\d.]+) m', text))
     assert metres == pytest.approx(METRES[route], rel=0.1, abs=0.5)
@@ -100,7 +100,7 @@ def test_no_drive_forward_is_taken_for_it(scenario, seed):
 
 def starts(speeds, nose=None, noise=0.0):
     """
-    Return travel, Imu times, turn rates and forces of runs of 10 s with stops of 4 s between.
+    Return travel, IMU times, turn rates and forces of runs of 10 s with stops of 4 s between.
 
     speeds : m/s at the top of each.   nose : gravity along x by the nose's rise, in parts of the
     acceleration.

@@ -59,17 +59,17 @@ def test_a_clean_leg_is_used_to_the_last_row(leg):
 
 
 @pytest.mark.parametrize(('slot', 'column', 'label'), [
-    ('imu', 'w_i', 'Imu'), ('imu', 'f_i', 'Imu'), ('fix', 'latitude', 'fix')])
+    ('imu', 'w_i', 'IMU'), ('imu', 'f_i', 'IMU'), ('fix', 'latitude', 'fix')])
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, 1e200])
 def test_rows_that_hold_no_number_are_dropped_and_counted(leg, slot, column, label, value):
     bad = changed(getattr(leg, slot), **{column: lambda a: a.__setitem__(slice(40, 43), value)})
     inputs, _, texts = said(replace(leg, **{slot: bad}))
     t = seconds(leg, bad)[40]
     if slot == 'fix' and value == 1e200:
-        assert texts == [f'3 of {len(bad.stamp_ns)} fixes are not used: 3 at no real position']
+        assert texts == [f'3 of {len(bad.stamp_ns)} fixes are not used: 3 at an invalid position']
     else:
-        assert texts == [f'3 of {len(bad.stamp_ns)} {label} messages hold NaN, Inf or a value '
-                         f'beyond any sensor, first at t = {t:.2f} s; dropped']
+        assert texts == [f'3 of {len(bad.stamp_ns)} {label} messages hold NaN, Inf or an '
+                         f'impossible value, first at t = {t:.2f} s; dropped']
     kept = inputs.t_imu if slot == 'imu' else inputs.t_fix
     assert len(kept) == len(bad.stamp_ns) - 3
     assert np.isfinite(inputs.w_b).all()
@@ -91,7 +91,7 @@ def test_one_stamp_in_the_future_costs_one_row(leg):
     inputs, codes, _ = said(replace(leg, imu=bad))
     assert len(inputs.t_imu) == len(bad.stamp_ns) - 1
     assert '1 of' in codes[Code.STAMPS_NOT_RISING]
-    assert 'step back' in codes[Code.STAMPS_NOT_RISING]
+    assert 'backward step' in codes[Code.STAMPS_NOT_RISING]
     assert Code.CLOCKS_DIFFER not in codes
 
 
@@ -102,7 +102,7 @@ def test_a_clock_set_back_costs_the_shorter_side_and_is_named(leg):
     # two seconds of stamps come twice: 100 rows of 50 Hz, those of one side
     assert n - len(inputs.t_imu) == 100
     assert (np.diff(inputs.t_imu) > 0).all()
-    assert sum('the Imu clock was set by -2.000 s during the leg' in x for x in texts) == 1
+    assert sum('the IMU clock was set by -2.000 s during the leg' in x for x in texts) == 1
 
 
 def test_rows_out_of_order_are_no_clock_that_was_set(leg):
@@ -132,7 +132,7 @@ def test_messages_that_queue_and_arrive_at_once_are_no_clock_that_differs(leg):
     slots = {slot: queued(getattr(leg, slot)) for slot in ('imu', 'odometer', 'fix')}
     assert Code.CLOCKS_DIFFER not in said(replace(leg, **slots))[1]
     slots['fix'] = replace(slots['fix'], stamp_ns=slots['fix'].stamp_ns + 700_000_000)
-    assert 'the fix stamps are +0.7' in said(replace(leg, **slots))[1][Code.CLOCKS_DIFFER]
+    assert 'fix stamps are +0.7' in said(replace(leg, **slots))[1][Code.CLOCKS_DIFFER]
 
 
 @pytest.mark.parametrize(('slot', 'setting'), [('odometer', 'odometer.time_offset'),
@@ -203,10 +203,10 @@ def test_fixes_without_a_fix_are_left_out_nan_or_not(leg):
 
 
 @pytest.mark.parametrize(('columns', 'text'), [
-    ({'latitude': 0.0, 'longitude': 0.0}, '4 at no real position'),
-    ({'latitude': 2.0}, '4 at no real position'),
-    ({'longitude': 1.0}, '4 at no real position'),      # half a world from the others
-    ({'height': 1e6}, '4 at no real position'),
+    ({'latitude': 0.0, 'longitude': 0.0}, '4 at an invalid position'),
+    ({'latitude': 2.0}, '4 at an invalid position'),
+    ({'longitude': 1.0}, '4 at an invalid position'),      # half a world from the others
+    ({'height': 1e6}, '4 at an invalid position'),
     ({'status': -1}, '4 with status below 0')])
 def test_fixes_at_no_real_place_are_left_out(leg, columns, text):
     bad = changed(leg.fix, **{k: lambda a, v=v: a.__setitem__(slice(70, 74), v)
@@ -227,7 +227,7 @@ def test_an_unknown_covariance_is_taken_from_the_settings_and_said(leg, how):
     inputs, codes, _ = said(replace(leg, fix=bad),
                             with_settings(Config(), {'gnss.default_sigma': 4.0}))
     assert codes[Code.COVARIANCE_UNKNOWN] == (
-        f'{n} of {n} fixes come without a usable covariance; taken as 4 m (gnss.default_sigma)')
+        f'{n} of {n} fixes have no usable covariance; 4 m (gnss.default_sigma) is used')
     np.testing.assert_array_equal(inputs.covariance_n[5], np.diag([16.0, 16.0, 64.0]))
     assert len(inputs.t_fix) == n         # unknown is not above gnss.max_sigma
 
@@ -266,7 +266,7 @@ def test_a_burst_of_false_rates_is_left_out(leg, length, size):
     bad = changed(leg.imu, w_i=lambda a: a.__setitem__((rows, 2), size))
     inputs, codes, _ = said(replace(leg, imu=bad))
     assert f'{length} of' in codes[Code.BAD_ROWS_DROPPED]
-    assert 'stand alone' in codes[Code.BAD_ROWS_DROPPED]
+    assert 'isolated outliers' in codes[Code.BAD_ROWS_DROPPED]
     assert np.abs(inputs.w_b).max() < 0.1
 
 
@@ -326,7 +326,7 @@ class TestOdometerCare:
         assert Code.COUNTER_RESET not in codes
         true = self.travelled(leg)
         assert inputs.travel.s[-1] == true.s[-1]
-        assert 'hang or jump away' in codes[Code.BAD_ROWS_DROPPED]
+        assert 'freeze or jump away' in codes[Code.BAD_ROWS_DROPPED]
         assert inputs.doubt_sigma.sum() == 0
 
     @pytest.mark.parametrize('first', [1200, 2500])      # from rest, and at 12 m/s

@@ -50,7 +50,7 @@ def test_wheel_speeds_units_and_axes_are_found(drive):
 
     for change in (forward, down, lambda v: np.multiply(v, 3.6, out=v),
                    lambda v: np.negative(v, out=v)):
-        assert 'does not agree with the fixes' in screened(drive, change)[0]
+        assert 'contradicts the fixes' in screened(drive, change)[0]
 
 
 def test_nothing_is_said_of_a_velocity_that_is_not_wanted(drive):

@@ -43,7 +43,7 @@ def test_every_key_that_means_the_node_is_taken(write, key):
 @pytest.mark.parametrize('key', ['/car1/calibrator', 'imu_driver', '/**/driver', '/calibrator2'])
 def test_blocks_of_other_nodes_are_named_not_taken(write, key):
     path = write(f'{key}:\n  ros__parameters:\n    leg.min_distance: 50.0\n')
-    with pytest.raises(BadConfig, match=r'no block for the calibrator; it has .*want a top key'):
+    with pytest.raises(BadConfig, match=r'no block for the calibrator; it has .*required: a top-'):
         read_config_file(path)
 
 
@@ -80,8 +80,9 @@ def test_what_the_node_itself_leaves_in_a_dump_is_passed_over(write):
     ('    leg.min_distnace: 5.0\n', BadConfig,
      r'line 3: no setting .* did you mean leg.min_distance'),
     ('    leg: {min_distance: far}\n', BadConfig, "line 3: leg.min_distance: 'far' is not a num"),
-    ('\n    leg.min_distance: 0.0\n', BadConfig, 'line 4: leg.min_distance = 0: want 1 to 1'),
-    ('    gnss.lever_arm: [1.0, 2.0]\n', BadConfig, 'line 3: gnss.lever_arm: 2 values, want 3'),
+    ('\n    leg.min_distance: 0.0\n', BadConfig, 'line 4: leg.min_distance = 0: required: 1 to 1'),
+    ('    gnss.lever_arm: [1.0, 2.0]\n', BadConfig, 'line 3: gnss.lever_arm: 2 values; required: '
+     '3'),
     ('    gnss.lever_arm: [[1.0], 2.0, 3.0]\n', BadConfig, r'\[1.0\] is not a number'),
     ('    odometer.left: 0\n', BadConfig, 'write it in quotes'),
     ('    method: [all\n', BadConfig, 'line 4: not valid YAML: '),
@@ -137,17 +138,17 @@ def test_set_takes_nan_where_a_setting_may_be_unset():
 
 
 @pytest.mark.parametrize(('text', 'error', 'match'), [
-    ('leg.min_distance', BadUsage, 'want key=value'),
-    ('=5', BadUsage, 'want key=value'),
+    ('leg.min_distance', BadUsage, 'required: key=value'),
+    ('=5', BadUsage, 'required: key=value'),
     ('gnss.lever_arm=[1, 2', BadUsage, 'not valid YAML'),
     ('leg.min_dist=5', BadConfig, "^--set: no setting 'leg.min_dist'; did you mean leg.min_dist"),
-    ('imu.gyro_scale=-1', BadConfig, '^--set imu.gyro_scale = -1: want 0 to 1000$'),
-    ('imu.gyro_noise=-1', BadConfig, 'want 0 to 1 rad/s/sqrt'),
+    ('imu.gyro_scale=-1', BadConfig, '^--set imu.gyro_scale = -1: required: 0 to 1000$'),
+    ('imu.gyro_noise=-1', BadConfig, 'required: 0 to 1 rad/s/sqrt'),
     ('leg.min_distance=', BadConfig, 'is not a number'),
     ('verdict.min_legs=2.5', BadConfig, 'is not a whole number'),
     ('leg.max_gap={a: 1}', BadConfig, 'is not a number'),
-    ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: want at most 1e.09'),
-    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'want at most'),
+    ('imu.nominal_yaw=1.0e+308', BadConfig, 'imu.nominal_yaw = 1e.308: the limit is 1e.09'),
+    ('reference.start=[1.0, 2.0, -1.0e+300, 1.0]', BadConfig, 'the limit is'),
 ])
 def test_set_says_what_is_wrong(text, error, match):
     with pytest.raises(error, match=match) as caught:

@@ -64,7 +64,7 @@ def test_the_nose_rises_and_the_body_leans_outwards():
 
 def test_the_imu_on_the_body_feels_how_its_place_moves():
     motion, h, arm = bends(), 1e-4, np.array([0.7, -0.4, 1.1])
-    t = np.arange(1.5, 17.0, 0.01)      # as an Imu of 100 Hz
+    t = np.arange(1.5, 17.0, 0.01)      # as an IMU of 100 Hz
     stiff = Motion(motion.speed, motion.yaw_rate, motion.start)
     w, f = body.felt(motion, motion.at(t), arm)
     R, before, after = (body.rotation(motion, t + k * h) for k in (0, -1, 1))
@@ -74,7 +74,7 @@ def test_the_imu_on_the_body_feels_how_its_place_moves():
     want = np.einsum('nij,ni->nj', R, w_v) + np.stack([spin[:, 2, 1], spin[:, 0, 2],
                                                        spin[:, 1, 0]], -1)
     assert_allclose(w, want, atol=1e-6)
-    # f: second difference of the place that the body takes the Imu to, in a stiff vehicle's axes
+    # f: second difference of the place that the body takes the IMU to, in a stiff vehicle's axes
     a_arm = (after + before - 2 * R) @ arm / h**2
     rate = (after - before) @ arm / (2 * h)
     _, f_0 = body.felt(stiff, stiff.at(t), (0.0, 0.0, 0.0))
@@ -85,7 +85,7 @@ def test_the_imu_on_the_body_feels_how_its_place_moves():
     want = np.einsum('nij,ni->nj', R, f_0 + a_arm + 2 * np.cross(w_0, rate)
                      + np.cross(dw, place) + np.cross(w_0, np.cross(w_0, place)))
     # what the turn rate's derivative by differences misses where its flank begins, w" dt / 2,
-    # over the up to 4 cm that the Imu is moved; round-off of the second difference is 1e-8
+    # over the up to 4 cm that the IMU is moved; round-off of the second difference is 1e-8
     assert_allclose(f, want, atol=(6 * 0.8 / 3.5 / 1.5**2) * 0.01 / 2 * 0.04)
 
 

@@ -96,8 +96,8 @@ def test_what_is_given_is_what_effects_go_by():
 
 @pytest.mark.parametrize(('change', 'told'), [
     ({'effects': ODOMETER_EFFECTS}, 'a vehicle has one odometer'),
-    ({'effects': ('rust',)}, '--effect rust: want one of triads'),
-    ({'grade': 'navigation'}, 'want one of consumer')])
+    ({'effects': ('rust',)}, '--effect rust: required: one of triads'),
+    ({'grade': 'navigation'}, 'required: one of consumer')])
 def test_what_cannot_be_drawn_is_said(change, told):
     with pytest.raises(BadUsage, match=told):
         drawn(**{'seed': 1, 'kind': 'town', 'grade': 'consumer'} | change)

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The two frames of an Imu: closed forms, and instruments that nothing can tell apart."""
+"""The two frames of an IMU: closed forms, and instruments that nothing can tell apart."""
 
 import numpy as np
 from numpy.testing import assert_allclose

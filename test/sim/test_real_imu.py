@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What a real Imu adds: triads, warmth, vibration that goes nowhere, late stamps."""
+"""What a real IMU adds: triads, warmth, vibration that goes nowhere, late stamps."""
 
 from dataclasses import replace
 
@@ -106,12 +106,13 @@ def test_late_stamps_move_no_true_mark():
 
 
 @pytest.mark.parametrize(('figures', 'told'), [
-    ({'gyro_matrix': (1, 2)}, 'want 9 numbers'), ({'squat': (1, 2)}, 'want one number'),
-    ({'gyro_bias': 1.0}, 'want 3 numbers'), ({'vibration': -1}, 'out of range'),
-    ({'speed_rounding': 'up'}, 'want one of floor, round'), ({'drops': 1.0}, 'out of range'),
-    ({'told_grade': 'best'}, 'want one of consumer'), ({'slow_errors': (1, 60)}, 'want pairs'),
-    ({'slow_errors': ((1, 0),)}, 'want pairs'),
-    ({'warm_time': 0.0}, 'out of range'), ({'squat': float('nan')}, 'want finite'),
+    ({'gyro_matrix': (1, 2)}, 'required: 9 numbers'), ({'squat': (1, 2)}, 'required: one number'),
+    ({'gyro_bias': 1.0}, 'required: 3 numbers'), ({'vibration': -1}, 'out of range'),
+    ({'speed_rounding': 'up'}, 'required: one of floor, round'), ({'drops': 1.0}, 'out of range'),
+    ({'told_grade': 'best'}, 'required: one of consumer'),
+    ({'slow_errors': (1, 60)}, 'required: pairs'),
+    ({'slow_errors': ((1, 0),)}, 'required: pairs'),
+    ({'warm_time': 0.0}, 'out of range'), ({'squat': float('nan')}, 'required: finite'),
     ({'imu_batch': 1.5}, 'out of range')])
 def test_figures_that_cannot_be_are_refused(figures, told):
     from odocal_ros.errors import BadUsage

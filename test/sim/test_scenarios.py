@@ -124,26 +124,27 @@ def test_every_choice_is_filled_in():
 
 
 @pytest.mark.parametrize(('change', 'told'), [
-    ({'scenario': 'moon'}, '--scenario moon: want one of paper, straight'),
-    ({'imu_grade': 'best'}, '--imu-grade best: want one of consumer'),
-    ({'fix_noise': 'pink'}, '--fix-noise pink: want one of white'),
-    ({'odometer': 'radar'}, '--odometer radar: want one of counts'),
-    ({'imu_rate': 0.0}, '--imu-rate 0: want a number above 0'),
-    ({'imu_rate': float('nan')}, '--imu-rate nan: want a finite number'),
-    ({'imu_rate': 20_000.0}, '--imu-rate 20000: want at most 10000'),
-    ({'seed': -1}, '--seed -1: want 0 or more'),
-    ({'fix_sigma': -1.0}, '--fix-sigma -1: want 0 or more'),
+    ({'scenario': 'moon'}, '--scenario moon: required: one of paper, straight'),
+    ({'imu_grade': 'best'}, '--imu-grade best: required: one of consumer'),
+    ({'fix_noise': 'pink'}, '--fix-noise pink: required: one of white'),
+    ({'odometer': 'radar'}, '--odometer radar: required: one of counts'),
+    ({'imu_rate': 0.0}, '--imu-rate 0: required: a number above 0'),
+    ({'imu_rate': float('nan')}, '--imu-rate nan: required: a finite number'),
+    ({'imu_rate': 20_000.0}, '--imu-rate 20000: the limit is 10000'),
+    ({'seed': -1}, '--seed -1: required: 0 or more'),
+    ({'fix_sigma': -1.0}, '--fix-sigma -1: required: 0 or more'),
     ({'orientation_sigma': -0.1}, '--orientation-sigma-deg -5.7'),
-    ({'pitch': 1.0}, '--pitch-deg 57.2958: want at most 45'),
-    ({'antenna_lever_arm': (0.0, np.inf, 0.0)}, '--antenna-lever-arm inf: want a finite'),
-    ({'outliers': 0.6}, '--outliers 0.6: want at most 0.5'),
-    ({'outages': ((5.0, 2.0),)}, '--outage 5:2: want A:B'),
-    ({'two_wheels': True, 'odometer': 'speed'}, '--two-wheels goes with'),
+    ({'pitch': 1.0}, '--pitch-deg 57.2958: the limit is 45'),
+    ({'antenna_lever_arm': (0.0, np.inf, 0.0)}, '--antenna-lever-arm inf: required: '),
+    ({'outliers': 0.6}, '--outliers 0.6: the limit is 0.5'),
+    ({'outages': ((5.0, 2.0),)}, '--outage 5:2: required: A:B'),
+    ({'two_wheels': True, 'odometer': 'speed'}, '--two-wheels requires'),
     ({'duration': 30_000.0, 'imu_rate': 1000.0}, 'more than 20,000,000 samples'),
     ({'duration': 100.0}, 'scenario straight: --duration 100 s is too short, give 180'),
     ({'scenario': 'paper', 'duration': 411.0}, 'scenario paper: .* give 420'),
     ({'scenario': 'out_and_back', 'duration': 200.0}, 'scenario out_and_back: .* too short'),
-    ({'scenario': 'town', 'duration': 46.0}, 'scenario town: .* holds no cycle')])
+    ({'scenario': 'town', 'duration': 46.0}, 'scenario town: .* is too short for a stop-and-go '
+     'cycle')])
 def test_what_cannot_be_driven_is_said(change, told):
     with pytest.raises(BadUsage, match=told):
         simulate(replace(SimOptions(), **change))

@@ -8,7 +8,7 @@
 # the License.
 
 """
-The GNSS / Imu / odometer smoother: a batch maximum likelihood over all samples of a leg.
+The GNSS / IMU / odometer smoother: a batch maximum likelihood over all samples of a leg.
 
 ``smooth`` takes a leg that is over, ``GrowingFit`` one that grows; ``smoother_leg`` makes either
 of screened samples, where ``too_little_of`` says no. ``bound`` is the covariance without a fit.

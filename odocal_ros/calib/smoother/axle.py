@@ -8,9 +8,9 @@
 # the License.
 
 """
-What the vehicle's axle does: springs and tyres answer to its pushes, not to those at the Imu.
+What the vehicle's axle does: springs and tyres answer to its pushes, not to those at the IMU.
 
-An Imu half a metre beside it feels half a metre times the change of the turn rate as a push ahead,
+An IMU half a metre beside it feels half a metre times the change of the turn rate as a push ahead,
 in left turns and right ones with opposite signs, which a wheel that slips would turn into way.
 """
 

@@ -222,7 +222,7 @@ def solve(normal: Normal) -> Solved:
     for k in stepping(range(N)):
         root, info = dpotrf(D, lower=1)
         if info:
-            raise NotPositive(f'nothing holds keyframe {k} of {N}')
+            raise NotPositive(f'keyframe {k} of {N} is not constrained')
         W = wide[k]
         X, _ = dpotrs(root, W, lower=1)
         logdet += 2 * np.log(root.diagonal()).sum()

@@ -86,6 +86,6 @@ def filter_reasons(found: SpeedFilter | None) -> list[Reason]:
     """Return SPEED_FILTERED, empty without a filter."""
     if found is None:
         return []
-    return [Reason(Code.SPEED_FILTERED, 'the speed of the odometer is low-pass filtered over '
-                   f'about {found.time:.2f} s, which moves it by up to '
-                   f'{np.abs(found.way).max():.2f} m in a second beside a plain delay')]
+    return [Reason(Code.SPEED_FILTERED, 'the odometer speed is low-pass filtered with a time '
+                   f'constant of about {found.time:.2f} s, an error of up to '
+                   f'{np.abs(found.way).max():.2f} m in one second that a delay does not explain')]

@@ -92,10 +92,10 @@ class GrowingFit:
             with raised_if_wild():
                 best, problem = self._fit(last, view, config, trace)
                 if not best.settled:
-                    raise BadData('the smoother has not settled on the way so far')
+                    raise BadData('the smoother has not converged on the data so far')
                 so_far = _so_far(view, problem, best, config)
         except (NotPositive, np.linalg.LinAlgError, FloatingPointError) as error:
-            raise BadData(f'the smoother cannot solve the way so far: {error}') from None
+            raise BadData(f'the smoother cannot solve the data so far: {error}') from None
         self._last = WarmStart(best.state, best.levels, best.priors, best.first, best.spread)
         self._per_effective = problem.per_effective
         return so_far

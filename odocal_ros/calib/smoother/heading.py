@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A heading from outside, docs/method.md (S19): yaw of the Imu's x axis, one error for the leg."""
+"""A heading from outside, docs/method.md (S19): yaw of the IMU's x axis, one error for the leg."""
 
 from typing import TYPE_CHECKING
 

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""White noise and walks of an Imu: as its grade, its standstills and its samples have them."""
+"""White noise and walks of an IMU: as its grade, its standstills and its samples have them."""
 
 from dataclasses import replace
 
@@ -27,14 +27,14 @@ UNFELT_NOISE, UNFELT_WALK = 5.0, 0.01
 
 
 def sensor_noise(grade: Grade) -> dict[str, float]:
-    """Return the roots of the Imu's noise levels by its grade, SI: white ones and walks."""
+    """Return the roots of the IMU's noise levels by its grade, SI: white ones and walks."""
     stated = {'gyro': grade.gyro_noise, 'accel': grade.accel_noise,
               'gyro_walk': grade.gyro_bias_walk, 'accel_walk': grade.accel_bias_walk}
     return {name: max(sigma, LEAST.imu[name]) for name, sigma in stated.items()}
 
 
 def unfelt(grade: Grade) -> Grade:
-    """Return the grade of an Imu without an accelerometer: its forces are gravity, made up."""
+    """Return the grade of an IMU without an accelerometer: its forces are gravity, made up."""
     return replace(grade, accel_noise=UNFELT_NOISE, accel_bias=TILT_SIGMA * G,
                    accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 

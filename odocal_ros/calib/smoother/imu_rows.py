@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Imu samples of a leg as rows between keyframes, and the Imu's own errors in them."""
+"""IMU samples of a leg as rows between keyframes, and the IMU's own errors in them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def keyframes(t: Floats, t_begin: float, t_end: float, spacing: float) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class SomeRows:
-    """Imu samples between some keyframes, first and last with them."""
+    """IMU samples between some keyframes, first and last with them."""
 
     t: Floats           # (n,)
     f_b: Floats         # (n, 3)
@@ -55,7 +55,7 @@ class SomeRows:
 @dataclass(frozen=True, eq=False)
 class ImuRows:
     """
-    Imu samples of the leg.
+    IMU samples of the leg.
 
     Rotation vectors are made of the turn rates anew in each pass: those of hours are 0.2 GB.
     """

@@ -17,7 +17,7 @@ class LeastNoise:
     """
     1 sigma, below which a variance component does not go.
 
-    Physical: of receivers what the best of today have; of an Imu a tenth of navigation grade,
+    Physical: of receivers what the best of today have; of an IMU a tenth of navigation grade,
     since one with a dead band is silent at rest.
     """
 

@@ -25,11 +25,11 @@ from odocal_ros.settings.grades import grade_of, turn_on_bias
 from odocal_ros.settings.levels import REMARK_SIGMAS
 
 WORSE_THAN_GRADE = 3.0      # times the grade's noise that is another sensor: judgement
-BY_SHAKING = 'the Imu errs more than its grade, in ways that are not white noise'
-SHAKEN = ('What shakes an Imu is no white noise; the sigmas were widened. Mount it firmly and '
+BY_SHAKING = 'IMU errors exceed its grade and are not white noise'
+SHAKEN = ('Vibration is not white noise; uncertainties were increased. Mount the IMU firmly and '
           'away from the engine.')
-OF_FORCE = ('Mount the Imu firmly, or set imu.grade, or imu.accel_noise and the like, to what it '
-            'is.')
+OF_FORCE = ('Mount the IMU firmly. If this is its normal noise, set imu.grade, or '
+            'imu.accel_noise and the other noise settings.')
 
 
 def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Reason]]:
@@ -41,9 +41,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     # of an accelerometer that is not there nothing is said
     sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
     shaken = max(level[name] / own[name] for name in sensors)
-    worse = [f'{what} noise {level[name] / stated[name]:.1f} times'
+    worse = [f'{what} noise is {level[name] / stated[name]:.1f} times'
              for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
-    worse += [f'{what} bias {np.max(np.abs(now[0]) / sigma):.1f} times' for (
+    worse += [f'{what} bias is {np.max(np.abs(now[0]) / sigma):.1f} times' for (
         now, sigma, sold), what in zip((
             (fit.state.gyro_bias, problem.priors.gyro_bias, gyro_sold),
             (fit.state.accel_bias, problem.priors.accel_bias, accel_sold)),
@@ -51,26 +51,26 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
         if np.max(np.abs(now[0]) / np.maximum(2 * sigma, sold)) > WORSE_THAN_GRADE]
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
-                              f'{config.imu.grade} grade; estimated from the drive instead',
+                              f'{config.imu.grade} grade; the estimate from this drive is used',
                               '' if any('gyro' in x for x in worse) else OF_FORCE))
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
         move = moving(fit)
         odd.append(f'after {fit.iterations} passes ' + (
-            f'the estimates still moved by {move:.2g} of their sigmas'
+            f'the estimates still changed by {move:.2g} sigma'
             if move > SETTLING.nearly else 'the noise levels still changed'))
     odd_share = 0.15        # of fixes far off, of intervals with a slip: judgement
     if shaken > WORSE_THAN_GRADE:      # what shakes a vehicle is not white, of no known colour
         odd.append(BY_SHAKING)
     share = float((fit.weighted[Fixes].weight[:, 0] < 0.5).mean())
     if share > odd_share:
-        odd.append(f'{100 * share:.0f} % of the fixes lie far off')
+        odd.append(f'{100 * share:.0f} % of the fixes are outliers')
     share = float((fit.spread[:, 0] > SLIP_VARIANCE).mean())
     if share > odd_share:
-        odd.append(f'the wheel slips in {100 * share:.0f} % of the time')
+        odd.append(f'the wheel slips {100 * share:.0f} % of the time')
     if max(level['side'], level['side_turn']) > 0.2:       # m/sqrt(s): no vehicle on wheels
-        odd.append(f"the odometer's point moves sideways by "
-                   f'{max(level["side"], level["side_turn"]):.2f} m in a second')
+        odd.append(f'sideslip at the odometer is {max(level["side"], level["side_turn"]):.2f} '
+                   'm/√s')
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
@@ -91,5 +91,5 @@ def _heading(heading: Heading, error: float) -> list[Reason]:
     if not len(heading.t) or abs(error) < REMARK_SIGMAS * heading.sigma:
         return []
     return [Reason(Code.MODEL_MISMATCH, f'the heading ({heading.source}) differs by '
-                   f'{np.rad2deg(error):+.2f} deg from that of the drive, '
-                   f'{abs(error) / heading.sigma:.1f} times its sigma; it was given less weight')]
+                   f'{np.rad2deg(error):+.2f} deg, {abs(error) / heading.sigma:.1f} sigma, from '
+                   'the heading estimated on this drive; it was down-weighted')]

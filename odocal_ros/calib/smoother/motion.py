@@ -85,7 +85,7 @@ class Motion:
     change : (K, 3 + g), s: by what gyro bias and constants and the odometer's delay differ from
         those that the sums were made with (for the others the sums have been shifted).
     fitted : the state is so near that residuals are noise: the derivative by the scale goes by
-        the way as fitted, for the Imu's see signals.py.
+        the way as fitted, for the IMU's see signals.py.
     """
 
     def __init__(self, problem: 'Problem', state: State, intervals: Intervals,

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The motion of the intervals as a part: Imu and odometer from each keyframe to the next."""
+"""The motion of the intervals as a part: IMU and odometer from each keyframe to the next."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -60,7 +60,7 @@ class MotionRows(Part):
 
     @classmethod
     def first_levels(cls, problem: 'Problem') -> tuple[dict[str, float], dict[str, float]]:
-        """Return first levels and their least: of the Imu as it rests, of the road."""
+        """Return first levels and their least: of the IMU as it rests, of the road."""
         imu = {name: sigma**2 for name, sigma in sensor_noise(problem.grade).items()}
         imu |= at_rest(problem.imu, problem.leg, problem.still)
         slide, road = least_slide(problem.turned)**2, 0.01**2      # m^2/s, where they set out

@@ -97,8 +97,8 @@ def outcome(leg: SmootherLeg, problem: Problem, fit: Fit, config: Config) -> Met
             found[name] = Estimate(float(state.gyro_bias[0, i]), float(bias_sigma[i]), 'rad/s')
     unsaid = [name for name in ratio if name in found and found[name].value is None]
     if unsaid:
-        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'this drive does not tell '
-                              f'{in_words(unsaid)}; what the settings say of it is kept'))
+        reasons.append(Reason(Code.PARAMETER_NOT_DETERMINED, 'not observable on this drive: '
+                              f'{in_words(unsaid)}; the configured values are used'))
     reasons += assumed(problem, fit.levels)
     reasons += judge(found, leg.nominal_scale, config)
     sources = [*(_widened(s, widen) for s in shares(fit, near)),
@@ -200,29 +200,28 @@ def _widened(source: Source, widen: float) -> Source:
 
 def _undetermined(sigma: Floats, limit: float, config: Config, yaw: float) -> list[Reason]:
     # of a model that does not hold more is wanted: said, or 0.4 deg would seem to be enough
-    reasons, wanted = [], f', {np.rad2deg(limit):.2g} deg are wanted'
+    reasons, wanted = [], f'; the limit is {np.rad2deg(limit):.2g} deg'
     if sigma[LN_K] > SCALE_LIMIT:
-        reasons.append(Reason(Code.SCALE_NOT_DETERMINED, f'the scale would be good to '
-                              f'{100 * sigma[LN_K]:.0f} % only'))
+        reasons.append(Reason(Code.SCALE_NOT_DETERMINED, 'scale uncertainty is '
+                              f'{100 * sigma[LN_K]:.0f} %, too large to state a value'))
     nominal = 0.0 if np.isnan(config.imu.nominal_yaw) else config.imu.nominal_yaw
     off = abs(float(wrap(yaw - nominal)))
     if sigma[YAW] > limit:
-        reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'the drive tells the yaw mounting to '
-                              f'{np.rad2deg(sigma[YAW]):.1f} deg only{wanted}: too little '
-                              'acceleration and too few turns'))
+        reasons.append(Reason(Code.YAW_NOT_DETERMINED, 'yaw mounting uncertainty is '
+                              f'{np.rad2deg(sigma[YAW]):.1f} deg{wanted}. Likely cause: too '
+                              'little acceleration, or too few turns'))
     elif off > np.deg2rad(135.0):       # no mounting, but the other way round
-        reasons.append(Reason(Code.ODOMETER_REVERSED, 'the odometer runs against the Imu: '
-                              'positive counts mean backwards, or the Imu faces backwards (yaw '
-                              f'{np.rad2deg(yaw):+.1f} deg)'))
+        reasons.append(Reason(Code.ODOMETER_REVERSED, 'odometer and IMU have opposite '
+                              'directions: positive counts mean backwards, or the IMU x axis '
+                              f'points backwards (yaw {np.rad2deg(yaw):+.1f} deg)'))
     elif off > FAR_YAW:
-        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'the yaw mounting of '
-                              f'{np.rad2deg(yaw):+.1f} deg is {np.rad2deg(off):.1f} deg from the '
-                              'nominal one'))
+        reasons.append(Reason(Code.YAW_FAR_FROM_NOMINAL, f'yaw mounting {np.rad2deg(yaw):+.1f} '
+                              f'deg differs by {np.rad2deg(off):.1f} deg from its nominal value'))
     if sigma[PITCH] > limit:
-        reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'the drive tells the pitch mounting to '
-                              f'{np.rad2deg(sigma[PITCH]):.1f} deg only{wanted}',
-                              'Drive longer, with stops and starts; good ellipsoidal heights help '
-                              'too.'))
+        reasons.append(Reason(Code.PITCH_NOT_DETERMINED, 'pitch mounting uncertainty is '
+                              f'{np.rad2deg(sigma[PITCH]):.1f} deg{wanted}',
+                              'Drive longer, with stops and starts. Accurate ellipsoidal heights '
+                              'also help.'))
     return reasons
 
 

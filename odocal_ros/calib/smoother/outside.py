@@ -8,7 +8,7 @@
 # the License.
 
 """
-What is known from outside besides fixes: the antenna's velocity, the heading of the Imu's x axis.
+What is known from outside besides fixes: the antenna's velocity, the heading of the IMU's x axis.
 
 A heading comes with one error for the whole leg (a mounting, a declination, a compass), which no
 number of messages averages out, and white noise on top; a heading that is given at the start mark
@@ -60,7 +60,7 @@ class Velocity:
 @dataclass(frozen=True, eq=False)
 class Heading:
     """
-    Yaw of the Imu's x axis in n: (m,) s, (m,) rad.
+    Yaw of the IMU's x axis in n: (m,) s, (m,) rad.
 
     noise : (m,) rad.   sigma : rad, of the error that is the same through the leg.
     """

@@ -74,7 +74,7 @@ class Intervals:
 
     def shifted(self, gyro: Floats, accel_bias: Floats, accel: Floats) -> 'Intervals':
         """
-        Return the sums for errors of the Imu that differ a little.
+        Return the sums for errors of the IMU that differ a little.
 
         gyro : (K, 3 + g) biases and constants.   accel_bias : (K, 3).   accel : (a,) constants.
         """

@@ -217,7 +217,7 @@ def imperfect_sigmas(grade: Grade) -> Floats:
     """
     Return the sigmas of IMPERFECT, 0 for none: (k,).
 
-    Those of the Imu by its grade. A receiver that smooths does so over a second;
+    Those of the IMU by its grade. A receiver that smooths does so over a second;
     most have no odometer (SIZE_SPREADS).
     Tyres change by 0.25 % from 5 to 30 m/s, by 0.25 % as they warm within ten minutes or so, and
     slip by 0.4 % for each m/s^2;

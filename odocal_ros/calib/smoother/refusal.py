@@ -33,14 +33,14 @@ def refused(reasons: Iterable[Reason], scale_unit: str, two_wheels: bool) -> Met
 
 
 def no_imu(fit: Fit) -> list[Reason]:
-    """Return why a fit is implausible whose Imu no maker would sell, empty else."""
+    """Return why a fit is implausible whose IMU no maker would sell, empty else."""
     c = fit.state.constants
     worst = max(IMU_SCALES, key=lambda i: abs(c[i]))
     if abs(c[worst]) <= 0.2:        # twenty times what a consumer's is off
         return []
-    return [Reason(Code.NOT_CONVERGED, 'the fit settled where the '
-                   f'{CONSTANTS[worst].replace("_", " ")} is {100 * c[worst]:+.0f} % off, as no '
-                   'Imu is: a false minimum, or its units, axes or times are not as set')]
+    return [Reason(Code.NOT_CONVERGED, 'the fit converged to '
+                   f'{CONSTANTS[worst].replace("_", " ")} {100 * c[worst]:+.0f} %, impossible '
+                   'for an IMU: a local minimum, or wrong units, axes or time offsets')]
 
 
 def unknown(scale_unit: str) -> dict[str, Estimate]:

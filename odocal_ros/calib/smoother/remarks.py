@@ -53,7 +53,7 @@ def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, 
     """
     Return what stands beside the estimates: figures by their names in calibration.json.
 
-    value, covariance : (M,), (M, M) of the constants.   grade : that the Imu is taken for, None
+    value, covariance : (M,), (M, M) of the constants.   grade : that the IMU is taken for, None
     without an accelerometer.
     """
     sigma = np.sqrt(np.diag(covariance))
@@ -76,7 +76,7 @@ def _figure(value: float, unit: str) -> dict[str, Any]:
 
 def _of_housing(found: float, found_sigma: float, sigma: float, misalignment: float) -> float:
     """
-    Return the sigma of an angle against the housing's axes, where that of the Imu's own is given.
+    Return the sigma of an angle against the housing's axes, where that of the IMU's own is given.
 
     The angle between both is one of two errors of axes, of one size, whose sum is ``found``: half
     of it, with what is left of either.
@@ -111,14 +111,15 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
     off *= np.abs(c) > REMARK_SIGMAS * sigma
     if off[[AXIS_XY, AXIS_ZX]].max() > REMARK_SIGMAS:
         worst = max((AXIS_XY, AXIS_ZX), key=lambda i: off[i])
-        said.append(Reason(Code.IMU_AXES_SKEW, 'the axes of the accelerometer are off a right '
-                           f'angle by {np.rad2deg(abs(c[worst])):.2f} deg, {off[worst]:.0f} times '
-                           f'the {config.imu.grade} grade; the values allow for it'))
+        said.append(Reason(Code.IMU_AXES_SKEW, 'accelerometer axes are '
+                           f'{np.rad2deg(abs(c[worst])):.2f} deg off perpendicular, '
+                           f'{off[worst]:.0f} times the sigma of the {config.imu.grade} grade; '
+                           'accounted for'))
     worst = max(IMU_SCALES, key=lambda i: off[i])
     if off[worst] > 4.0:        # of the grade's sigma: another Imu
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
-                           f'the {config.imu.grade} grade; the values allow for it'))
+                           f'the {config.imu.grade} grade; accounted for'))
     return said + _arms(c, sigma, leg)
 
 
@@ -128,23 +129,23 @@ def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
     factor = np.sqrt(levels['fix'] + slow / problem.fix_sigma**2)
     if factor <= 1.5:       # worth a word: receivers state their errors no better
         return []
-    return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'white and slow errors together, the fixes '
-                   f'err {factor:.1f} times as much as their covariance says')]
+    return [Reason(Code.FIXES_NOISIER_THAN_SAID, 'fix errors (white and time-correlated) are '
+                   f'{factor:.1f} times as large as their covariance states')]
 
 
 def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
     """Say where the scale is not one number through the leg."""
     motion, c = fit.weighted[MotionRows].motion, fit.state.constants
     said = []
-    for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from slow to fast'),
-                          (BY_TIME, motion.from_mean[:, 1], 'from begin to end')):
+    for i, span, what in ((BY_SPEED, motion.from_mean[:, 0], 'from low to high speed'),
+                          (BY_TIME, motion.from_mean[:, 1], 'from start to end')):
         change = c[i] * np.ptp(span)
         if abs(c[i]) > REMARK_SIGMAS * sigma[i] and abs(change) > 3e-4:     # worth a word
             said.append(f'{100 * change:+.2f} % {what}')
     if not said:
         return []
-    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the value is '
-                   'its mean over the way of this leg')]
+    return [Reason(Code.SCALE_VARIES, f'the scale changes by {" and ".join(said)}; the stated '
+                   'value is the mean over this leg')]
 
 
 def _arms(c: Floats, sigma: Floats, leg: SmootherLeg) -> list[Reason]:
@@ -157,5 +158,5 @@ def _arms(c: Floats, sigma: Floats, leg: SmootherLeg) -> list[Reason]:
                 said.append(f'{name} {axis} by {c[i]:+.2f} m +- {sigma[i]:.2f}')
     if not said:
         return []
-    return [Reason(Code.LEVER_ARM_OFF, f'the drive puts {", ".join(said)} off its setting; the '
-                   'values allow for it')]
+    return [Reason(Code.LEVER_ARM_OFF, f'estimated {", ".join(said)} differs from its setting; '
+                   'accounted for')]

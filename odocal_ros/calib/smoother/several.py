@@ -87,8 +87,8 @@ def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], confi
     estimates |= newest(legs, {n: e for n, e in estimates.items() if not n.startswith('gyro_')})
     unsaid = [CONSTANTS[i] for i in OPTIONAL if estimates[CONSTANTS[i]].value is None]
     if unsaid:
-        why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'these {len(legs)} drives do not tell '
-                          f'{in_words(unsaid)}; what the settings say of it is kept'))
+        why.append(Reason(Code.PARAMETER_NOT_DETERMINED, f'not observable on these {len(legs)} '
+                          f'drives: {in_words(unsaid)}; the configured values are used'))
     sources = _sources(found.used[at] * found.factor, C)
     # by any leg with an accelerometer
     grade = grade_of(config.imu) if np.isinf(found.sigma[at][PITCH]) else None
@@ -153,11 +153,11 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
             continue
         # of two each differs from the other alike
         who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
-        said.append(f'{name} differs between the {J} legs {np.sqrt((z**2).mean()):.1f} times more '
-                    f'than their sigmas allow{who}')
+        said.append(f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times more than '
+                    f'their uncertainties{who}')
     if found.factor > 1:
-        said.append(f'the {J} legs differ {found.factor:.1f} times more than their sigmas allow, '
-                    'in more than their constants')
+        said.append(f'the {J} legs differ {found.factor:.1f} times more than their '
+                    'uncertainties, in other parameters than the ones listed')
     return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
 
 

@@ -8,7 +8,7 @@
 # the License.
 
 """
-What of the Imu's signals its errors multiply: docs/method.md, noise in the regressor.
+What of the IMU's signals its errors multiply: docs/method.md, noise in the regressor.
 
 Derivatives by a scale error go by a signal. By the signal as measured they hold its noise, which
 the fit then takes for information, and a smaller signal for a better one. So, once the state is so
@@ -66,7 +66,7 @@ class Signals:
     def fit(self, rows: slice, constants: Floats, by_bias: Floats, gyro: Floats,
             found: Floats) -> None:
         """
-        Put the derivatives by the Imu's errors right, in constants: (k, 18, M).
+        Put the derivatives by the IMU's errors right, in constants: (k, 18, M).
 
         rows : slice of the intervals.   by_bias : (k, 18, 3) derivatives by the gyro's bias.
         gyro : (k, 18, 3 p) columns of the gyro's unit noises, along the axes of n at p points.

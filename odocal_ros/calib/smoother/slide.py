@@ -11,7 +11,7 @@
 Bounds from below of how much wheels slide sideways and heave: as the leg has tested it.
 
 Wheels slide in turns. A leg with turns shows how much, and its own figure stands. On a leg that
-goes straight on nothing tells a vehicle that goes a little askew from an Imu that is mounted so:
+goes straight on nothing tells a vehicle that goes a little askew from an IMU that is mounted so:
 there an ordinary road's noise is taken, whatever the residuals of the single seconds say.
 """
 
@@ -70,7 +70,7 @@ def assumed(problem: 'Problem', levels: Levels) -> list[Reason]:
     if least < 2e-3**2 or all(      # m^2/s, worth a word
             levels[name] > 1.01 * least for name in SIDEWAYS):
         return []
-    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'the turns of this drive add up to '
-                   f'{np.rad2deg(problem.turned):.0f} deg, too little to test how much the '
-                   f'wheels slide sideways: {1e3 * np.sqrt(least):.0f} mm in a second are '
-                   'assumed, and the sigmas of the mounting angles rest on that')]
+    return [Reason(Code.PARAMETER_NOT_DETERMINED, 'total turn angle '
+                   f'{np.rad2deg(problem.turned):.0f} deg, too little to estimate sideslip: '
+                   f'{1e3 * np.sqrt(least):.0f} mm/√s is assumed, and the uncertainties of the '
+                   'mounting angles depend on it')]

@@ -94,12 +94,12 @@ def slip_reasons(fit: Fit, neighbours: Neighbours, slips: tuple[Slip, ...], coun
         one = [f'{s.metres:+.2f} m at t = {s.t:.0f} s ({s.duration:.0f} s)'
                for s in slips[:most]]
         more = f' and {len(slips) - most} more' if len(slips) > most else ''
-        said.append('the wheel turned more (+) or less (-) than the vehicle moved: '
+        said.append('wheel slip, travel of the wheel minus travel of the vehicle: '
                     + ', '.join(one) + more)
     # m/sqrt(s), times even driving: no wheel without slip has so much when speeds change
     if 'along_hard' in known and level['along_hard'] > max(0.006, 3 * level['along'], rounding):
-        beside = f', {1e3 * level["along"]:.1f} mm in even driving' if 'along' in known else ''
-        said.append('it slips when the speed changes: about '
-                    f'{1e3 * level["along_hard"]:.0f} mm in each second of speeding up or '
-                    f'braking{beside}')
+        beside = (f', {1e3 * level["along"]:.1f} mm/√s at constant '
+                  'speed') if 'along' in known else ''
+        said.append('slip while accelerating or braking is about '
+                    f'{1e3 * level["along_hard"]:.0f} mm/√s{beside}')
     return [Reason(Code.WHEEL_SLIP, '; '.join(said))] if said else []

@@ -60,8 +60,9 @@ def smooth(leg: SmootherLeg, config: Config, trace: Trace | None = None) -> Meth
     try:
         best = best_fit(problem, config, trace)
     except (NotPositive, np.linalg.LinAlgError) as error:
-        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}; '
-                               'samples are missing or wild there')], leg.scale_unit, two_wheels)
+        return refused([Reason(Code.NOT_CONVERGED, f'the equations could not be solved: {error}. '
+                               'Likely cause: missing or invalid samples '
+                               'there')], leg.scale_unit, two_wheels)
     if implausible := no_imu(best):
         return refused(implausible, leg.scale_unit, two_wheels)
     return outcome(leg, problem, best, config)
@@ -102,7 +103,7 @@ def _first_levels(problem: Problem, start: Start) -> Levels:
 
 
 def too_little_of(leg: SmootherLeg) -> Reason | None:
-    """Return why a leg's fixes beside its Imu rows are too few, None if they are not."""
+    """Return why a leg's fixes beside its IMU rows are too few, None if they are not."""
     first = int(np.searchsorted(leg.t_imu, leg.t_begin))
     t = leg.t_imu[first:int(np.searchsorted(leg.t_imu, leg.t_stop, side='right'))]
     if len(t) < 2:
@@ -116,8 +117,8 @@ def too_little(fixes: int, seconds: float) -> Reason | None:
     fewest, shortest = 10, 20.0     # fixes, s: judgement, of less no start is found
     if fixes >= fewest and seconds >= shortest:
         return None
-    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s: the smoother '
-                  f'needs {fewest} in {shortest:.0f} s at least')
+    return Reason(Code.SCALE_NOT_DETERMINED, f'{fixes} fixes in {seconds:.0f} s; the smoother '
+                  f'needs at least {fewest} fixes in {shortest:.0f} s')
 
 
 def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,

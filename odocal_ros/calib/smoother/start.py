@@ -81,7 +81,7 @@ def first_state(leg: SmootherLeg, imu: ImuRows, priors: Priors, yaw: float | Non
     leg : SmootherLeg
         The leg.
     imu : ImuRows
-        Its Imu rows with the keyframes.
+        Its IMU rows with the keyframes.
     priors : Priors
         Turn-on bias.
     yaw : float, optional

@@ -118,10 +118,10 @@ class State:
     """
     Values of all unknowns.
 
-    t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the Imu, m, m/s.   C_nb : (N, 3, 3).
+    t : (N,) s, keyframes.   p_n, v_n : (N, 3) of the IMU, m, m/s.   C_nb : (N, 3, 3).
     gyro_bias, accel_bias : (N, 3) in b.   travel_error : (N,) scale units.
     slow_n : (N, 3) slow part of the fix error, m.   constants : (M,) as CONSTANTS, ln K first.
-    up_b : (3,) up in b, mean of the leg: by it the Imu's roll on the vehicle is observable.
+    up_b : (3,) up in b, mean of the leg: by it the IMU's roll on the vehicle is observable.
     """
 
     t: Floats
@@ -151,7 +151,7 @@ class State:
         return C_bv(self.forward, self.up_b)
 
     def level(self) -> 'State':
-        """Return the state with what its attitudes tell of the Imu's roll."""
+        """Return the state with what its attitudes tell of the IMU's roll."""
         return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
 
     def C_bv_gradient(self) -> tuple[Floats, Floats]:

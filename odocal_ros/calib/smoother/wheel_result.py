@@ -52,10 +52,10 @@ def wheel_estimates(wheels: Sequence[Wheel], scale: Estimate,
     # one line, seen twice: right by left is off by twice what either is off from the mean
     sigma = 2 * wheels[0].ratio_sigma if wheels else np.inf
     if sigma > limit:
-        known = f'is known to {100 * sigma:.2g} %' if wheels else 'is not known'
-        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, f'the ratio of the right factor to the '
-                              f'left one {known}, {100 * limit:.2g} % is the limit: left and '
-                              'right are not stated')]
+        known = f'has an uncertainty of {100 * sigma:.2g} %' if wheels else 'is not known'
+        return found, [Reason(Code.WHEELS_NOT_SEPARABLE, 'the ratio of right to left wheel '
+                              f'{known}; the limit is {100 * limit:.2g} %. The factors of the '
+                              'wheels are not stated')]
     for name, wheel in zip(FACTORS, wheels, strict=True):
         value = scale.value * wheel.ratio
         relative = np.hypot(scale.sigma / scale.value, wheel.ratio_sigma)
@@ -71,16 +71,16 @@ def _track_width(wheels: Sequence[Wheel], given: float) -> tuple[Estimate, list[
     if given and sigma >= INFORMED_SHARE * TRACK_WIDTH.taped_share * given:
         return none, []         # the tape knows it better
     if sigma < TRACK_WIDTH.least and width < TRACK_WIDTH.least:
-        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the difference of the wheels does '
-                             f'not follow the turns by gyro: the track width is {width:.2g} m')]
+        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'the wheel difference does not '
+                             f'match the gyro turns: the track width would be {width:.2g} m')]
     if sigma >= TRACK_WIDTH.determined_share * max(width, TRACK_WIDTH.least):
-        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'too few turns: the uncertainty of '
-                             f'the track width is {sigma:.2g} m')]
+        return none, [Reason(Code.TRACK_WIDTH_NOT_DETERMINED, 'track width uncertainty is '
+                             f'{sigma:.2g} m. Likely cause: too few turns')]
     if given and abs(width - given) > REMARK_SIGMAS * np.hypot(
             TRACK_WIDTH.taped_share * given, sigma):
         return Estimate(width, sigma, 'm'), [Reason(
-            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'the drive tells a track width of {width:.4f} +- '
-            f'{sigma:.4f} m, odometer.track_width says {given:.4g} m')]
+            Code.TRACK_WIDTH_FAR_FROM_GIVEN, f'estimated track width is {width:.4f} +- '
+            f'{sigma:.4f} m; odometer.track_width is {given:.4g} m')]
     return Estimate(width, sigma, 'm'), []
 
 

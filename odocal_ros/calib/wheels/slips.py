@@ -12,7 +12,7 @@ Faults of two wheels by the gyro: exchanged, one slipping, counting unlike each 
 
 The ways of the two wheels differ by the track width times the turn. What is left of the
 difference is rounding and gyro noise, millimetres over seconds; a wheel that spins or slides on
-its own stands out of it by centimetres, where the Imu's acceleration alone sees half a metre.
+its own stands out of it by centimetres, where the IMU's acceleration alone sees half a metre.
 """
 
 from dataclasses import replace
@@ -247,8 +247,8 @@ def _which(two: Pair, mean: Floats, imu: tuple[Floats, Floats, Floats], track: T
     """
     Return which wheel slipped: -1, +1, or 0 where acceleration does not tell.
 
-    A slip of the right wheel by x takes the mean ahead of the Imu by x / 2, one of the left by -x
-    back by as much: the odds of the two come from how far mean and Imu part elsewhere.
+    A slip of the right wheel by x takes the mean ahead of the IMU by x / 2, one of the left by -x
+    back by as much: the odds of the two come from how far mean and IMU part elsewhere.
     """
     begin, end, size = event
     grid = np.arange(max(track.t[0], two.t[0]), min(track.t[-1], two.t[-1]), SPIN_GRID)

@@ -76,11 +76,11 @@ def slip_reason(slips: WheelSlips) -> tuple[Reason]:
     n = len(slips.size)
     worst = int(np.argmax(np.abs(slips.size)))
     which = ('one of the wheels', 'the right wheel', 'the left wheel')[slips.wheel[worst]]
-    done = 'parts' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
+    done = 'deviates' if not slips.wheel[worst] else 'spins' if slips.size[worst] > 0 else 'slides'
     other = ' from the other' * (not slips.wheel[worst])
     return (Reason(Code.WHEEL_SLIP, f'{which} {done}{other} by '
-                   f'{100 * abs(slips.size[worst]):.0f} cm against the gyro from '
-                   f't = {slips.begin[worst]:.1f} s for '
+                   f'{100 * abs(slips.size[worst]):.0f} cm relative to the gyro, from t = '
+                   f'{slips.begin[worst]:.1f} s for '
                    f'{max(slips.end[worst] - slips.begin[worst], SLIP_GRID):.1f} s'
-                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in all'
+                   + (f'; {n} such places, {np.abs(slips.size).sum():.2f} m in total'
                       if n > 1 else '')),)

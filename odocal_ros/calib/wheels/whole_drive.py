@@ -33,7 +33,7 @@ def signals_of(two: Pair, metres_per_unit: float) -> Floats:
     Return what the right way is made of, at the edges: (n, 6).
 
     The left way, turn and time (gyro bias); speed (the wheels' stamps apart), turn rate (the
-    Imu's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
+    IMU's stamps apart) and the load that sideways acceleration moves from tyre to tyre.
     """
     half = MEAN_STEPS // 2
     mean = (two.left + two.right) / 2
@@ -70,18 +70,17 @@ def fitted(two: Pair, signals: Floats, metres_per_unit: float,
 def swapped(width: float, sigma: float, track_width: float) -> tuple[Reason, ...]:
     if abs(width) + WHOLE_DRIVE_SIGMAS * sigma < max(TRACK_WIDTH.least,
                                                        track_width / 2):
-        return (Reason(Code.WHEEL_DEAD, 'both wheels count alike in turns, too: turn and '
-                       f'difference of the wheels give a track width of {width:.3f} m, +-'
-                       f'{sigma:.2g} m, as if one counter were sent twice'),)
+        return (Reason(Code.WHEEL_DEAD, 'both wheels count the same in turns: the track width '
+                       f'would be {width:.3f} m, +-{sigma:.2g} m. Likely cause: one counter is '
+                       'sent twice'),)
     if width - WHOLE_DRIVE_SIGMAS * sigma <= 0 < width + WHOLE_DRIVE_SIGMAS * sigma:
-        return (Reason(Code.ODOMETER_CHOSEN, 'no turn tells whether the left wheel and the right '
-                       f'one are exchanged (track width by turns {width:.2f} +- {sigma:.2g} m): '
-                       'the sides are taken as named'),)
+        return (Reason(Code.ODOMETER_CHOSEN, 'too few turns to test whether left and right wheel '
+                       f'are swapped (track width from turns {width:.2f} +- {sigma:.2g} m): the '
+                       'configured sides are used'),)
     if width > -TRACK_WIDTH.least:
         return ()
-    return (Reason(Code.WHEELS_SWAPPED, 'in left turns the left wheel goes farther: turn and '
-                   f'difference of the wheels give a track width of {width:.2f} m, +-'
-                   f'{sigma:.2g} m'),)
+    return (Reason(Code.WHEELS_SWAPPED, 'the left wheel travels farther in left turns (track '
+                   f'width {width:.2f} m, +-{sigma:.2g} m)'),)
 
 
 def changed(two: Pair, signals: Floats,
@@ -112,12 +111,13 @@ def changed(two: Pair, signals: Floats,
     # before it as likely as after it: the fit lies between, (1 - share) of the change from before
     held = float(change * np.sqrt(2 * (share**2 + (1 - share)**2)))
     return (Reason(Code.WHEEL_SLIP, f'from t = {two.t[at]:.0f} s on, after about '
-                   f'{100 * share:.0f} % of the way, the right wheel comes to count '
+                   f'{100 * share:.0f} % of the path, the right wheel counts '
                    f'{100 * abs(change):.2f} % (+-{100 * abs(change) / odds:.2f}) '
-                   f'{"more" if change > 0 else "less"} on the way of the left one, '
-                   'against the gyro: a wheel that slips all along, or loses air. Which part is '
-                   f'right nothing tells: the sigma of the scale holds {25 * abs(held):.2f} % for '
-                   f'it, that of each wheel {50 * abs(held):.2f} %'),), held
+                   f'{"more" if change > 0 else "less"} relative to the left wheel and the gyro. '
+                   'Likely cause: continuous slip or a tyre that loses pressure. Which section '
+                   f'is correct cannot be decided from the data: {25 * abs(held):.2f} % is added '
+                   f'to the uncertainty of the scale, {50 * abs(held):.2f} % to that of each '
+                   'wheel'),), held
 
 
 def unlike(ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
@@ -126,7 +126,6 @@ def unlike(ratio: float, width: float, limit: float) -> tuple[Reason, ...]:
         return ()
     # the mean count weighs each wheel by its counts a metre
     off = (ratio / (1 + ratio) - 0.5) * width
-    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as much '
-                   'as the left one: the scale is that of the mean count, which stands for a '
-                   f'point {abs(off):.2f} m {"right" if off > 0 else "left"} of the middle of '
-                   'the axle'),)
+    return (Reason(Code.WHEEL_COUNTERS_DIFFER, f'the right wheel counts {ratio:.3f} times as '
+                   'much as the left wheel: the scale refers to the mean count, at a point '
+                   f'{abs(off):.2f} m {"right" if off > 0 else "left"} of the axle centre'),)

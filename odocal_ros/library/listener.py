@@ -7,38 +7,38 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Who hears how the work goes: a command shows it, another program need not."""
+"""Receivers of notes and progress: commands print them, other programs need not."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
-# of the share done, 0 to 1 or None where nobody knows it, and what is being done
+# called with the fraction done, 0 to 1 or None if unknown, and the current stage
 Progress = Callable[..., None]
 
 
-class Hearer:
-    """Hears sentences and phases of the work; this one keeps to itself."""
+class Listener:
+    """Receive notes and phases of the work; this one ignores them."""
 
     def note(self, text: str) -> None:
-        """Take a sentence that the user should know."""
+        """Receive a note for the user."""
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        """Return a context for a phase of the work, whose value is told the share done."""
+        """Return a context for a phase of the work; its value receives the fraction done."""
         return nullcontext(lambda share, stage='': None)
 
 
-class Notes(Hearer):
-    """Keeps the sentences, and passes all on."""
+class Notes(Listener):
+    """Store the notes, and forward everything."""
 
-    def __init__(self, onward: Hearer) -> None:
+    def __init__(self, onward: Listener) -> None:
         self.said: list[str] = []
         self._onward = onward
 
     def note(self, text: str) -> None:
-        """Keep a sentence."""
+        """Store and forward a note."""
         self.said.append(text)
         self._onward.note(text)
 
     def phase(self, title: str) -> AbstractContextManager[Progress]:
-        """Return the phase as the other has it."""
+        """Return the phase of the next listener."""
         return self._onward.phase(title)

@@ -1,0 +1,171 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Printed text and docs use the terms of CONTRIBUTING.md, not the words that these replace."""
+
+import ast
+import io
+import re
+import tokenize
+
+from pages import ROOT
+import pytest
+
+from odocal_ros.reasons import Code
+from odocal_ros.settings.config import SETTINGS
+
+# what is not used: what to write instead
+WORDS = {
+    r'tells?|told|untold|foretells?': 'determine, observe, show, configured',
+    r'hears?|heard|hearer': 'receive, use, listen',
+    r'feels?|felt|unfelt': 'measure',
+    r'wanders?|wandered|wandering': 'drift',
+    r'mends?|mended|mending': 'fix, correct, check',
+    r'gainsays?|gives? way': 'contradict, is relaxed',
+    r'borne out|from nothing': 'confirmed, cold start',
+    r'astray|strays?|strayed': 'outlier, deviate',
+    r'heaved|shaken|shakes|leaned': 'crest, vibrating, lean',
+    r'goes before|went before|go before': 'takes precedence',
+    r'goes? to and fro|to and fro': 'oscillates',
+    r'alike': 'the same, correlated',
+    r'lies? off|lying off|ly off': 'are outliers',
+    r'(?<!same )(?<!this )(?<!either )(?<!no )(?<!another )way': 'path, path length, travel',
+    r'above all': 'largest',
+    r'take care|for the eye|the sky|open sky\b.*\bsees': 'warnings, for people, sky view',
+    r'exchanged?': 'swap',
+    r'by (?:itself|themselves)': 'automatically, separately',
+    r'begins? anew|anew': 'restart, again',
+    r'allows? for it|put(?:s)? \w+ off': 'accounted for, differs from its setting',
+    r'(?:is|are) (?:wanted|asked)|were asked': 'the limit is, required',
+    r'(?:nothing|nobody|somebody) (?:tells|knows|says|sees)': 'cannot be decided from the data',
+    r'whoever|who does not': 'to ..., do ...',
+    r'as (?:it|they) (?:was|were) \S+ s ago': 'estimate is N s old',
+    r'eased?|eases': 'reduce',
+    r'believable|believed': 'plausible, the limit is',
+    r'honest|honestly': 'reliable, correct',
+    r'creeps?|crept|ran away|runs away': 'converges slowly, diverged',
+    r'believes?|doubts?|doubted|in doubt': 'has the prior, uncertainty',
+    r'(?:is|are|was|were) taken for|passes for|passed for': 'is treated as, looks like',
+    r'settles?|goes on|by hand|speaks?|spoke': 'converges, continues, manually, reports',
+    r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words',
+}
+UNUSED = re.compile(r'(?<![\w/.`:-])(?:(?i:' + '|'.join(WORDS) + r')|Imus?)(?![\w/`-])')
+MODULES = [path for path in sorted((ROOT / 'odocal_ros').rglob('*.py'))
+           if 'calib' not in path.relative_to(ROOT).parts]      # calib: printed text only
+PAGES = [*sorted(ROOT.glob('*.md')), *sorted((ROOT / 'docs').rglob('*.md'))]
+SETTING_FILES = [path for folder in ('config', 'launch')
+                 for path in sorted((ROOT / folder).iterdir()) if path.is_file()]
+# names of settings, files and values, equations, links
+NAMES = re.compile(r'``[^`\n]*``|`[^`\n]*`|\{[^{}]*\}|\$[^$]*\$|\([^() ]*\.md\)|https?://\S+|[\w-]+_[\w-]+')
+
+
+def unused(text):
+    """Return the words in a text that are not used, but for names."""
+    return [match.group() for match in UNUSED.finditer(NAMES.sub(' ', text))]
+
+
+def literals(path):
+    """Return (line, text) of the string literals of a module but docstrings; {} for a value."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)
+             for part in ast.walk(node) if part is not node}
+    inner |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if id(node) in inner:
+            continue
+        if isinstance(node, ast.JoinedStr):
+            yield node.lineno, ''.join(part.value if isinstance(part, ast.Constant) else '{}'
+                                       for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+
+
+def printed():
+    """Return the printed texts of the package: literals with a space; sim names random streams."""
+    return [(f'{path.relative_to(ROOT)}:{line}', text)
+            for path in sorted((ROOT / 'odocal_ros').rglob('*.py'))
+            for line, text in literals(path)
+            if len(text.split()) > (3 if path.parent.name == 'sim' else 1)]
+
+
+def remarks(path):
+    """Yield (line, text) of the docstrings and comments of a module."""
+    source = path.read_text(encoding='utf-8')
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield getattr(node, 'lineno', 1), ast.get_docstring(node) or ''
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+
+
+def test_printed_text_is_plain():
+    found = [f'{where}: {words}: {text[:90]}' for where, text in printed()
+             if (words := unused(text))]
+    assert not found, '\n'.join(found)
+
+
+def test_pages_in_html_are_plain():
+    for page in (ROOT / 'odocal_ros').rglob('*.html'):
+        text = re.sub(r'\{[{%].*?[%}]\}|<[^>]*>', ' ', page.read_text(encoding='utf-8'))
+        assert not unused(text), page.name
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_docs_are_plain(page):
+    found = [f'{number}: {words}' for number, line in enumerate(
+        page.read_text(encoding='utf-8').splitlines(), 1) if (words := unused(line))]
+    assert not found, '\n'.join(found)
+
+
+def test_the_newest_section_of_the_changelog_is_plain():
+    sections = re.split(r'^-+$', (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8'),
+                        flags=re.MULTILINE)
+    found = [f'{words}: {line}' for line in sections[1].splitlines() if (words := unused(line))]
+    assert found == []
+
+
+@pytest.mark.parametrize('path', SETTING_FILES, ids=lambda path: path.name)
+def test_files_of_settings_are_plain(path):
+    found = [f'{number}: {words}' for number, line in enumerate(
+        path.read_text(encoding='utf-8').splitlines(), 1) if (words := unused(line))]
+    assert not found, '\n'.join(found)
+
+
+@pytest.mark.parametrize('code', Code, ids=lambda code: code.name)
+def test_remedies_are_short_sentences(code):
+    for sentence in re.split(r'(?<=[.:;]) ', re.sub(r'\([^)]*\)', '', code.remedy)):
+        assert len(sentence.split()) <= 20, sentence
+
+
+def test_settings_are_described_in_short_sentences():
+    for setting in SETTINGS.values() if isinstance(SETTINGS, dict) else SETTINGS:
+        for sentence in re.split(r'(?<=[.:;]) ', setting.about):
+            assert len(sentence.split()) <= 30, setting.name
+
+
+def test_docstrings_and_comments_are_plain():
+    # 'name : meaning' and 'name=value' name parameters
+    found = [f'{path.relative_to(ROOT)}:{line}: {words}' for path in MODULES
+             for line, text in remarks(path)
+             if (words := unused(re.sub(r'\b\w+ :|\b\w+=', ' ', text)))]
+    assert not found, '\n'.join(found)
+
+
+def test_docstrings_say_what_is_returned():
+    vague = re.compile(r'(?:Return|Tell|Say)s? (?:what|how|why|whether|where|which|when)\b|Tell\b')
+    found = [f'{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}' for path in MODULES
+             for line, text in remarks(path) if vague.match(text)]
+    assert not found, '\n'.join(found)
+
+
+def test_the_words_are_found():
+    assert unused('this drive tells the way; mend the Imu of the node') == [
+        'tells', 'way', 'mend', 'Imu']
+    assert unused('in the same way, `odometer.way` and /imu/way are names of an IMU') == []
