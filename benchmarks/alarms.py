@@ -16,10 +16,10 @@ Vehicles are those of the zoo (docs/zoo.md) without any of its effects, their op
 right. Clean drives are of all kinds and grades, four times ``--drives``, half of them with two
 wheels and half with RTK. Each fault is put into drives of a kind that shows it, of a size that
 real ones have (FAULTS). Drive k of run e has seed 80_000_000 + 1_000_000 e + k, fixed before the
-first run. Rows go to the file line by line: an interrupted run goes on where it stopped.
+first run. Rows go to the file line by line: an interrupted run continues where it stopped.
 
 Printed by code: the fault; in how many drives with it the code is said, in how many clean ones;
-what else is said of the fault's drives, but for what is never false (zoo_table.HONEST).
+what else is said of the fault's drives, but for what is never false (zoo_table.NEVER_FALSE).
 """
 
 import argparse
@@ -37,7 +37,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from resumed import read_rows
 from zoo import configured, GRADES, KINDS
-from zoo_table import BY_KIND, HONEST
+from zoo_table import BY_KIND, NEVER_FALSE
 
 FIRST_SEED, SEEDS_A_RUN = 80_000_000, 1_000_000
 CHEAP = {'imu_rate': 50.0, 'odometer_rate': 20.0, 'fix_rate': 5.0}
@@ -78,7 +78,7 @@ def of_imu(**signals):
 
 
 def matrix(scale):
-    """Return an accelerometer's matrix whose x feels a part of y (1 deg and the like)."""
+    """Return an accelerometer matrix with a share of y in x (for example 1 deg)."""
     return (0.0, scale, 0.0) + (0.0,) * 6
 
 
@@ -88,8 +88,8 @@ FAULTS: dict = {
                    {}, {}, None),
     'REVERSING_UNSIGNED': ('a fifth backwards, no sign', 'yard', {'duration': 600.0}, {}, {},
                            unsigned),
-    'IMU_WORSE_THAN_GRADE': ('consumer IMU, told tactical', 'town', {'imu_grade': 'consumer'},
-                             {}, {'imu.grade': 'tactical'}, None),
+    'IMU_WORSE_THAN_GRADE': ('consumer IMU, configured as tactical', 'town',
+                             {'imu_grade': 'consumer'}, {}, {'imu.grade': 'tactical'}, None),
     'IMU_AXES_SKEW': ('industrial, accelerometer x 1 deg off', 'town',
                       {'imu_grade': 'industrial'}, {'accel_matrix': matrix(DEG)}, {}, None),
     'FIXES_NOISIER_THAN_SAID': ('1.5 m, stated 0.5 m', 'town', {}, {'stated_factor': 1 / 3}, {},
@@ -104,7 +104,7 @@ FAULTS: dict = {
                      {'warming': 0.003, 'warming_time': 200.0}, {}, None),
     'LEVER_ARM_OFF': ('antenna set 0.8 m off', 'town', {},
                       {'antenna_arm_error': (0.8, 0.0, 0.0)}, {}, None),
-    'GYROCOMPASS_REFUSED': ('gyro of 1 deg/h, told navigation', 'straight',
+    'GYROCOMPASS_REFUSED': ('gyro of 1 deg/h, configured as navigation', 'straight',
                             {'imu_grade': 'tactical'}, {}, {
                                 'imu.grade': 'navigation',
                                 'alignment.heading_source': 'gyrocompass',
@@ -163,12 +163,12 @@ def table(rows):
         if not own:
             continue
         beside = Counter(c for r in own for c in r['codes']
-                         if c != code and c not in HONEST | BY_KIND.get(r['kind'], set()))
+                         if c != code and c not in NEVER_FALSE | BY_KIND.get(r['kind'], set()))
         said, false = (sum(code in r['codes'] for r in some) for some in (own, clean))
         print(f'{code:25}{what:42}{f"{said}/{len(own)}":>9}{f"{false}/{len(clean)}":>9}  '
               + ', '.join(f'{c} {n}' for c, n in beside.most_common(4)))
     other = Counter(c for r in clean for c in r['codes'] if c not in FAULTS
-                    and c not in HONEST | BY_KIND.get(r['kind'], set()))
+                    and c not in NEVER_FALSE | BY_KIND.get(r['kind'], set()))
     print('clean drives, beside:', dict(other) or 'nothing', dict(Counter(
         r['verdict'] for r in clean)))
 

@@ -13,16 +13,16 @@ Legs of a vehicle combined on their border: what is stated, and how far it is of
     python benchmarks/border_legs.py [--vehicles 4] [--legs 6] [--grade consumer]
                                      [--fixes correlated|white|rtk] [--file F]
 
-A vehicle has one scale, one mounting and one IMU, whose scale errors are drawn as its grade has
-them (accelerometer by grades.GRADES, gyro by a third of that); biases, road, wheels and fixes are
-each leg's own. The accelerometer's scale error is alike on all axes; the upward one turns the
-pitch by itself times the pitch, and no constant holds that. Legs are town drives of 10 minutes, a
-quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
+A vehicle has one scale, one mounting and one IMU, whose scale errors are drawn from its grade
+(accelerometer: grades.GRADES, gyro: a third of that); biases, road, wheels and fixes are different
+in each leg. The scale error of the accelerometer is the same on all axes; the vertical one changes
+the pitch by its product with the pitch, which is no constant. Legs are town drives of 10 minutes,
+a quarter of an hour apart. Leg j of vehicle k has seed 61_000_000 + 100 k + j.
 
 Printed for scale, yaw and pitch: median stated sigma and RMS of error over sigma of one leg, of
 all legs on their border and, for comparison, of the mean of the same legs weighted by variances
 (as ``two_point`` is combined); chi-square of the legs over its freedom; what they disagree on.
-Rows are kept in the file: an interrupted run goes on where it stopped.
+Rows are kept in the file: an interrupted run continues where it stopped.
 """
 
 import argparse

@@ -8,11 +8,11 @@
 # the License.
 
 """
-A fleet as it must stand: found changes, kills, workers alike, cost of the engine, bad bags.
+Tests of a fleet: detected changes, kills, identical workers, cost of the engine, bad bags.
 
-python benchmarks/fleet.py found FLEET RESULT            what a run found beside the truth
+python benchmarks/fleet.py found FLEET RESULT            result of a run compared with the truth
 python benchmarks/fleet.py kills FLEET                   SIGKILL of workers, scheduler, command
-python benchmarks/fleet.py alike FLEET                   1, 2, 4 workers and TCP: the same rows
+python benchmarks/fleet.py identical FLEET               1, 2, 4 workers and TCP: the same rows
 python benchmarks/fleet.py cost FLEET                    against plain replay, overhead a bag
 python benchmarks/fleet.py spoilt FLEET                  a bag bomb and a bag that hangs
 
@@ -188,9 +188,9 @@ def kills(args):
     print(f'parts of files left: {len(left)}')
 
 
-def alike(args):
+def identical(args):
     """Compare the rows of one, two and four local workers, and of two over TCP."""
-    folder = Path(tempfile.mkdtemp(prefix='fleet_alike_'))
+    folder = Path(tempfile.mkdtemp(prefix='fleet_identical_'))
     rows = {}
     for workers in (1, 2, 4):
         subprocess.run(fleet_command(args.fleet, folder / f'{workers}', '--workers',
@@ -298,18 +298,18 @@ def spoilt(args):
             rows[name] = rows_in(folder / name / 'out')
             print(f'{name}: {len(bags)} bags, {time.monotonic() - began:.0f} s, exit {code}')
     failed = [row for row in rows['spoilt'].values() if row.status == 'failed']
-    alike = sum(rows['spoilt'].get(bag) == row for bag, row in rows['clean'].items())
-    print(f'{alike} of {len(rows["clean"])} rows the same to the last bit; {len(failed)} failed:')
+    same = sum(rows['spoilt'].get(bag) == row for bag, row in rows['clean'].items())
+    print(f'{same} of {len(rows["clean"])} rows the same to the last bit; {len(failed)} failed:')
     for row in failed:
         print(f'  {Path(row.bag).name}: {row.reason}')
 
 
 def main():
-    """Run what is asked for."""
+    """Run the selected tests."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_subparsers(required=True)
-    for function in (found, kills, alike, cost, spoilt):
+    for function in (found, kills, identical, cost, spoilt):
         sub = what.add_parser(function.__name__)
         sub.set_defaults(run=function)
         sub.add_argument('--seed', type=int, default=1)

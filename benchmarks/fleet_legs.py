@@ -48,7 +48,7 @@ def scales(rng, changed):
 
 
 def leg_of(scale, k, rng):
-    """Return what the two-point method says of a vehicle's k-th leg."""
+    """Return the two-point result of the k-th leg of a vehicle."""
     value, sigma = float(scale * (1 + OWN * rng.standard_normal())), float(np.hypot(OWN, SHARED))
     column = np.array([[1.0], [0.0]])
     method = MethodResult('two_point', (), {

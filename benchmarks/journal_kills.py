@@ -12,7 +12,7 @@ What kill -9 costs: the node is killed at random moments of a leg and its journa
 
     python benchmarks/journal_kills.py [--kills 50] [--seed 20260601] [--longest 9] [--stage stop]
 
-Every kill is a new node process that hears a simulated drive over DDS at ten times real time.
+Every kill is a new node process that receives a simulated drive over DDS at ten times real time.
 Lost is the wall time from the newest IMU message in the journal to the kill; the replay must find
 the leg by its start mark. With ``--stage stop`` or ``save`` it is killed after ~/stop_leg or
 ~/save instead, and its result folders are looked at: whole or none, and none wrong.

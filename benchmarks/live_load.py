@@ -16,7 +16,7 @@ What the node costs while it records: beside a bare typed subscriber of the same
 A publisher process sends IMU, speed and fixes of a simulated town drive; the calibrator and a bare
 rclpy node that subscribes to the same topics, typed, with an empty callback, run beside it, all at
 once. Printed, each figure beside its goal where there is one: CPU of one core of the node before
-anything comes (status and diagnostics, which a hearer hears, and looking for messages) and in a
+anything comes (status and diagnostics with one subscriber, and polling) and in a
 leg; that of the bare subscriber in the same seconds; messages lost in the leg and while its result
 is computed; how often there was a new running estimate; the latency of service calls after these
 seconds, ten a second for CALLS_S. No loss is to be seen at --imu 4000 --odometer 250 --fix 25.
@@ -149,7 +149,7 @@ def cpu_percent(processes, seconds: float) -> list[float]:
 
 
 def called(client) -> list[float]:
-    """Return how long calls of a service took, ms."""
+    """Return the durations of service calls, ms."""
     latencies, until = [], time.monotonic() + CALLS_S
     while time.monotonic() < until:
         asked = time.perf_counter()

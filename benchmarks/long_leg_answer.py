@@ -49,7 +49,7 @@ class Sender:
         self._first_ns = int(drive.imu.stamp_ns[0])
 
     def received(self) -> bool:
-        """Return whether the node hears every topic."""
+        """Return True if the node subscribes to every topic."""
         return self._player.matched()
 
     def send(self, first_s: float, last_s: float) -> None:

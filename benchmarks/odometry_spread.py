@@ -12,9 +12,9 @@ Hold the covariance of the node ``odometry`` against the spread of simulated dri
 
     python benchmarks/odometry_spread.py [--drives 50] [--scenario town] [--minutes 10]
 
-Each drive has its own route, gyro, accelerometer and road; the calibration applied errs by as much
-as its sigmas say. Printed: error over sigma of the last pose, rms over the drives (1: honest), and
-how large both are. The pure core is run, fed as the node feeds it.
+Each drive has its own route, gyro, accelerometer and road; the applied calibration has errors
+according to its sigmas. Output: error over sigma of the last pose, rms over the drives (1: correct
+sigma), and the size of both. The pure core runs with the same input as in the node.
 """
 
 import argparse

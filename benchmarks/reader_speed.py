@@ -15,7 +15,7 @@ Reading and replaying an hour's bag beside plain reading: each ratio beside its 
 
 Writes simulated bags of a town drive (200 Hz IMU, 50 Hz counts, 5 Hz fixes; --camera adds 1 GB of
 pictures), each read once before it is timed. Every figure is the median of processes of their own,
-in processor seconds (--wall: on the clock), taken in turn, so that a busy machine hurts all alike.
+in processor seconds (--wall: on the clock), taken in turn, so that other load affects all equally.
 ``read`` are the file's bytes, unpacked where they are packed; ``raw`` is rosbags' iteration over
 the wanted topics, nothing decoded; neither counts its imports. ``auto`` is the replay with all
 files and the report, less what the methods themselves take. --growth compares 10 min with 3 h.

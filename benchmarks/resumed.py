@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Rows of a benchmark that goes on where it was interrupted: one JSON object a line."""
+"""Rows of a benchmark that continues after an interruption: one JSON object per line."""
 
 import json
 

@@ -17,7 +17,7 @@ Vehicles are those of the zoo (docs/zoo.md) without any of its effects, kinds an
 towns where wheels slip or the odometer is in steps; ``zoo``: with all effects but slip, tyres and
 vibration. What is put into the odometer stands in RUNS: lateness, a first-order low pass, steps of
 whole km/h at 2 Hz, spins. Drive k of run e has seed 83_000_000 + 1_000_000 e + k, fixed before the
-first run. Rows go to the file line by line: an interrupted run goes on where it stopped.
+first run. Rows go to the file line by line: an interrupted run continues where it stopped.
 
 Printed by run: how many drives say WHEEL_SLIP, DELAY_SEEN and SPEED_FILTERED, and the verdicts;
 drives of spins in which chance has put none are left out.
@@ -88,7 +88,7 @@ RUNS = {
 
 
 def spins_of(made, drive):
-    """Tell whether a wheel spins in a drive: its last value is not that without spins."""
+    """Return True if a wheel spins in a drive: its last value differs from that without spins."""
     from odocal_ros.sim.scenarios import simulate
     value, without = (d.leg().odometer.value for d in (
         drive, simulate(replace(made, slip_events=0.0))))

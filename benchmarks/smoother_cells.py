@@ -14,22 +14,23 @@ Monte Carlo of the smoother: does the stated sigma hold, and how far is it from 
     python benchmarks/smoother_cells.py --stress [--drives 100]
     python benchmarks/smoother_cells.py --special [--cells dull] [--cells starts]
 
-A cell is a kind of drive: scenario town, 600 s, one IMU grade, white fixes of 1.5 m or RTK ones of
-2 cm at 5 Hz; the heading is drawn and not told. Drive k of cell c has seed 50_000_000 + 100_000 c
-+ k, fixed before the first run. Cells named ``sway`` have what method.md section 3 has: 0.05 m/s
-of sideways and vertical velocity, white at 10 Hz, and a speed odometer at 10 Hz with 0.05 m/s of
-white noise; the others a counter of 2 cm pulses and wheels that never slide.
+A cell is a type of drive: scenario town, 600 s, one IMU grade, white fixes of 1.5 m or RTK ones of
+2 cm at 5 Hz; the heading is drawn and not configured. Drive k of cell c has seed
+50_000_000 + 100_000 c + k, fixed before the first run. Cells
+named ``sway`` have the noise of method.md section 3: 0.05 m/s of sideways and vertical velocity,
+white at 10 Hz, and a speed odometer at 10 Hz with 0.05 m/s of white noise; the others have a
+counter of 2 cm pulses and wheels that never slide.
 
 Printed for scale and yaw: RMS error, RMS of error over stated sigma, RMS of error over the
 posterior bound (covariance only, at the true states) at two sets of noise levels, and the share
 of errors within 1.96 sigmas. The levels are (fit) those that the fit of this drive ended with, and
 (true) those of the simulation. A wheel that never slides has no sideways noise: there, ``true``
-takes the least that the smoother believes in, so that bound is that of an estimator which knows
+uses the lower limit of the smoother, so that bound is that of an estimator which knows
 what no one can know; the goal then looks at (fit), in the sway cells at (true).
 
 Goals: 40 drives a cell, RMS over bound at most 1.4 in each and 0.86 to 1.15 over all, share at
 least 82 % in each and 91 to 98.5 % over all, no failure. Under stress, 100 drives a cell: share at
-least 87 % in each. Results go to the file line by line: an interrupted run goes on where it
+least 87 % in each. Results go to the file line by line: an interrupted run continues where it
 stopped.
 """
 

@@ -43,7 +43,7 @@ def special(simulated, true_levels, drives, parts):
 
 def _print_dull(simulated, true_levels, drives):
     print('Sigma of the yaw against bounds at the truth, deg. bound: levels of the simulation,\n'
-          'none below the least believed on such a drive. sliding: as method.md has it, 0.05 m/s\n'
+          'none below the lower limit on such a drive. sliding: as method.md has it, 0.05 m/s\n'
           'sideways at 10 Hz, but not at rest (with that too, 0.101 and 0.0070 deg)')
     for number, (options, promise) in enumerate(DULL):
         first = FIRST_SEED + 1000 * number
@@ -95,7 +95,7 @@ def _dull(simulated, true_levels, seeds, options, promise):
 
 def _starts(simulated, seed, grade, noise, worst):
     drive, config = simulated(seed, scenario='town', imu_grade=grade, fix_noise=noise)
-    # scale errors of the accelerometer are believed by its axes: a turned IMU is another one
+    # priors of accelerometer scale errors are by axis: a rotated IMU has others
     config = with_settings(config, {'imu.accel_scale_sigma': 0.0})
     leg = leg_of(drive.leg(), config)
     usual = smooth(leg, config)

@@ -12,7 +12,7 @@ A long day of the node: hours of simulated time, a leg every quarter of an hour,
 
     python benchmarks/soak.py [--hours 24] [--speedup 40] [--legs 100] [--log FILE]
 
-The node runs in simulated time (/clock) and hears drives out and back, the same ten again and
+The node runs in simulated time (/clock) and receives out-and-back drives, the same ten again and
 again, with stamps that go on; between the drives its sensors are silent. After each leg are
 printed: memory, threads and descriptors of the process, the latency of a service call in the leg,
 the time that the answer of ~/stop_leg took, what is in the output folder, and how far the scale
@@ -75,7 +75,7 @@ class Day:
         self.now_s, self._due = 0.0, time.monotonic()
 
     def received(self) -> bool:
-        """Return whether the node hears the topics, and the clock some time ago."""
+        """Return True if the node subscribes to the topics and has received the clock."""
         self.tell_time()
         time.sleep(0.5)
         return self._player.matched() and bool(self._clock.get_subscription_count())
@@ -132,7 +132,7 @@ class Day:
 
 
 def size_mib(folder: Path) -> float:
-    """Return what a folder takes."""
+    """Return the size of a folder."""
     return sum(f.stat().st_size for f in folder.rglob('*') if f.is_file()) / 2**20
 
 
@@ -166,7 +166,7 @@ def one_leg(day, client, node, folder, leg, truth) -> Look:
 
 
 def grown(looks: list[Look]) -> list[str]:
-    """Return what has grown from the second quarter of the legs to the last, for people."""
+    """Return the growth from the second quarter of the legs to the last, as text."""
     quarter = len(looks) // 4
     found = []
     for name, most in GROWTH.items():

@@ -13,7 +13,7 @@ Monte Carlo of the two-point method, to see whether the stated sigma holds.
     python benchmarks/two_point_cells.py [--drives 2000] [--processes 2] [--only TEXT] [--file F]
 
 Each cell (scenario, IMU grade, kind of fix noise) is driven N times through ``pipeline.calibrate``
-with errors drawn anew: gyro and accelerometer biases, walks and noise, heading, fixes, where the
+with new random errors: gyro and accelerometer biases, walks and noise, heading, fixes, where the
 encoder's disc stands. Printed for scale and yaw: mean error, RMS error, RMS of error / stated
 sigma, share of errors within 1.96 stated sigmas. Goal at N = 2000: ratio 0.93 to 1.07, share
 93.5 to 96.5 % (its own noise there is 1.6 % and 0.5 %, 1 sigma). Drive k of cell c has seed
@@ -22,7 +22,7 @@ error of 3.6' (the paper's), navigation ones gyrocompass. ``yaw - heading`` is t
 heading error and its share of the sigma taken out, so that the small sources are seen too.
 
 The motion is computed once a cell and only the errors are redrawn, at low sensor rates. Results go
-to the file line by line: a run that was interrupted goes on where it stopped.
+to the file line by line: an interrupted run continues where it stopped.
 """
 
 import argparse
@@ -103,7 +103,7 @@ class Cell:
         return recorder.close(self.truth.start_ns, self.stop_ns)
 
     def config(self, seed: int):
-        """Return what the operator of such a drive sets, and the error of the heading, rad."""
+        """Return the settings of such a drive, and the error of the heading, rad."""
         from odocal_ros.settings.config import Config, with_settings
         from odocal_ros.sim.noise import stream
         settings = {'imu.grade': self.options.imu_grade,

@@ -12,9 +12,9 @@ Monte Carlo of the two-point method over whole simulated drives: whether stated 
 
     python benchmarks/two_point_monte_carlo.py [--drives 100] [--first-seed 1000] [--only TEXT]
 
-Each case is driven N times, route, sensors and fixes drawn anew, at low sensor rates, with a
+Each case is driven N times, with new random route, sensors and fixes, at low sensor rates, with a
 heading known to 1 mrad. Printed for scale, yaw and pitch: mean of error / sigma, its RMS, and the
-share of drives within 1.96 sigmas. At N drives the mean strays by 1 / sqrt(N), the RMS by
+share of drives within 1.96 sigmas. At N drives the mean varies by 1 / sqrt(N), the RMS by
 1 / sqrt(2 N), the share by sqrt(0.0475 / N), 1 sigma. ``partly slow`` fixes are white but for a
 seventh of their variance: the hardest to see. benchmarks/two_point_cells.py runs thousands of
 drives over three routes with the motion computed once.

@@ -8,21 +8,21 @@
 # the License.
 
 """
-Monte Carlo of drives with two wheels, to see whether the stated sigmas hold.
+Monte Carlo simulation of drives with two wheels: test of the stated sigmas.
 
     python benchmarks/wheels_monte_carlo.py [--drives 200] [--processes 1] [--cell TEXT] [--file F]
 
-Each cell (scenario, IMU grade, fix noise, what is told) is driven N times for 300 s with two
-wheels (the IMU sends 50 Hz, the wheels 20, fixes 5), errors drawn anew from what the settings
-believe: gyro and accelerometer biases, walks and noise, the gyro's scale (by its grade), fixes,
-where the encoders' discs stand, latency of the fixes (50 ms), of the odometer (10 ms), the
-antenna's place (0.1 m), and the track width where one is given (2 %); routes of the town are drawn
+Each cell (scenario, IMU grade, fix noise, known values) is driven N times for 300 s with two
+wheels (IMU 50 Hz, wheels 20 Hz, fixes 5 Hz), with new random errors from the priors of the
+settings: gyro and accelerometer biases, random walks and noise, the gyro scale (by its grade),
+fixes, angles of the encoder discs, latency of the fixes (50 ms), of the odometer (10 ms), the
+antenna position (0.1 m), and the track width if it is given (2 %); routes of the town are random
 too. The whole pipeline runs, as for a recording. Printed for the scale of the mean, of each wheel,
 for the ratio of right to left, the yaw mounting angle and the track width: mean error, RMS error,
 median stated sigma, RMS of error / stated sigma, share within 1.96 sigmas. Goal at N = 2000: ratio
 0.93 to 1.07, share 93.5 to 96.5 % (its own noise there is 1.6 % and 0.5 %, 1 sigma). Drive k of
 cell c has seed 40_000_000 + 100_000 c + k, fixed before the first run. Results go to the file line
-by line: an interrupted run goes on where it stopped.
+by line: an interrupted run continues where it stopped.
 """
 
 import argparse

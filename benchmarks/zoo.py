@@ -17,7 +17,7 @@ Each drive is of a vehicle drawn by ``odocal_ros/sim/draw.py`` (docs/zoo.md), al
 or one alone (``--only clean``: none), configured as its operator would. Drive k of a run has seed
 70_000_000 + 1_000_000 e + k, fixed before the first run; e counts the effects, 0 for all. Kinds of
 drive and grades take turns, so that 15 drives hold each pair once. Rows go to the file line by
-line: an interrupted run goes on where it stopped.
+line: an interrupted run continues where it stopped.
 
 Printed by effect, kind and grade, for scale, yaw and pitch by the IMU's own axes (and by its
 housing, where the product states that): how many were given in drives that are not rejected, share
@@ -104,7 +104,7 @@ def run_drive(seed, duration=None):
 
 
 def compact(options):
-    """Return what was drawn, to four digits: only what is not as in a plain drive."""
+    """Return the drawn values that differ from a plain drive, to four digits."""
     from odocal_ros.sim.options import resolved, SimOptions
     plain = asdict(resolved(SimOptions(scenario=options.scenario, odometer=options.odometer)))
     own = asdict(options)

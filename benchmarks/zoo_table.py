@@ -17,8 +17,8 @@ WITHIN, OFF = 1.96, 3.5
 MDEG = 1e3 * 180 / np.pi
 FIGURES = (('scale', 'ppm', 1e6), ('yaw', 'mdeg', MDEG), ('pitch', 'mdeg', MDEG),
            ('yaw_housing', 'mdeg', MDEG), ('pitch_housing', 'mdeg', MDEG))
-# what tells of the drive or of the sigmas, and is never false
-HONEST = {'PARAMETER_NOT_DETERMINED', 'SCALE_SIGMA_TOO_LARGE', 'YAW_SIGMA_TOO_LARGE',
+# statements about the drive or the sigmas, never false
+NEVER_FALSE = {'PARAMETER_NOT_DETERMINED', 'SCALE_SIGMA_TOO_LARGE', 'YAW_SIGMA_TOO_LARGE',
           'YAW_NOT_DETERMINED', 'YAW_NOT_SEPARABLE', 'PITCH_NOT_DETERMINED', 'LEG_NOT_STRAIGHT',
           'CHORD_TOO_SHORT', 'SCALE_NOT_DETERMINED', 'GYROCOMPASS_REFUSED', 'HEADING_UNAVAILABLE',
           'NOT_CONVERGED', 'METHOD_REJECTED'}
@@ -30,7 +30,7 @@ TYRES = {'SCALE_VARIES'}
 WHEELS = {'WHEEL_SLIP', *GENERAL}
 EXPLAINS = {
     'triads': IMU, 'g_sensitivity': IMU, 'bias': {'TRACK_MISMATCH', *IMU},
-    'temperature': {'TRACK_MISMATCH', *IMU},      # what the standstill told no longer holds
+    'temperature': {'TRACK_MISMATCH', *IMU},      # values from the standstill are no longer valid
     'vibration': IMU | WHEELS, 'grade': IMU,
     'imu_stamps': {'DELAY_SEEN', 'STAMPS_NOT_RISING', 'CLOCKS_DIFFER', *IMU},
     'coarse_speed': {'SPEED_COARSE', *WHEELS}, 'coarse_pulses': {'COUNTER_COARSE', *GENERAL},
@@ -53,25 +53,25 @@ def explained(row):
 
 
 def off(row):
-    """Tell whether a row that is not rejected has a figure far beyond its sigma."""
+    """Return True if a row that is not rejected has a value far beyond its sigma."""
     return row['verdict'] in ('accepted', 'caution') and any(
         abs(row[f'{key}_error']) > OFF * row[f'{key}_sigma'] for key, _, _ in FIGURES
         if f'{key}_sigma' in row)
 
 
 def silent(row):
-    """Tell whether no reason of a row is explained by what is there."""
+    """Return True if no reason of a row is explained by an effect of the drive."""
     return not set(row['codes']) & explained(row)
 
 
 def unnamed(row):
-    """Tell whether no reason of a row names a cause that is there."""
+    """Return True if no reason of a row names a cause of the drive."""
     return not set(row['codes']) & explained(row) - GENERAL
 
 
 def false_codes(row):
     """Return the reasons that nothing explains."""
-    return set(row['codes']) - HONEST - explained(row)
+    return set(row['codes']) - NEVER_FALSE - explained(row)
 
 
 def print_tables(rows):

@@ -8,10 +8,10 @@
 # the License.
 
 """
-Take an odometer of a type that odocal does not know: python add_message_type.py BAG.
+Use an odometer with an unknown message type: python add_message_type.py BAG.
 
-Here the speed comes as geometry_msgs/Vector3Stamped, in vector.x. A type of your own works alike:
-a bag has its definition inside. Types that many vehicles send are worth a line in
+Here the speed is in vector.x of geometry_msgs/Vector3Stamped. Your own types work in the same way:
+their definition is in the bag. For types of many vehicles, add a line to
 odocal_ros/messages/odometer_types.py.
 """
 

@@ -56,7 +56,8 @@ WORDS = {
     r'in vain|hence|thereof|therein|aught|naught|thence|whereof': 'plain words',
 }
 UNUSED = re.compile(r'(?<![\w/.`:-])(?:(?i:' + '|'.join(WORDS) + r')|Imus?)(?![\w/`-])')
-MODULES = [path for path in sorted((ROOT / 'odocal_ros').rglob('*.py'))
+MODULES = [path for folder in ('odocal_ros', 'benchmarks', 'tools', 'examples')
+           for path in sorted((ROOT / folder).rglob('*.py'))
            if 'calib' not in path.relative_to(ROOT).parts]      # calib: printed text only
 PAGES = [*sorted(ROOT.glob('*.md')), *sorted((ROOT / 'docs').rglob('*.md'))]
 SETTING_FILES = [path for folder in ('config', 'launch')

@@ -33,7 +33,7 @@ MILLISECONDS = 1e11      # a time in UTC that is larger is none in seconds
 FLU = np.array([1.0, -1.0, -1.0])                          # forward-right-down to ours
 K0 = 0.01                # m, of a pulse derived from the speed
 WHEELS = ('front_left', 'front_right', 'rear_left', 'rear_right')
-PIECES = 12              # of which the scatter tells the sigma of the scale
+PIECES = 12              # sections whose scatter gives the sigma of the scale
 LEAST_SIGMA = 6e-4       # of the scale: pose and fixes differ by half of it in Example_1
 TRUTH = """\
 bag: bag
@@ -143,7 +143,7 @@ def fix_topics(segment, clock):
 
 
 def scale_by_pose(segment, clock):
-    """Return the way of the pose over that of the speed, and its sigma by pieces of the drive."""
+    """Return the ratio of path lengths, pose over speed, and its sigma from sections."""
     t, speed = log(segment, 'CAN/speed')
     v = np.linalg.norm(array(segment, 'global_pose/frame_velocities', 3)[:, :3], axis=1)
     if len(v) != len(clock.boot):
@@ -160,7 +160,7 @@ def scale_by_pose(segment, clock):
 
 
 def way_of(t, speed):
-    """Return the way since the first of speeds, m."""
+    """Return the path length since the first of speeds, m."""
     return np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(t)))
 
 

@@ -10,7 +10,7 @@
 """
 Pages made from the settings and reasons: config/calibrator.yaml and its like, docs/*.md.
 
-``python -m tools.settings_page`` tells whether they agree with the code, ``--write`` makes
+``python -m tools.settings_page`` compares them with the code, ``--write`` makes
 them agree. A test says so too.
 """
 
@@ -51,7 +51,7 @@ TYPES = {'bool': 'bool', 'int': 'int', 'float': 'double', 'str': 'string', 'floa
 
 
 def scalar_text(value) -> str:
-    """Return a value as YAML that rcl and YAML 1.1 readers type alike."""
+    """Return a value as YAML with the same type for rcl and YAML 1.1 readers."""
     if isinstance(value, (tuple, list)):
         return f'[{", ".join(scalar_text(v) for v in value)}]'
     import yaml
@@ -115,7 +115,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
 
 
 def main() -> int:
-    """Tell which pages are stale (exit 1), or write them."""
+    """Print the stale pages (exit 1), or write them."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--write', action='store_true', help='write the pages that are stale')
     write = parser.parse_args().write

@@ -7,7 +7,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""A terminal panel of ``~/status``: state, what to do, bars of what is enough."""
+"""A terminal panel of ``~/status``: state, next action, and progress bars towards the limits."""
 
 from math import degrees, isfinite, nan
 
@@ -43,8 +43,8 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
     driven, lacks = number(status, 'distance_m'), number(status, 'metres_to_least')
     stand = number(status, 'seconds_to_stand')
     done = driven / (driven + lacks) if driven + lacks > 0 else 0.0
-    found = {'way': (done, f'{lacks:.0f} m to go'),
-             'standing': (1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go')}
+    found = {'path': (done, f'{lacks:.0f} m to go'),
+             'standstill': (1 - stand / REST_FORESEEN_S, f'{stand:.0f} s to go')}
     for name, unit in (('scale', 'ppm'), ('yaw', 'deg')):
         asked = number(status, f'asked_{name}_sigma_{unit}')
         sigma = number(status, f'predicted_{name}_sigma_{unit}') or _of_result(status)[name]
@@ -56,7 +56,7 @@ def shares(status: dict[str, str]) -> dict[str, tuple[float, str]]:
 
 
 def _of_result(status: dict[str, str]) -> dict[str, float]:
-    """Return the sigmas of the result, as what is foreseen has them; 0 in a leg, or of none."""
+    """Return the sigmas of the result in the units of the forecast; 0 in a leg or without them."""
     if status.get('state') == 'recording':
         return {'scale': 0.0, 'yaw': 0.0}
     relative = number(status, 'scale_factor_sigma') / (number(status, 'scale_factor') or nan)
@@ -65,7 +65,7 @@ def _of_result(status: dict[str, str]) -> dict[str, float]:
 
 
 def number(status: dict[str, str], key: str) -> float:
-    """Return a value of the status, 0 where there is none."""
+    """Return a value of the status, 0 if it is missing."""
     try:
         value = float(status.get(key, ''))
     except ValueError:
@@ -78,7 +78,7 @@ def _bars(status: dict[str, str]) -> Table:
     for label, (share, words) in shares(status).items():
         full = share >= 1.0
         grid.add_row(label, ProgressBar(1.0, max(share, 0.0), width=40, complete_style=(
-            'green' if full else 'yellow'), finished_style='green'), 'enough' if full else words)
+            'green' if full else 'yellow'), finished_style='green'), 'OK' if full else words)
     return grid
 
 

@@ -59,7 +59,7 @@ def test_the_panel_shows_a_running_node(start, connect):
     ended = subprocess.run(ODOCAL, capture_output=True, text=True, timeout=PATIENCE, check=False,
                            env=os.environ | {'PYTHONPATH': paths, 'COLUMNS': '120'})
     assert ended.returncode == 0, ended.stderr
-    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'way', 'limit 1000 ppm'):
+    for words in ('/calibrator', 'waiting', 'no IMU on /imu/data', 'path', 'limit 1000 ppm'):
         assert words in ended.stdout
 
 
@@ -87,7 +87,7 @@ def test_the_bars_are_shares_of_what_is_asked():
                     'asked_scale_sigma_ppm': '1000.0', 'predicted_scale_sigma_ppm': '4000.0',
                     'asked_yaw_sigma_deg': '0.5', 'predicted_yaw_sigma_deg': ''})
     assert {name: share for name, (share, _) in found.items()} == {
-        'way': 0.75, 'standing': 0.6, 'scale': 0.25, 'yaw': 0.0}
+        'path': 0.75, 'standstill': 0.6, 'scale': 0.25, 'yaw': 0.0}
     # after a leg it is the result that is held against what is asked
     done = {'state': 'calibrated', 'asked_scale_sigma_ppm': '1000.0', 'scale_factor': '0.02',
             'scale_factor_sigma': '0.00004', 'asked_yaw_sigma_deg': '0.5',
