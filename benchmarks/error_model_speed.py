@@ -13,7 +13,8 @@ import time
 
 import numpy as np
 
-from odocal_ros.paper.error_model import planned_path, propagate, transition
+from odocal_ros.paper.error_model import propagate, transition
+from odocal_ros.paper.path import planned_path
 
 HOUR, RATE = 3600, 50
 
