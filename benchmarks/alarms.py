@@ -126,6 +126,8 @@ FAULTS: dict = {
     'WHEELS_SWAPPED': ('left is right', 'town', {'two_wheels': True}, {}, {},
                        lambda leg, rng: replace(leg, odometer=leg.odometer_right,
                                                 odometer_right=leg.odometer)),
+    'GYRO_AXES': ('gyro x has the wrong sign', 'town', {'duration': 600.0}, {}, {},
+                  of_imu(w_i=lambda w: w * [-1.0, 1.0, 1.0])),
 }
 RUNS = ('clean', *FAULTS)
 

@@ -97,6 +97,8 @@ class Code(Enum):
                               'steering, tracks) also looks like this: then change nothing.')
     GYRO_SIGN = REJECT, ('Check the IMU axes: set imu.mounting_rpy, or correct the signs in the '
                          'driver.')
+    GYRO_AXES = REJECT, ('Correct the axes of angular_velocity in the IMU driver. '
+                         'imu.mounting_rpy cannot: it rotates gyro and accelerometer together.')
     BAG_TRUNCATED = CAUTION, 'Stop recordings with Ctrl-C. All readable messages were used.'
     STOP_MARK_MISSING = CAUTION, ('Mark the end with ~/stop_leg, or give --leg. Data up to the '
                                   'end of the recording was used.')

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.data.arrays import Floats
+from odocal_ros.data.arrays import Floats, Ints
 from odocal_ros.data.mapped import let_go, room
 
 Array = NDArray[Any]
@@ -90,6 +90,39 @@ def medians(x: Floats) -> Floats:
             column[rows] = x[rows, k]
         found.append(median(column))
     return np.array(found)
+
+
+def bin_means(t: Floats, edges: Floats, *vectors: Floats) -> tuple[Ints, list[Floats]]:
+    """
+    Return how many rows lie in each bin, and the mean of each vector there.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Times of the rows, rising.
+    edges : (m + 1,) array
+        Of the bins, in the same unit; a bin holds its upper edge.
+    vectors : (n, k) arrays
+        Values of the rows.
+
+    Returns
+    -------
+    (m,) counts, (m, k) means; 0 in an empty bin.
+
+    """
+    first = np.searchsorted(t, edges, side='right')
+    count = np.diff(first)
+    means = [np.empty((len(count), vector.shape[1])) for vector in vectors]
+    bins_at_a_time = 64    # bins worked on at a time
+    for bins in (slice(k, k + bins_at_a_time) for k in range(0, len(count), bins_at_a_time)):
+        rows = slice(first[bins.start], first[bins.start + len(count[bins])])
+        cell = np.repeat(np.arange(len(count[bins])), count[bins])
+        for mean, vector in zip(means, vectors, strict=True):
+            for k, column in enumerate(vector[rows].T):
+                mean[bins, k] = np.bincount(cell, column, len(count[bins]))
+        let_go()
+    divisor = np.maximum(count, 1)[:, None]
+    return count, [mean / divisor for mean in means]
 
 
 def pieces(times: Array, t: Array) -> Iterator[tuple[slice, slice]]:

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.drive import judge_drive, judge_way, not_moving, uncovered
+from odocal_ros.calib.gyro_axes import gyro_axes
 from odocal_ros.calib.mounting import with_axes
 from odocal_ros.calib.turning import gyro_reasons, turn_ratio
 from odocal_ros.calib.wheels.wheel_slips import NO_SLIPS, WheelSlips
@@ -128,11 +129,14 @@ def _standing(inputs: Inputs, placed: Placed) -> tuple[Reason, ...] | None:
 
 
 def _turning(inputs: Inputs, config: Config, placed: Placed) -> tuple[Reason, ...]:
-    """Return the reason for a gyro that does not turn with the course of the fixes."""
+    """Return the reason for a gyro that does not turn with the fixes or with gravity."""
     up_b = inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b)
     ratio = turn_ratio(inputs.t_imu, by_row(lambda w_b: w_b @ up_b, inputs.w_b),
                        inputs.t_fix, placed.fixes_n, placed.fix_sigma)
-    return gyro_reasons(ratio, config.imu.gyro_scale)
+    scale_or_sign = gyro_reasons(ratio, config.imu.gyro_scale)
+    if any(r.code is Code.GYRO_SIGN for r in scale_or_sign):
+        return scale_or_sign
+    return gyro_axes(inputs, placed) or scale_or_sign
 
 
 def _wheels_beside(inputs: Inputs, config: Config, placed: Placed, track: Track,

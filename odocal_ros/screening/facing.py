@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from odocal_ros.data.arrays import Floats
-from odocal_ros.data.mapped import let_go
+from odocal_ros.data.pieces import bin_means
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.dead_reckoning import forward_b, mounting_from_forward
 from odocal_ros.nav.odometer import Travel
@@ -82,18 +82,8 @@ def pushes(t: Floats, w: Floats, f: Floats, up: Floats, travel: Travel,
     if t1 - t0 < FEWEST_BINS_FACING * BIN_S:
         return None
     edges = np.arange(t0, t1, BIN_S)
-    first = np.searchsorted(t, edges, side='right')
-    count = np.diff(first)
-    means = np.empty((len(count), 4))
-    bins_at_a_time = 64    # bins worked on at a time
-    for bins in (slice(k, k + bins_at_a_time) for k in range(0, len(count), bins_at_a_time)):
-        rows = slice(first[bins.start], first[bins.start + len(count[bins])])
-        cell = np.repeat(np.arange(len(count[bins])), count[bins])
-        for k, column in enumerate((*f[rows].T, w[rows] @ up)):
-            means[bins, k] = np.bincount(cell, column, len(count[bins]))
-        let_go()
-    means /= np.maximum(count, 1)[:, None]
-    f, turn_rate = means[:, :3].copy(), means[:, 3].copy()
+    count, (f, w) = bin_means(t, edges, f, w)
+    turn_rate = w @ up
     speed = np.diff(travel.at(edges)) * metres_per_unit / BIN_S
     middle = (edges[:-1] + edges[1:]) / 2
     onward = (travel.at(middle + BIN_S) - 2 * travel.at(middle) + travel.at(middle - BIN_S)) \

@@ -17,6 +17,8 @@ import struct
 import yaml
 
 from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
+from odocal_ros.messages.cdr import layout_of
+from odocal_ros.messages.sensor_types import IMU
 from odocal_ros.outside.limits import zstd_module
 
 INTEGERS = [0, 1, -1, 2, 127, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62,
@@ -230,6 +232,23 @@ def sqlite_values(rng, bag):
     db.close()
 
 
+def sqlite_gyro_axes(rng, bag):
+    """Send the axes of the gyro in another order or with other signs, in every message."""
+    order = rng.sample(range(3), 3)
+    signs = [rng.choice([1.0, -1.0]) for _ in order]
+    with sqlite3.connect(file_of(bag)) as db:
+        rows = db.execute('SELECT messages.id, data FROM messages JOIN topics ON topic_id = '
+                          'topics.id WHERE type = ?', [IMU]).fetchall()
+        at, _ = layout_of(IMU, rows[0][1]).find('angular_velocity.x')
+        changed = []
+        for key, data in rows:
+            rates = struct.unpack_from('<3d', data, at)
+            turned = [sign * rates[k] for sign, k in zip(signs, order, strict=True)]
+            changed.append((data[:at] + struct.pack('<3d', *turned) + data[at + 24:], key))
+        db.executemany('UPDATE messages SET data = ? WHERE id = ?', changed)
+    db.close()
+
+
 def sqlite_pages(rng, bag):
     """Change the heads of pages: kinds, cells, where they lead."""
     file = file_of(bag)
@@ -331,7 +350,8 @@ def texts(rng: random.Random, folder):
 
 
 OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, metadata],
-      'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_pages, metadata],
+      'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_gyro_axes,
+                  sqlite_pages, metadata],
       'rosbag1': [raw, clump, ros1_inside, ros1_inside],
       'file': [raw, clump, metadata],                   # packed as a whole, and
       'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached

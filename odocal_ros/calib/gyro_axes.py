@@ -1,0 +1,146 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Gyro axes against the accelerometer and against the course of the fixes.
+
+A rotation of the whole Imu (imu.mounting_rpy) turns gyro and accelerometer together. Here the gyro
+alone has an axis with the wrong sign, or two axes exchanged: no rotation corrects that.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from odocal_ros.calib.check import ONE_MOTION_RATIO
+from odocal_ros.calib.turning import turn_ratio
+from odocal_ros.data.arrays import Floats
+from odocal_ros.data.pieces import by_row
+from odocal_ros.reasons import Code, Reason
+from odocal_ros.screening.gravity_turn import gravity_fit
+from odocal_ros.screening.placed import Placed
+
+if TYPE_CHECKING:
+    from odocal_ros.screening.screen import Inputs
+
+Found = list[tuple[str, str, str]]      # sent axis, true axis with its sign, sentence
+SOUND = np.array([1.0, 1j, 0.0])     # definition: coefficients of a sound gyro
+TURNED = np.array([1.0, -1.0, 1j, -1j])      # definition: of axes mirrored or exchanged
+# statistical: all four must hold
+LARGEST_SIGMA, FAR_SIGMAS, NEAR_TURNED, FEWEST_SEGMENTS = 0.2, 5.0, 0.4, 4.0
+
+
+def sensor_axes(up: Floats) -> tuple[Floats, list[str]]:
+    """
+    Return the axes of a sensor, levelled, and their names.
+
+    Parameters
+    ----------
+    up : (3,)
+        Unit vector in the sensor's frame.
+
+    Returns
+    -------
+    (3, 3) rows e1, e2, up, right-handed, and the sensor axis next to each, as "-y".
+
+    """
+    k = int(np.argmax(np.abs(up)))
+    first, second = np.eye(3)[(k + 1) % 3], np.sign(up[k]) * np.eye(3)[(k + 2) % 3]
+    e1 = first - (first @ up) * up
+    e1 /= np.linalg.norm(e1)
+    axes = np.stack([e1, np.cross(up, e1), up])
+    return axes, [_name(axis) for axis in (first, second, np.sign(up[k]) * np.eye(3)[k])]
+
+
+def gyro_axes(inputs: 'Inputs', placed: Placed) -> tuple[Reason, ...]:
+    """
+    Return GYRO_AXES where an axis of the gyro is mirrored, or two are exchanged.
+
+    Parameters
+    ----------
+    inputs : Inputs
+        A screened leg.
+    placed : Placed
+        Its fixes in metres and approximate scale.
+
+    Returns
+    -------
+    Nothing where the drive does not show it: a flat road has no roll and pitch, a straight one no
+    yaw.
+
+    """
+    w_i, f_i = (by_row(lambda x: x @ inputs.C_bi, x) for x in (inputs.w_b, inputs.f_b))
+    up = inputs.usual_f_b @ inputs.C_bi
+    axes, names = sensor_axes(up / np.linalg.norm(up))
+    found = by_course(inputs, placed, w_i, axes, names)
+    if not found and inputs.felt:
+        found = by_gravity(inputs, placed, w_i, f_i, axes, names)
+    if not found:
+        return ()
+    do = ', '.join(f'negate angular_velocity.{sent}' if sent == true[-1] else
+                   f'publish angular_velocity.{sent} as {true[:-1]}angular_velocity.{true[-1]}'
+                   for sent, true, _ in found)
+    if len(found) == 1 and found[0][0] != found[0][1][-1]:
+        do += ', and check the other axes'
+    return (Reason(Code.GYRO_AXES, '; '.join(text for *_, text in found),
+                   f'Correct the IMU driver: {do}. imu.mounting_rpy cannot correct this: it '
+                   'rotates gyro and accelerometer together.'),)
+
+
+def by_course(inputs: 'Inputs', placed: Placed, w_i: Floats, axes: Floats,
+              names: list[str]) -> Found:
+    """Return a level axis of the gyro that measures the yaw rate instead of the upright one."""
+    def ratio(axis: Floats) -> float | None:
+        return turn_ratio(inputs.t_imu, by_row(lambda w: w @ axis, w_i), inputs.t_fix,
+                          placed.fixes_n, placed.fix_sigma)
+
+    def one_motion(ratio: float | None) -> bool:
+        return ratio is not None and ONE_MOTION_RATIO[0] < abs(ratio) < ONE_MOTION_RATIO[1]
+    if one_motion(ratio(axes[2])):
+        return []
+    found: Found = []
+    for name, axis in zip(names[:2], axes[:2], strict=True):
+        turns = ratio(axis)
+        if turns is not None and one_motion(turns):
+            sent, true = _measured(name, names[2], turns)
+            found.append((sent, true, f'angular_velocity.{sent} turns with the course of the '
+                          f'fixes (ratio {turns:.2f}), angular_velocity.{names[2][-1]} does not'))
+    return found
+
+
+def by_gravity(inputs: 'Inputs', placed: Placed, w_i: Floats, f_i: Floats, axes: Floats,
+               names: list[str]) -> Found:
+    """Return the gyro axes that clearly follow another direction of the accelerometer."""
+    fit = gravity_fit(inputs.t_imu, w_i, f_i, axes, inputs.travel, placed.rough)
+    found: Found = []
+    if fit is None:
+        return found
+    for k in np.flatnonzero((fit.sigma < LARGEST_SIGMA) & (fit.segments > FEWEST_SEGMENTS)):
+        c = fit.coefficient[k]
+        nearest = TURNED[np.argmin(np.abs(TURNED - c))]
+        if (nearest == SOUND[k] or abs(c - nearest) > NEAR_TURNED
+                or abs(c - SOUND[k]) < FAR_SIGMAS * fit.sigma[k]):
+            continue
+        along, part = (names[0], c.real) if nearest.imag == 0 else (names[1], c.imag)
+        sent, true = _measured(names[k], along, float(part))
+        found.append((sent, true, f'angular_velocity.{sent} measures the turn of gravity about '
+                      f'{true} (coefficient {abs(part):.2f} ± {fit.sigma[k]:.2f})'))
+    return found
+
+
+def _measured(sent: str, true: str, part: float) -> tuple[str, str]:
+    """Return a sent axis without its sign, and the axis that it measures with the sign due."""
+    minus = (part < 0) ^ sent.startswith('-') ^ true.startswith('-')
+    return sent[-1], '-' * minus + true[-1]
+
+
+def _name(axis: Floats) -> str:
+    """Return a sensor axis by name, as "-y"."""
+    k = int(np.argmax(np.abs(axis)))
+    return '-' * bool(axis[k] < 0) + 'xyz'[k]

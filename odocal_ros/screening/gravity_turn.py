@@ -1,0 +1,176 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Fit of the direction of gravity to the gyro, one coefficient for each axis of the gyro.
+
+Hills, bumps and braking tilt a vehicle: gravity turns in the frame of the accelerometer, and the
+gyro must measure that turn. In level axes that the yaw psi of the gyro holds still, the specific
+force, as a complex number e1 + i e2, is
+
+    F = F0 + i g int (w1 + i w2) exp(i psi) dt + d/dt (v exp(i psi)).
+
+Each gyro axis has a coefficient of its own, so the second term is
+``i g int (c1 w1 + c2 w2 + c3 w3) exp(i psi) dt`` with c = (1, i, 0) for a sound gyro. A mirrored
+axis has the opposite coefficient, exchanged axes have exchanged coefficients.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from odocal_ros.data.arrays import Bools, Floats
+from odocal_ros.data.pieces import bin_means
+from odocal_ros.nav.odometer import Travel
+from odocal_ros.settings.grades import G
+
+Complexes = NDArray[np.complex128]
+ROW_S, ROWS_A_SECOND = 0.25, 4       # s, judgement: the yaw between rows stays small
+# tuned by benchmarks/zoo.py, 90 drives of 150 to 600 s: shorter or longer segments detect less
+SEGMENTS, SHORTEST_S, LONGEST_S = 12, 10, 30
+MOVING_SPEED = 0.5      # m/s, judgement: mean of a segment in which a vehicle drives
+WEIGHTING_PASSES = 4    # judgement: the weights of segments have settled
+
+
+@dataclass(frozen=True, eq=False)
+class GravityFit:
+    """
+    Coefficients of the gyro axes w1, w2, w3.
+
+    coefficient : (3,) complex, 1, i and 0 for a sound gyro.   sigma : (3,) from the scatter of
+    the segments.   segments : (3,) how many segments determine it, effectively.
+    """
+
+    coefficient: Complexes
+    sigma: Floats
+    segments: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """
+    A drive in rows of ROW_S seconds.
+
+    w, f : (m, 3) rad/s and m/s^2, in e1, e2, up.   s : (m + 1,) m, travel at their edges.
+    full : (m,) whether the Imu has samples there.
+    """
+
+    w: Floats
+    f: Floats
+    s: Floats
+    full: Bools
+
+
+def gravity_fit(t: Floats, w: Floats, f: Floats, axes: Floats, travel: Travel,
+                metres_per_unit: float) -> GravityFit | None:
+    """
+    Return the coefficients of the gyro axes, None where the drive is too short.
+
+    Parameters
+    ----------
+    t, w, f : (n,), (n, 3), (n, 3) arrays
+        Times, s, turn rate, rad/s, and specific force, m/s^2, in one frame fixed to the Imu.
+    axes : (3, 3) array
+        Rows e1, e2, up in that frame: right-handed.
+    travel : Travel
+        Odometer; positive is forward.
+    metres_per_unit : float
+        Its approximate scale.
+
+    """
+    begin, end = max(t[0], travel.t[0]), min(t[-1], travel.t[-1])
+    edges = begin + ROW_S * np.arange(max(int((end - begin) / ROW_S), 0) // ROWS_A_SECOND
+                                      * ROWS_A_SECOND + 1)
+    if len(edges) <= SHORTEST_S * ROWS_A_SECOND:
+        return None
+    count, (w, f) = bin_means(t, edges, w, f)
+    full = count > 0
+    if not full.any():
+        return None
+    w = np.where(full[:, None], w - np.median(w[full], axis=0), 0.0)
+    f = np.where(full[:, None], f, np.median(f[full], axis=0))
+    return _fit(*_segments(Rows(w @ axes.T, f @ axes.T, travel.at(edges) * metres_per_unit,
+                                full)))
+
+
+def _segments(rows: Rows) -> tuple[Complexes, Complexes]:
+    """Return observables, (k, m, p), and forces, (k, m), of k segments of m seconds."""
+    half = ROWS_A_SECOND // 2
+    speed = np.zeros(len(rows.s))
+    speed[half:-half] = rows.s[ROWS_A_SECOND:] - rows.s[:-ROWS_A_SECOND]
+    speed = speed[::ROWS_A_SECOND]
+    driven_s = np.count_nonzero(np.abs(speed) > MOVING_SPEED)
+    length = int(np.clip(driven_s // SEGMENTS, SHORTEST_S, LONGEST_S))
+
+    def cut(x: NDArray[Any]) -> NDArray[Any]:
+        k = len(x) // length
+        segments: NDArray[Any] = x[:k * length].reshape(k, length, *x.shape[1:])
+        return segments
+    psi = np.concatenate([[0.0], np.cumsum(rows.w[:, 2]) * ROW_S])
+    turned = np.exp(0.5j * (psi[1:] + psi[:-1]))
+    tilts = [_seconds(_integral(1j * G * rate * turned)) for rate in rows.w.T]
+    drift = _seconds(_integral(turned))         # of a bias of the gyro
+    force = _seconds((rows.f[:, 0] + 1j * rows.f[:, 1]) * turned)
+    course = np.exp(1j * psi[::ROWS_A_SECOND])
+    onward = np.diff(speed) * (course[1:] + course[:-1]) / 2
+    inward = np.diff(course) * (speed[1:] + speed[:-1]) / 2
+    turn_rate, heading = _seconds(rows.w[:, 2]), _seconds(turned)
+    # the derivatives stand for delays, the last two for a lever arm of the Imu
+    pushes = [onward, inward, np.gradient(onward), np.gradient(inward),
+              np.gradient(turn_rate) * heading, turn_rate**2 * heading]
+    observables = cut(np.stack([*tilts, *pushes], -1))
+    constant = np.stack([np.ones_like(drift), drift], -1)
+    basis, _ = np.linalg.qr(cut(constant) - [0.0, 1.0] * cut(constant).mean(1, keepdims=True))
+    use = cut(_seconds(rows.full) == 1).all(axis=1) & (
+        np.abs(cut((speed[1:] + speed[:-1]) / 2)).mean(axis=1) > MOVING_SPEED)
+
+    def without_offsets(x: Complexes) -> NDArray[Any]:
+        rest: NDArray[Any] = (x - basis @ (basis.conj().swapaxes(1, 2) @ x))[use]
+        return rest
+    return without_offsets(observables), without_offsets(cut(force)[..., None])[..., 0]
+
+
+def _fit(X: Complexes, force: Complexes) -> GravityFit | None:
+    """Return the least-squares coefficients; a segment weighs by its residuals."""
+    n, _, p = X.shape
+    if n <= p:
+        return None
+    adjoint = X.conj().swapaxes(1, 2)
+    normal, right = adjoint @ X, (adjoint @ force[..., None])[..., 0]
+    scale = np.sqrt(np.einsum('kii->i', normal).real)
+    scale[scale == 0] = 1.0             # a push that never is
+    normal, right = normal / (scale[:, None] * scale), right / scale
+    weight = np.ones(n)
+    tiny = 1e-9 * np.eye(p)    # of the unit diagonal, rounding: what the drive does not determine
+    for _ in range(WEIGHTING_PASSES):
+        used = weight / weight.mean()
+        inverse = np.linalg.inv(np.einsum('k,kij->ij', used, normal) + tiny)
+        found = inverse @ (used @ right)
+        rest = force - X @ (found / scale)
+        variance = (np.abs(rest)**2).mean(axis=1)
+        weight = 1 / np.maximum(variance + np.median(variance), 1e-12)
+    score = used[:, None] * (adjoint @ rest[..., None])[..., 0] / scale
+    influence = np.abs(score @ inverse.T)[:, :3] / scale[:3]
+    sigma = np.sqrt((influence**2).sum(axis=0) * n / (n - p))
+    share = np.einsum('ij,kjl,li->ki', inverse, used[:, None, None] * normal, inverse).real[:, :3]
+    segments = share.sum(axis=0)**2 / np.maximum((share**2).sum(axis=0), 1e-300)
+    return GravityFit(found[:3] / scale[:3], sigma, segments)
+
+
+def _integral(rate: Complexes) -> Complexes:
+    """Return the integral from the first row to the middle of each."""
+    return (np.cumsum(rate) - rate / 2) * ROW_S
+
+
+def _seconds(x: NDArray[Any]) -> Complexes:
+    """Return the mean of each second."""
+    mean: Complexes = x.reshape(-1, ROWS_A_SECOND).mean(axis=1)
+    return mean

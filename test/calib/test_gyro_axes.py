@@ -1,0 +1,105 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A gyro axis that is mirrored or exchanged, against gravity and the course of the fixes."""
+
+from dataclasses import replace
+from functools import cache
+
+from drives import changed, drive, everything_said, rejecting, settings
+import numpy as np
+import pytest
+
+from odocal_ros.calib.gyro_axes import sensor_axes
+from odocal_ros.nav.rotations import matrix_from_rpy
+from odocal_ros.pipeline.calibrate import calibrate, faults, screened
+from odocal_ros.reasons import Code
+from odocal_ros.screening.gravity_turn import gravity_fit
+from odocal_ros.settings.config import with_settings
+
+SOUND = np.array([1.0, 1j, 0.0])
+AXES = {'mirrored x': np.diag([-1.0, 1.0, 1.0]), 'mirrored y': np.diag([1.0, -1.0, 1.0]),
+        'x and y exchanged': np.eye(3)[[1, 0, 2]], 'x and z exchanged': np.eye(3)[[2, 1, 0]],
+        'y and z exchanged': np.eye(3)[[0, 2, 1]]}
+DO = {'mirrored x': 'negate angular_velocity.x', 'mirrored y': 'negate angular_velocity.y',
+      'x and y exchanged': 'publish angular_velocity.x as angular_velocity.y, publish '
+      'angular_velocity.y as angular_velocity.x',
+      'x and z exchanged': 'publish angular_velocity.x as angular_velocity.z',
+      'y and z exchanged': 'publish angular_velocity.y as angular_velocity.z'}
+
+
+@cache
+def town():
+    return drive(scenario='town', duration=400.0, imu_grade='industrial', slope=0.04, seed=5)
+
+
+def of_gyro(made, M, C=None, **options):
+    """Return what a leg says whose gyro sends M w, and whose Imu sits turned by C (b to i)."""
+    C = np.eye(3) if C is None else C
+    imu = changed(made.imu, w_i=lambda w: w @ C.T @ M.T, f_i=lambda f: f @ C.T)
+    config = with_settings(settings(made), options)
+    leg = replace(made.leg(), imu=imu)
+    return {r.code: r for r in faults(leg, screened(leg, config), config)}
+
+
+@pytest.mark.parametrize('name', AXES)
+def test_a_wrong_axis_rejects_the_leg_and_its_correction_is_named(name):
+    made = town()
+    leg = replace(made.leg(), imu=changed(made.imu, w_i=lambda w: w @ AXES[name].T))
+    result = calibrate(leg, settings(made))
+    assert rejecting(result) == {Code.GYRO_AXES} == set(everything_said(result))
+    assert f': {DO[name]}' in next(r.do for r in result.reasons)
+
+
+def test_axes_are_those_of_the_messages_whatever_the_mounting():
+    """An Imu that lies on its side and looks back has its x along another axis of the vehicle."""
+    rpy = (np.pi / 2, 0.0, np.pi / 2)
+    C = matrix_from_rpy(rpy).T
+    for name in ('mirrored x', 'mirrored y'):
+        said = of_gyro(town(), AXES[name], C, **{'imu.mounting_rpy': rpy})
+        if Code.GYRO_SIGN in said:      # the one that turns with the course
+            continue
+        assert DO[name] in said[Code.GYRO_AXES].do, name
+    assert not {Code.GYRO_SIGN, Code.GYRO_AXES} & set(
+        of_gyro(town(), np.eye(3), C, **{'imu.mounting_rpy': rpy}))
+
+
+@pytest.mark.parametrize('up', [(0.1, -0.05, 0.99), (0.0, 0.1, -0.99), (0.99, 0.1, 0.0),
+                                (0.1, -0.99, 0.1)])
+def test_level_axes_are_right_handed_and_named_by_the_sensor_axis_next_to_them(up):
+    up = np.array(up) / np.linalg.norm(up)
+    axes, names = sensor_axes(up)
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert axes[2] == pytest.approx(up)
+    for axis, name in zip(axes, names, strict=True):
+        assert axis['xyz'.index(name[-1])] * (-1 if name[0] == '-' else 1) > 0.9
+
+
+@pytest.mark.parametrize('options', [
+    {'scenario': 'town', 'slope': 0.04}, {'scenario': 'straight', 'slope': 0.04},
+    {'scenario': 'town', 'slope': 0.04, 'imu_grade': 'consumer'}, {'scenario': 'town'},
+    {'scenario': 'straight', 'imu_grade': 'consumer'}])
+def test_a_sound_gyro_is_not_accused(options):
+    made = drive(duration=300.0, seed=11, **options)
+    assert Code.GYRO_AXES not in of_gyro(made, np.eye(3))
+
+
+def test_the_fit_finds_each_coefficient_within_its_sigma():
+    made = town()
+    inputs = screened(made.leg(), settings(made)).inputs
+    axes, _ = sensor_axes(inputs.usual_f_b / np.linalg.norm(inputs.usual_f_b))
+    for M, expected in ((np.eye(3), SOUND), (AXES['mirrored x'], SOUND * [-1, 1, 1]),
+                        (AXES['x and y exchanged'], SOUND[[1, 0, 2]])):
+        fit = gravity_fit(inputs.t_imu, inputs.w_b @ M.T, inputs.f_b, axes, inputs.travel,
+                          made.options.nominal_scale)
+        off = np.abs(fit.coefficient - expected)
+        assert np.all(off[:2] < 4 * fit.sigma[:2])
+        assert np.all(fit.sigma[:2] < 0.2)
+        assert off[2] < 0.1, 'the tilt that the median of the force leaves'
