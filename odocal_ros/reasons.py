@@ -79,6 +79,8 @@ class Code(Enum):
                                  'set imu.mounting_rpy or imu.nominal_yaw instead.')
     ODOMETER_STILL = REJECT, ('Check the wheel sensor and the odometer topic: the fixes move, '
                               'but the counter does not.')
+    SEVERAL_IMUS = REJECT, ('Set imu.frame_id to the IMU to calibrate, or publish each IMU on '
+                            'its own topic.')
     IMU_UNITS = REJECT, ('Publish m/s^2 and rad/s (REP-145), or set imu.accel_scale / '
                          'imu.gyro_scale.')
     IMU_LOOKS_Z_DOWN = CAUTION, ('Set imu.mounting_rpy to [3.141592653589793, 0.0, 0.0] if the '

@@ -103,6 +103,8 @@ MEANINGS: dict[str, dict[Code, str]] = {
         'the IMU frame.',
         Code.ODOMETER_STILL: 'The fixes move, but the counter does not: from the start, or for '
         '100 m or more of the drive.',
+        Code.SEVERAL_IMUS: 'Messages on the IMU topic have different frame_ids. Only one IMU '
+        'was used, the first on the topic. Which one is meant cannot be decided from the data.',
         Code.IMU_UNITS: 'Gravity is not 9.8 m/s^2, or the gyro shows much larger turns than the '
         'vehicle can make: the unit is g, deg/s or another one.',
         Code.IMU_LOOKS_Z_DOWN: 'Gravity is on -z, as for an IMU with forward-right-down axes. '

@@ -29,9 +29,11 @@ from odocal_ros.data.samples import (
     no_heading,
     no_imu,
     no_odometer,
+    no_other_imu,
     no_velocity,
     OdometerForm,
     OdometerSamples,
+    OtherImuSamples,
     Samples,
     SomeSamples,
     take,
@@ -41,7 +43,8 @@ from odocal_ros.data.spool import Rows
 from odocal_ros.errors import BadData
 
 EMPTY: dict[str, Callable[[], Samples]] = {
-    'imu': no_imu, 'odometer': no_odometer, 'odometer_right': no_odometer,
+    'imu': no_imu, 'imu_other': no_other_imu,
+    'odometer': no_odometer, 'odometer_right': no_odometer,
     'fix': no_fix, 'fix_velocity': no_velocity, 'heading': no_heading,
 }
 SLOTS = tuple(EMPTY)
@@ -63,6 +66,7 @@ class Leg:
     start_ns: int
     stop_ns: int
     imu: ImuSamples = field(default_factory=no_imu)
+    imu_other: OtherImuSamples = field(default_factory=no_other_imu)
     odometer: OdometerSamples = field(default_factory=no_odometer)
     odometer_right: OdometerSamples = field(default_factory=no_odometer)
     fix: FixSamples = field(default_factory=no_fix)

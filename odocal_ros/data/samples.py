@@ -29,6 +29,8 @@ from odocal_ros.errors import BadData
 Stamps = Ints
 # definition: of no rows
 NO_STAMPS = np.empty(0, np.int64)
+FRAME_BYTES = 48     # judgement: of a frame_id that is shown
+FRAME = f'S{FRAME_BYTES}'
 NONE, NONE_OF_3, NONE_OF_4 = np.empty(0), np.empty((0, 3)), np.empty((0, 4))
 
 
@@ -45,6 +47,19 @@ class ImuSamples:
 
     def __post_init__(self) -> None:
         freeze(self, w_i=(3,), f_i=(3,), q_ni=(4,), yaw_variance=())
+
+
+@dataclass(frozen=True, eq=False)
+class OtherImuSamples:
+    """Messages on the IMU topic that are of another frame_id than the IMU in use."""
+
+    stamp_ns: Stamps      # (n,)
+    received_ns: Stamps   # (n,)
+    frame: NDArray[np.bytes_]     # (n,) frame_id as sent, the first FRAME_BYTES
+    used: NDArray[np.bytes_]      # (n,) frame_id of the IMU in use
+
+    def __post_init__(self) -> None:
+        freeze(self, frame=((), FRAME), used=((), FRAME))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +138,8 @@ class HeadingSamples:
         freeze(self, q_ni=(4,), yaw_variance=())
 
 
-Samples = ImuSamples | OdometerSamples | FixSamples | VelocitySamples | HeadingSamples
+Samples = (ImuSamples | OtherImuSamples | OdometerSamples | FixSamples | VelocitySamples
+           | HeadingSamples)
 SomeSamples = TypeVar('SomeSamples', bound=Samples)
 Index = slice | Ints | Bools      # of rows
 
@@ -174,6 +190,11 @@ def of_columns(kind: type[SomeSamples], *columns: NDArray[Any]) -> SomeSamples:
 def no_imu() -> ImuSamples:
     """Return an empty block."""
     return ImuSamples(NO_STAMPS, NO_STAMPS, NONE_OF_3, NONE_OF_3, NONE_OF_4, NONE)
+
+
+def no_other_imu() -> OtherImuSamples:
+    """Return an empty block."""
+    return OtherImuSamples(NO_STAMPS, NO_STAMPS, np.empty(0, FRAME), np.empty(0, FRAME))
 
 
 def no_odometer() -> OdometerSamples:

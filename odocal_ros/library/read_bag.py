@@ -132,7 +132,8 @@ def read_bag(path: Path | str, topics: Mapping[str, str] | None = None, config: 
                 hearer.note(note)
         with hearer.phase(f'checksum of {name}'):
             sha256 = digest.result()
+        frame = readers[chosen['imu']].frame or bag.frame(chosen['imu'])
         return Recording(
-            name, sha256, chosen, bag.frame(chosen['imu']), bag.start_ns, bag.end_ns,
+            name, sha256, chosen, frame, bag.start_ns, bag.end_ns,
             tuple(marks), bool(journal and not marks and dropped_legs(bag)),
             tuple(note for note in bag.notes if not isinstance(note, str)), settings, recorder)

@@ -111,6 +111,8 @@ class OdometryNode(SettledNode):
         if not raws:
             return
         for slot, block in source.decode(raws, sent_ns, None):
+            if slot == 'imu_other':
+                continue
             self._odometry.feed(slot, block, source.reader.form if source.reader else None)
         if source.health.jumped_back:
             source.health.forget()

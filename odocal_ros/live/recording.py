@@ -63,6 +63,8 @@ class Recording:
             max_gap_s = config.leg.max_gap if source.slot == 'imu' else None
             for slot, block in source.decode(raws, sent_ns, max_gap_s):
                 self.recorder.feed(slot, block)
+                if slot == 'imu_other':
+                    continue
                 if not source.sound.all():     # the pipeline screens for itself
                     block = take(block, source.sound)
                 self.progress.feed(slot, block, config, self.inputs.form, found_scale)
@@ -79,15 +81,18 @@ class Recording:
         """Bound the memory of what came before the pre-roll, of a leg that began then."""
         # by each topic's own stamps: one on a foreign clock must not grow without bound
         for source in self.inputs.by_slot.values():
-            slots = (source.slot, 'odometer_right') if self._both(source) else (source.slot,)
+            slots = (source.slot, *self._beside(source))
             if source.health.newest_ns:
                 since_ns = min(source.health.newest_ns, start_ns or source.health.newest_ns)
                 self.recorder.forget_before(
                     since_ns - round((preroll_s + PREROLL_MARGIN_S) * 1e9), slots)
 
-    def _both(self, source: Input) -> bool:
-        """Return True if the messages of a topic hold both wheels."""
-        return source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
+    def _beside(self, source: Input) -> tuple[str, ...]:
+        """Return the other slots that the messages of a topic fill: right wheel, other IMUs."""
+        if source.slot == 'imu':
+            return ('imu_other',)
+        both = source.slot == 'odometer' and 'odometer_right' not in self.inputs.by_slot
+        return ('odometer_right',) * both
 
     @property
     def newest_imu_ns(self) -> int:

@@ -176,7 +176,7 @@ def _look(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block], s
 
 def _bring_up_to_date(thinned: ThinnedLeg, before: LegRecorder | None, fresh: list[Block],
                       over: threading.Event) -> None:
-    for slot in SLOTS:
+    for slot in (slot for slot in SLOTS if slot != 'imu_other'):
         if over.is_set():
             raise Abandoned
         blocks = [before.rows(slot)] if before is not None else []

@@ -30,7 +30,7 @@ from odocal_ros.live.health import Health
 from odocal_ros.live.waiting_messages import WaitingMessages
 from odocal_ros.messages.decode import make_reader, Reader
 from odocal_ros.messages.odometer_types import TYPES
-from odocal_ros.outside.names import said_by
+from odocal_ros.outside.names import one_line, said_by
 from odocal_ros.settings.config import Config
 
 TOPICS = {'imu': 'imu/data', 'odometer': 'odometer', 'odometer_right': 'odometer_right',
@@ -65,6 +65,7 @@ class Input:
         self.publishers: list[TopicEndpointInfo] = []
         self.meant: list[str] = []     # topics that others publish, where nobody does this one
         self._failed = 0
+        self._frame_id = ''
         self._node = node
         self._deserialize: Callable[[bytes], Any] | None = None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -94,6 +95,10 @@ class Input:
 
     def doubled(self) -> str:
         """Name those who publish the topic where they are several, else return nothing."""
+        frames = self.reader.frames if self.reader is not None else None
+        if frames is not None and frames.other and not self._frame_id:
+            return (f'{self.topic} carries several IMUs (frame_id {one_line(frames.frame)!r} and '
+                    f'{one_line(frames.other)!r}): set imu.frame_id to the one to calibrate')
         if len(self.publishers) < 2 or self.reader is None:
             return ''
         # a node's name comes after its topics
@@ -125,6 +130,7 @@ class Input:
                           f'remap {self.name} to another topic')
         kind = message_class(msgtype)
         reader = make_reader(self.slot, msgtype, config)
+        self._frame_id = config.imu.frame_id
         # increments want the QoS on offer; a heading is optional, an idle subscription is not free
         if not self.publishers and (self.slot == 'heading' or self._counts_increments(reader)):
             return
@@ -161,9 +167,9 @@ class Input:
         if reader is None or deserialize is None:
             return []
         try:
-            if not self.frame and self.slot == 'imu':
-                self.frame = deserialize(raws[0]).header.frame_id
             pairs = reader.rows(raws, received_ns, deserialize)
+            if self.slot == 'imu':
+                self.frame = reader.frame or self.frame or deserialize(raws[0]).header.frame_id
         except Exception as error:  # whatever a foreign message does, the node lives on
             self._failed += len(raws)
             self.trouble = f'{self.topic}: {said_by(error)}'

@@ -25,8 +25,9 @@ from odocal_ros.data.samples import OdometerForm, Samples
 from odocal_ros.errors import OdocalError
 from odocal_ros.messages import cdr
 from odocal_ros.messages.fields import MessageView, View
+from odocal_ros.messages.frames import FrameFilter
 from odocal_ros.messages.odometer_types import OdometerPlan
-from odocal_ros.messages.raws import Table
+from odocal_ros.messages.raws import Raws, Table
 from odocal_ros.messages.sensor_types import Pairs, sensor_plan, SensorPlan
 from odocal_ros.messages.tables import tables
 from odocal_ros.settings.config import Config
@@ -62,12 +63,18 @@ class Reader:
         self.msgtype = msgtype
         self.unreadable = 0
         self.trouble = ''
+        self.frames: FrameFilter | None = None      # of an IMU
         self._plan = plan
 
     @property
     def form(self) -> OdometerForm | None:
         """Return the meaning of odometer values, final after one message; None for others."""
         return self._plan.form
+
+    @property
+    def frame(self) -> str:
+        """Return the frame_id of the IMU in use, empty where it is not known."""
+        return self.frames.frame if self.frames is not None else ''
 
     @property
     def wheels(self) -> tuple[str, ...]:
@@ -98,6 +105,18 @@ class Reader:
             The messages can never give what was asked: no such field, not a number.
 
         """
+        other = None
+        if self.frames is not None and len(raws):
+            keep, other = self.frames.sort(raws, received_ns, deserialize)
+            if other is not None:
+                raws = Raws.of(raws).take(keep)
+                received_ns = np.asarray(received_ns, np.int64)[keep]
+        found = self._rows(raws, received_ns, deserialize)
+        return found if other is None else [*found, ('imu_other', other)]
+
+    def _rows(self, raws: Sequence[bytes], received_ns: Sequence[int] | Ints,
+              deserialize: Deserialize) -> Pairs:
+        """Decode messages of one sender."""
         plan = self._plan
         first = 0 if plan.columns else self._settled(raws, deserialize)
         if first:
@@ -200,7 +219,10 @@ def make_reader(slot: str, msgtype: str, config: Config) -> Reader:
     msgtype = full_type(msgtype)
     if slot in ('odometer', 'odometer_right'):
         return Reader(slot, msgtype, OdometerPlan(slot, msgtype, config))
-    return Reader(slot, msgtype, sensor_plan(slot, msgtype))
+    reader = Reader(slot, msgtype, sensor_plan(slot, msgtype))
+    if slot == 'imu':
+        reader.frames = FrameFilter(msgtype, config.imu.frame_id)
+    return reader
 
 
 def full_type(msgtype: str) -> str:

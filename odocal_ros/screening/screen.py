@@ -34,6 +34,7 @@ from odocal_ros.screening.fix_screen import usable_fixes
 from odocal_ros.screening.force import with_force
 from odocal_ros.screening.glitches import frozen, oriented
 from odocal_ros.screening.imu_rhythm import on_rhythm
+from odocal_ros.screening.other_imus import other_imus
 from odocal_ros.screening.placed import place
 from odocal_ros.screening.reversing import BY_IMU, reversed_starts, said_of
 from odocal_ros.screening.row_screen import LABEL, usable_rows
@@ -99,10 +100,12 @@ def screen(leg: Leg, config: Config, judged: bool = True) -> tuple[Inputs, tuple
 
     """
     leg, unfelt = with_force(leg, config)
-    found: list[Reason] = [*unfelt]
+    found: list[Reason] = [*unfelt, *other_imus(leg, config.imu)]
     for slot in ('imu', 'odometer', 'fix'):
         if not len(getattr(leg, slot).stamp_ns):
             code = {'imu': Code.NO_IMU, 'odometer': Code.NO_ODOMETER, 'fix': Code.NO_FIX}[slot]
+            if any(r.code is code for r in found):      # a frame_id that nobody sends
+                continue
             found.append(Reason(code, f'no {LABEL[slot]} message between the marks'))
     offset = _offsets(config)
     if judged:

@@ -75,6 +75,8 @@ class OdometerConfig:
 class ImuConfig:
     grade: str = setting('consumer', choices=GRADES, about='Gyro and accelerometer quality; the '
                          'settings below override single values.')
+    frame_id: str = setting('', ro=True, about='Use only messages of the IMU topic with this '
+                            "frame_id; '': the topic must carry one IMU.")
     gyro_noise: float = setting(NAN, 'rad/s/sqrt(Hz)', 0.0, 1.0, about='White gyro noise; NaN: '
                                 'value of the grade.')
     gyro_bias: float = setting(NAN, 'rad/s', 0.0, 1.0, about='Turn-on gyro bias, 1 sigma; NaN: '

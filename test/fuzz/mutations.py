@@ -9,6 +9,7 @@
 
 """Seeded mutations of bags, by their structure: each takes a random.Random and a folder."""
 
+import math
 from pathlib import Path
 import random
 import sqlite3
@@ -17,7 +18,7 @@ import struct
 import yaml
 
 from odocal_ros.bagio.mcap_records import CHUNK, MAGIC
-from odocal_ros.messages.cdr import layout_of
+from odocal_ros.messages.cdr import FRAME_AT, layout_of
 from odocal_ros.messages.sensor_types import IMU
 from odocal_ros.outside.limits import zstd_module
 
@@ -232,13 +233,35 @@ def sqlite_values(rng, bag):
     db.close()
 
 
+IMU_ROWS = ('SELECT messages.id, data FROM messages JOIN topics ON topic_id = topics.id '
+            f"WHERE type = '{IMU}'")
+
+
+def sqlite_second_imu(rng, bag):
+    """Send some messages of the IMU as a second one has them, that sits turned about z."""
+    every, angle = rng.choice([2, 2, 3, 10]), rng.uniform(-3.0, 3.0)
+    with sqlite3.connect(file_of(bag)) as db:
+        changed = []
+        for key, data in db.execute(IMU_ROWS).fetchall()[::every]:
+            data = bytearray(data)
+            layout = layout_of(IMU, bytes(data))
+            for name in ('angular_velocity', 'linear_acceleration'):
+                at, _ = layout.find(f'{name}.x')
+                x, y = struct.unpack_from('<2d', data, at)
+                struct.pack_into('<2d', data, at, x * math.cos(angle) - y * math.sin(angle),
+                                 x * math.sin(angle) + y * math.cos(angle))
+            data[FRAME_AT] ^= 1
+            changed.append((bytes(data), key))
+        db.executemany('UPDATE messages SET data = ? WHERE id = ?', changed)
+    db.close()
+
+
 def sqlite_gyro_axes(rng, bag):
     """Send the axes of the gyro in another order or with other signs, in every message."""
     order = rng.sample(range(3), 3)
     signs = [rng.choice([1.0, -1.0]) for _ in order]
     with sqlite3.connect(file_of(bag)) as db:
-        rows = db.execute('SELECT messages.id, data FROM messages JOIN topics ON topic_id = '
-                          'topics.id WHERE type = ?', [IMU]).fetchall()
+        rows = db.execute(IMU_ROWS).fetchall()
         at, _ = layout_of(IMU, rows[0][1]).find('angular_velocity.x')
         changed = []
         for key, data in rows:
@@ -351,7 +374,7 @@ def texts(rng: random.Random, folder):
 
 OF = {'mcap': [raw, clump, mcap_records, mcap_inside, mcap_inside, metadata],
       'sqlite3': [raw, clump, sqlite_rows, sqlite_values, sqlite_values, sqlite_gyro_axes,
-                  sqlite_pages, metadata],
+                  sqlite_second_imu, sqlite_pages, metadata],
       'rosbag1': [raw, clump, ros1_inside, ros1_inside],
       'file': [raw, clump, metadata],                   # packed as a whole, and
       'messages': [raw, clump, mcap_records, metadata]}  # each: no value can be reached
