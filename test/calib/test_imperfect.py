@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from smoother_legs import leg_of, made
 
-from odocal_ros.calib.smoother import smooth
-from odocal_ros.calib.smoother.state import FAST_SPEED
+from odocal_ros.calib.smoother import remarks, smooth
+from odocal_ros.calib.smoother.state import CONSTANTS, FAST_SPEED
 from odocal_ros.reasons import Code
 from odocal_ros.settings.config import Config, with_settings
 from odocal_ros.settings.grades import grade_as_seen, GRADES
@@ -139,6 +139,20 @@ def test_an_imu_is_taken_for_the_grade_its_noise_is_near_to_never_for_a_better_o
     assert grade_as_seen(replace(imu, grade='navigation'), {}) == GRADES['navigation']
 
 
+@pytest.mark.parametrize(('set_to', 'found', 'text', 'do'), [
+    ((0.0, 0.0, 1.5), 0.7, 'z: set to +1.50 m, found +2.20 ± 0.05 m', 'Measure .* z again'),
+    ((0.0, 0.0, 0.0), -0.73, 'z: not set, found -0.73 ± 0.05 m', 'Measure .* z and set it'),
+    ((0.0, 0.0, 0.0), 9.39, 'z: +9.39 ± 0.05 m is larger than a vehicle, so not plausible',
+     'Ignore the estimate')])
+def test_a_lever_arm_is_measured_again_only_if_it_was_set(set_to, found, text, do):
+    value, sigma = np.zeros(len(CONSTANTS)), np.full(len(CONSTANTS), 0.05)
+    value[CONSTANTS.index('antenna_lever_arm_z')] = found
+    reason, = remarks._arms(value, sigma, with_settings(Config(), {'gnss.lever_arm': set_to}))
+    assert f'gnss.lever_arm {text}' in reason.text
+    assert re.search(do, reason.do)
+    assert ('easure' in reason.do) != ('larger' in text)
+
+
 def test_what_a_vehicle_shows_beside_its_values_is_said():
     real = Real(receiver_lag=0.8, speed_law=0.006, stated_factor=0.5)
     drive, config, leg = made(scenario='town', duration=400.0, imu_grade='industrial', seed=4,
@@ -149,7 +163,7 @@ def test_what_a_vehicle_shows_beside_its_values_is_said():
     said = {r.code: r.text for r in found.reasons}
     tau = float(re.search(r'about (.*) s;', said[Code.FIXES_SMOOTHED])[1])
     assert tau == pytest.approx(real.receiver_lag, rel=0.02)     # said to 0.01 s
-    assert 'gnss.lever_arm x by +0.8' in said[Code.LEVER_ARM_OFF]
+    assert 'gnss.lever_arm x: set to +0.00 m, found +0.8' in said[Code.LEVER_ARM_OFF]
     assert ' 2.0 times as large' in said[Code.FIXES_NOISIER_THAN_SAID]
     assert 'from low to high speed' in said[Code.SCALE_VARIES]
     slope = found.details['beside']['scale_by_speed']

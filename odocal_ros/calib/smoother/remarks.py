@@ -16,7 +16,6 @@ import numpy as np
 from odocal_ros.calib.receiver import lag_reasons, odometer_reasons
 from odocal_ros.calib.smoother.chain import Neighbours
 from odocal_ros.calib.smoother.estimate import Fit
-from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion_rows import MotionRows
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.problem import imperfect_sigmas, Problem
@@ -47,6 +46,9 @@ AXIS_XY, AXIS_ZX = map(CONSTANTS.index, ('accelerometer_axis_xy', 'accelerometer
 # 1 sigma of what the model does not hold of scale, yaw and pitch: relative, rad, rad. Physical: a
 # body on springs within a second (docs/conventions.md)
 MODEL_FLOOR = np.array([6e-6, np.deg2rad(2e-3), np.deg2rad(5e-3)])
+VEHICLE = 15.0, 3.0, 5.0    # m, physical: reach of a lorry from base_link, forward, left, up
+SLIDES = ('Axes: from base_link, x forward, y left, z up. If both arms are off alike, it is '
+          'imu.lever_arm. Skid steering and tracks look the same; then keep the setting.')
 
 
 def beside(value: Floats, covariance: Floats, grade: Grade | None) -> dict[str, Any]:
@@ -101,7 +103,7 @@ def level_pitch(fit: Fit, near: Neighbours, widen: float) -> dict[str, Any]:
 
 def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[Reason]:
     """Return reasons: what is smoothed, varies, or lies off what it is taken for."""
-    c, leg = fit.state.constants, problem.leg
+    c = fit.state.constants
     said = [*_noisy(problem, fit.levels), *lag_reasons(c[FIX_LAG2], sigma[FIX_LAG2]),
             *odometer_reasons(c[FIX_BY_MOTION], sigma[FIX_BY_MOTION], c[FIX_TIME]),
             *_varies(fit, sigma)]
@@ -120,7 +122,7 @@ def remarks(problem: Problem, fit: Fit, sigma: Floats, config: Config) -> list[R
         said.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'the {CONSTANTS[worst].replace("_", " ")} '
                            f'is {100 * c[worst]:+.1f} % off, {off[worst]:.0f} times the sigma of '
                            f'the {config.imu.grade} grade; accounted for'))
-    return said + _arms(c, sigma, leg)
+    return said + _arms(c, sigma, config)
 
 
 def _noisy(problem: Problem, levels: Levels) -> list[Reason]:
@@ -148,15 +150,26 @@ def _varies(fit: Fit, sigma: Floats) -> list[Reason]:
                    'value is the mean over this leg')]
 
 
-def _arms(c: Floats, sigma: Floats, leg: SmootherLeg) -> list[Reason]:
-    """Say which lever arms lie far from where they are set."""
-    said = []
-    for name, where, axes in (('odometer.lever_arm', ODO_ARM, 'xy'),
-                              ('gnss.lever_arm', GNSS_ARM, 'xyz')):
-        for i, axis in zip(range(where.start, where.stop), axes, strict=False):
-            if abs(c[i]) > max(REMARK_SIGMAS * sigma[i], 0.3):     # m
-                said.append(f'{name} {axis} by {c[i]:+.2f} m +- {sigma[i]:.2f}')
-    if not said:
-        return []
-    return [Reason(Code.LEVER_ARM_OFF, f'estimated {", ".join(said)} differs from its setting; '
-                   'accounted for')]
+def _arms(c: Floats, sigma: Floats, config: Config) -> list[Reason]:
+    """Return LEVER_ARM_OFF for the lever arms that the drive puts far from their setting."""
+    said, do = [], []
+    for name, arm, where, axes in (
+            ('odometer.lever_arm', config.odometer.lever_arm, ODO_ARM, 'xy'),
+            ('gnss.lever_arm', config.gnss.lever_arm, GNSS_ARM, 'xyz')):
+        for i, axis, value, most in zip(range(where.start, where.stop), axes, arm, VEHICLE,
+                                        strict=False):
+            if abs(c[i]) <= max(REMARK_SIGMAS * sigma[i], 0.3):     # m
+                continue
+            found = value + c[i]
+            text = f'{found:+.2f} ± {sigma[i]:.2f} m'
+            if abs(found) > most:
+                said.append(f'{name} {axis}: {text} is larger than a vehicle, so not plausible')
+                do.append(f'Ignore the estimate of {name} {axis}: another error causes it.')
+            elif any(arm):
+                said.append(f'{name} {axis}: set to {value:+.2f} m, found {text}')
+                do.append(f'Measure {name} {axis} again.')
+            else:
+                said.append(f'{name} {axis}: not set, found {text}')
+                do.append(f'Measure {name} {axis} and set it.')
+    return [Reason(Code.LEVER_ARM_OFF, f'{"; ".join(said)}; accounted for', ' '.join(
+        [*do, SLIDES] if any('easure' in x for x in do) else do))] if said else []
