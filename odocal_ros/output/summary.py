@@ -139,6 +139,7 @@ def _values(calibration: Calibration, width: int) -> list[str]:
     if ratio.value is not None:
         lines.append(_line('  ratio to nominal', f'{with_sigma(ratio.value, ratio.sigma)}   '
                            f'({beyond_one(ratio.value, ratio.sigma)})'))
+    lines.append(_path_ratio(calibration, scale))
     for name, word in ANGLES.items():
         lines.append(_line(f'{word} mounting', _angle_text(known(estimates, name), width)))
     lines += _largest_errors(calibration, width)
@@ -163,6 +164,18 @@ def _values(calibration: Calibration, width: int) -> list[str]:
                         for angle in calibration.imu_rotation_rpy)
         lines.append(_line('IMU on the vehicle', f'roll, pitch, yaw {rpy} deg'))
     return [line for line in lines if line]
+
+
+def _path_ratio(calibration: Calibration, scale: Estimate) -> str:
+    """Return the plain ratio of path lengths beside the scale factor, '' where there is none."""
+    ratios = [(leg.path_ratio, leg.distance) for leg in calibration.legs if leg.path_ratio]
+    way = sum(distance for _, distance in ratios)
+    if not scale.value or not way:
+        return ''
+    ratio = sum(r * distance for r, distance in ratios) / way
+    unit = '' if scale.unit == '1' else f' {scale.unit}'
+    return _line('  path ratio', f'{ratio:#.4g}{unit}   fixes / odometer, uncorrected '
+                 f'({100 * (ratio / scale.value - 1):+.1f} %)')
 
 
 def _gyro_scale(calibration: Calibration) -> str:

@@ -219,3 +219,12 @@ def test_a_gyro_scale_far_from_one_is_said(good, error, sigma, shown):
         'gyro_scale_z': {'value': error, 'sigma': sigma}})
     text = screen(replace(good, methods={'two_point': method}))
     assert (shown in text) if shown else ('gyro scale' not in text)
+
+
+def test_the_plain_ratio_of_path_lengths_stands_beside_the_scale(good):
+    assert 'path ratio' not in screen(good)
+    legs = tuple(replace(good.legs[0], path_ratio=ratio, distance=distance)
+                 for ratio, distance in ((0.0505, 1000.0), (0.0508, 2000.0)))
+    line = next(x for x in screen(replace(good, legs=legs)).splitlines() if 'path ratio' in x)
+    assert line.split()[2:4] == ['0.05070', 'm/pulse']
+    assert line.endswith('fixes / odometer, uncorrected (+1.4 %)')
