@@ -9,12 +9,15 @@
 
 """Console log of the node: missing inputs, readiness, failures."""
 
+import re
+
 from odocal_ros.live.plain_log import PlainLog
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code
 
 # judgement: of waiting, until it is said, and said again
-SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 60 * 10**9
+SILENCE_FIRST_NS, SILENCE_SELDOM_NS = 5 * 10**9, 3600 * 10**9
+NUMBER = re.compile(r'\d+')
 
 
 class Console:
@@ -31,6 +34,7 @@ class Console:
         self._silence = False        # has been said
         self._due_ns = 0             # when the next word about what is missing is due
         self._pause_ns = SILENCE_FIRST_NS
+        self._missing_text = ''      # what was missing last, without its seconds
         self._leg_id = 0             # the leg whose faults are said
         self._reported: set[Code] = set()      # of them
 
@@ -46,6 +50,11 @@ class Console:
             self._complete(now)
 
     def _missing(self, now: SessionView, steady_ns: int) -> None:
+        text = NUMBER.sub('', '; '.join(now.missing))
+        if self._silence and text != self._missing_text:    # other publishers, other inputs
+            self._pause_ns = SILENCE_FIRST_NS
+            self._due_ns = min(self._due_ns, steady_ns + SILENCE_FIRST_NS)
+        self._missing_text = text
         if not self._due_ns:     # what has been there and falls silent is said at once
             self._due_ns = steady_ns + (0 if self._ready else SILENCE_FIRST_NS)
         if steady_ns >= self._due_ns:

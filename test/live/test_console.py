@@ -34,9 +34,13 @@ def test_each_thing_is_said_once_or_seldom():
         return said[before:]
 
     nothing = {'missing': ['no IMU on /imu/data']}
-    times = [s for s in range(1, 300) if report(s, **nothing)]
-    assert times[:3] == [6, 16, 36]                      # 5 s, then ever more seldom
-    assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 60
+    times = [s for s in range(-20000, 280) if report(s, **nothing)]
+    assert [t + 20000 for t in times[:4]] == [5, 15, 35, 75]       # 5 s, then ever more seldom
+    assert max(b - a for a, b in zip(times, times[1:], strict=False)) == 3600
+    # what is missing changes: soon again; the seconds of a silence are no change
+    other = {'missing': ['no IMU on /imu/data for 3 s: 1 publisher found']}
+    assert [s for s in range(280, 290) if report(s, **other)] == [285]
+    assert report(290, missing=['no IMU on /imu/data for 9 s: 1 publisher found']) == []
     assert report(300, rates_hz={'imu': 100.0})[0] == (
         'info', 'ready (imu 100 Hz): stand still for 10 s, then call ~/start_leg')
     assert report(301) == []
@@ -53,6 +57,12 @@ def test_each_thing_is_said_once_or_seldom():
         assert text.startswith(f'leg {session.leg_id}: IMU_GAP: no IMU data for 3 s. Fix')
         assert report(308, **gap) == []
         session.cancel()
+
+
+def test_ready_without_known_rates_has_no_empty_brackets():
+    said = []
+    Console(SimpleNamespace(info=said.append)).report(SessionView(Session(), Config()), SECOND)
+    assert said == ['ready: stand still for 10 s, then call ~/start_leg']
 
 
 def test_topics_that_may_be_meant_and_doubled_publishers_are_named(start, connect):
