@@ -108,11 +108,9 @@ class Calibrator(SettledNode):
         """Refuse what may not be set; changes nothing."""
         if self.publishing.setting_results:
             return SetParametersResult(successful=True)
-        ours = [p.name for p in parameters if p.name in params.RESULTS]
-        if ours:
-            return SetParametersResult(successful=False, reason=(
-                f'{ours[0]} is set by the node after each leg; to restore a result, give it as '
-                'an override at start-up'))
+        refused = params.refused(self.config, self.publishing.results(), parameters)
+        if refused:
+            return SetParametersResult(successful=False, reason=refused)
         session = self.operation.session
         if session.busy:
             return SetParametersResult(successful=False, reason=(

@@ -64,10 +64,12 @@ def descriptor(setting: Setting) -> ParameterDescriptor:
 
     rclpy refuses NaN where a range is declared, checks no array and knows no choices: there the
     range stands in the text only, and the on-set callback checks it. Lists that may be empty are
-    typed dynamically, since an empty list in YAML has no type.
+    typed dynamically, since an empty list in YAML has no type. What is fixed at start-up is not
+    declared read-only: rclpy would refuse it without a remedy, the on-set callback names one.
     """
     about = f'{setting.about} [{setting.unit}]' if setting.unit else setting.about
-    result = ParameterDescriptor(description=about, read_only=setting.read_only)
+    about += ' Fixed at start-up.' if setting.read_only else ''
+    result = ParameterDescriptor(description=about)
     result.dynamic_typing = setting.kind in ('floats', 'strs') and not (
         setting.read_only and setting.default)
     limits = []
@@ -143,6 +145,21 @@ def changed(config: Config, parameters: list[Parameter]) -> Config:
     """Return config with the settings among some parameters taken over, checked."""
     return with_settings(config, {
         p.name: _plain(p.value) for p in parameters if p.name in SETTINGS})
+
+
+def refused(config: Config, results: dict[str, Any], parameters: list[Parameter]) -> str:
+    """Return why parameters that the node or its start alone sets may not be changed, or ''."""
+    for p in parameters:
+        now = results.get(p.name)
+        if p.name in RESULTS and not (p.value == now or str(p.value) == str(now) == 'nan'):
+            return (f'{p.name} is set by the node after each leg; to restore a result, start the '
+                    'node with --params-file calibration.yaml')
+        if p.name in SETTINGS and SETTINGS[p.name].read_only:
+            group, _, key = p.name.rpartition('.')
+            if _plain(p.value) != getattr(getattr(config, group) if group else config, key):
+                return (f'{p.name} is fixed at start-up: restart the node with '
+                        f'"--ros-args -p {p.name}:=VALUE"')
+    return ''
 
 
 def fixed(parameters: list[Parameter]) -> SetParametersResult:

@@ -1,0 +1,41 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Parameters that the start of the node, or the node itself, alone sets: refused with a remedy."""
+
+import math
+
+from rclpy.parameter import Parameter
+
+from odocal_ros.live.params import refused, RESULTS
+from odocal_ros.settings.config import Config
+
+
+def of(**values):
+    return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
+
+
+def test_what_is_fixed_at_start_up_is_refused_with_the_way_to_set_it():
+    text = refused(Config(), RESULTS, of(odometer__type='std_msgs/msg/Int64'))
+    assert text == ('odometer.type is fixed at start-up: restart the node with '
+                    '"--ros-args -p odometer.type:=VALUE"')
+    assert not refused(Config(), RESULTS, of(odometer__type='auto', leg__min_speed=1.0,
+                                             imu__lever_arm=[0.0, 0.0, 0.0]))
+    assert 'imu.lever_arm is fixed' in refused(Config(), RESULTS,
+                                               of(imu__lever_arm=[0.0, 0.0, 1.0]))
+
+
+def test_a_result_is_refused_unless_it_is_the_one_in_force():
+    """So ``ros2 param load`` of the file that the node wrote has nothing to refuse."""
+    here = RESULTS | {'result.scale_factor': 0.05}
+    assert not refused(Config(), here, of(result__scale_factor=0.05,
+                                          result__yaw_mounting_angle=math.nan))
+    text = refused(Config(), here, of(result__scale_factor=0.06))
+    assert 'result.scale_factor is set by the node' in text
+    assert '--params-file calibration.yaml' in text
