@@ -110,8 +110,9 @@ class Publishing:
     def show_status(self, now: SessionView) -> DiagnosticArray:
         """Publish ``~/status`` and return it."""
         array = self._array([calibration_status(now)])
-        self._status.publish(array)
+        # first: who receives a status has its hint
         self._show(self._hint, String(data=action_first(now)))
+        self._status.publish(array)
         for name, publisher in self._plotted.items():
             self._show(publisher, Float64(data=in_force(now, name)))
         return array

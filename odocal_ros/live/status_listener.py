@@ -23,6 +23,7 @@ MOST_VALUES = 500      # judgement: keys of a status that are looked at; a calib
 # definition: of latched topics, publisher and subscriber
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+HINT_S = 0.1      # judgement: s in which a hint that was sent with a status arrives
 
 
 class StatusListener:
@@ -60,6 +61,8 @@ class StatusListener:
         try:
             while self._context.ok():
                 self._executor.spin_once(timeout_sec=0.5)
+                if self._status is not None:      # the hint sent with it may still be in its queue
+                    self._executor.spin_once(timeout_sec=HINT_S)
                 if self._status is not None and self._hint is not None:
                     status = self._status.status[0]
                     self._status = None
