@@ -17,6 +17,7 @@ from odocal_ros.calib.smoother.imu_noise import sensor_noise
 from odocal_ros.calib.smoother.outside import Heading
 from odocal_ros.calib.smoother.part import WANTED
 from odocal_ros.calib.smoother.problem import Problem
+from odocal_ros.calib.smoother.quantised import explained
 from odocal_ros.calib.smoother.slip import SLIP_VARIANCE
 from odocal_ros.calib.smoother.state import HEADING
 from odocal_ros.reasons import Code, Reason
@@ -40,6 +41,9 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     level = fit.levels.roots()
     # of an accelerometer that is not there nothing is said
     sensors = {'gyro': 'gyro', 'accel': 'accelerometer'} if problem.leg.felt else {'gyro': 'gyro'}
+    coarse = _coarse(explained(problem.leg, level), {
+        name: what for name, what in sensors.items()
+        if level[name] > WORSE_THAN_GRADE * min(own[name], stated[name])})
     shaken = max(level[name] / own[name] for name in sensors)
     worse = [f'{what} noise is {level[name] / stated[name]:.1f} times'
              for name, what in sensors.items() if level[name] > WORSE_THAN_GRADE * stated[name]]
@@ -52,7 +56,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     if worse:
         reasons.append(Reason(Code.IMU_WORSE_THAN_GRADE, f'{", ".join(worse)} that of the '
                               f'{config.imu.grade} grade; the estimate from this drive is used',
-                              '' if any('gyro' in x for x in worse) else OF_FORCE))
+                              coarse or ('' if any('gyro' in x for x in worse) else OF_FORCE)))
     odd, move = [], 0.0
     if fit.creeping or not fit.settled:
         move = moving(fit)
@@ -74,7 +78,7 @@ def mismatch(problem: Problem, fit: Fit, config: Config) -> tuple[float, list[Re
     reasons += _heading(problem.leg.heading, float(fit.state.constants[HEADING]))
     if odd:
         reasons.append(Reason(Code.MODEL_MISMATCH, '; '.join(odd),
-                              SHAKEN if odd == [BY_SHAKING] else ''))
+                              (coarse or SHAKEN) if odd == [BY_SHAKING] else ''))
     # judgement: nothing tells by how much a model is off; a fit that has not settled may be off by
     # what it still moves, several times
     return max(1.0, 2.0 * bool(odd), 4.0 * move), reasons
@@ -84,6 +88,17 @@ def moving(fit: Fit) -> float:
     """Return by how much of their sigmas scale, yaw and pitch moved in the last pass, at most."""
     step = fit.solved.step_border / np.sqrt(np.diag(fit.solved.covariance))
     return float(np.abs(step[:WANTED]).max())
+
+
+def _coarse(steps: dict[str, float], sensors: dict[str, str]) -> str:
+    """Return the remedy for sensors whose noise is the quantisation of their output."""
+    said = [f'the {sensors[name]} has steps of ' + (
+        f'{np.rad2deg(step):.3g} deg/s' if name == 'gyro' else f'{step:.3g} m/s^2')
+        for name, step in steps.items() if name in sensors]
+    if not said:
+        return ''
+    return (f'The cause is quantisation: {" and ".join(said)}. Set a finer resolution or a '
+            'smaller range in the IMU or its driver, if there is one.')
 
 
 def _heading(heading: Heading, error: float) -> list[Reason]:

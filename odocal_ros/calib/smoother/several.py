@@ -36,6 +36,8 @@ from odocal_ros.settings.grades import grade_of
 from odocal_ros.settings.levels import FAULT_SIGMAS
 
 DAY = 86400e9        # ns, definition
+DELAY_DIFFERS = ('A delay changed between the legs, not the vehicle. Check the clocks and the '
+                 'time stamps of this sensor: driver restarts, buffering, clock synchronisation.')
 
 
 def combine_legs(results: Sequence[MethodResult], times_ns: Sequence[int], config: Config,
@@ -143,7 +145,7 @@ def _name(number: int) -> str:
 
 def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
     """Say in which constants legs differ, and which leg differs most from the others."""
-    J, said = len(found.deviation), []
+    J, said = len(found.deviation), list[Reason]()
     apart = {name: found.deviation[:, found.names.index(name)] for name in found.spread}
     # what is determined with a parameter differs with it
     worst = max((np.abs(z).max() for n, z in apart.items() if n in PARAMETERS), default=0.0)
@@ -153,12 +155,14 @@ def _disputed(found: Joint, numbers: list[int]) -> tuple[Reason, ...]:
             continue
         # of two each differs from the other alike
         who = f', {_name(numbers[k])} most ({z[k]:+.1f} sigma from the others)' * (J > 2)
-        said.append(f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times more than '
-                    f'their uncertainties{who}')
+        said.append(Reason(
+            Code.LEGS_DISAGREE, f'{name}: the {J} legs differ {np.sqrt((z**2).mean()):.1f} times '
+            f'more than their uncertainties{who}', DELAY_DIFFERS if 'delay' in name else ''))
     if found.factor > 1:
-        said.append(f'the {J} legs differ {found.factor:.1f} times more than their '
-                    'uncertainties, in other parameters than the ones listed')
-    return tuple(Reason(Code.LEGS_DISAGREE, text) for text in said)
+        said.append(Reason(
+            Code.LEGS_DISAGREE, f'the {J} legs differ {found.factor:.1f} times more than their '
+            'uncertainties, in other parameters than the ones listed'))
+    return tuple(said)
 
 
 def _sources(used: Floats, C: Floats) -> tuple[Source, ...]:
