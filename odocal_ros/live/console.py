@@ -12,6 +12,7 @@
 import re
 
 from odocal_ros.live.plain_log import PlainLog
+from odocal_ros.live.session import State
 from odocal_ros.live.session_view import SessionView
 from odocal_ros.reasons import Code
 
@@ -37,6 +38,7 @@ class Console:
         self._missing_text = ''      # what was missing last, without its seconds
         self._leg_id = 0             # the leg whose faults are said
         self._reported: set[Code] = set()      # of them
+        self._withdrawn: set[Code] = set()     # of these
 
     def report(self, now: SessionView, steady_ns: int) -> None:
         """Log new events."""
@@ -78,9 +80,16 @@ class Console:
         """Log the problems of the current leg, each once."""
         leg_id = now.session.leg_id
         if self._leg_id != leg_id:
-            self._leg_id, self._reported = leg_id, set()
+            self._leg_id, self._reported, self._withdrawn = leg_id, set(), set()
         for fault in now.faults:
             if fault.code not in self._reported:
                 self._reported.add(fault.code)
                 self._log.warning(f'leg {leg_id}: {fault.code.name}: {fault.text}. '
                                   f'{fault.remedy}')
+        if now.session.state is not State.RECORDING:
+            return
+        gone = self._reported - self._withdrawn - {fault.code for fault in now.faults}
+        for code in sorted(gone, key=lambda code: code.name):
+            self._withdrawn.add(code)
+            self._log.info(f'leg {leg_id}: {code.name} no longer applies: later messages '
+                           'contradict it')

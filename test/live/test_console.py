@@ -59,6 +59,26 @@ def test_each_thing_is_said_once_or_seldom():
         session.cancel()
 
 
+def test_a_problem_that_later_messages_contradict_is_withdrawn_once():
+    """An IMU whose messages are late looks silent; then all of them arrive."""
+    said, session = [], Session()
+    console = Console(SimpleNamespace(info=said.append, warning=said.append))
+    cut = (Reason(Code.LEG_CUT, 'the IMU is missing for 1.30 s'),)
+    session.start(1, Config())
+    for second, faults in enumerate([cut, (), (), cut, ()]):
+        console.report(SessionView(session, Config(), faults=faults), second * SECOND)
+    assert [x for x in said if 'LEG_CUT' in x and 'no longer' not in x] == [said[0]]
+    assert [x for x in said if 'no longer' in x] == [
+        'leg 1: LEG_CUT no longer applies: later messages contradict it']
+    # the end of a leg withdraws nothing
+    session.cancel()
+    session.start(2, Config())
+    console.report(SessionView(session, Config(), faults=cut), 9 * SECOND)
+    session.cancel()
+    console.report(SessionView(session, Config()), 10 * SECOND)
+    assert sum('no longer' in x for x in said) == 1
+
+
 def test_ready_without_known_rates_has_no_empty_brackets():
     said = []
     Console(SimpleNamespace(info=said.append)).report(SessionView(Session(), Config()), SECOND)
