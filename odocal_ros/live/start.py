@@ -28,8 +28,9 @@ def _run(command: str, module: str) -> int:
         main = import_module(module).main
     except ModuleNotFoundError as error:
         print(f'{command}: a live node needs ROS 2 (Python module {error.name} is missing). Run '
-              "'source /opt/ros/jazzy/setup.bash', or install odocal_ros with the extra 'ros' on "
-              'Python 3.11 or 3.12 (Linux x86-64). Recorded bags need no ROS: odocal try BAG',
+              "'source /opt/ros/jazzy/setup.bash', or 'pip install \".[ros]\"' in the source "
+              'folder with Python 3.11 or 3.12 (Linux x86-64). Recorded bags need no ROS: '
+              'odocal try BAG',
               file=sys.stderr)
         return 2
     code: int = main()
