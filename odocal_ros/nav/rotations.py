@@ -54,6 +54,15 @@ def quat_from_rotvec(phi: ArrayLike) -> Floats:
     return q
 
 
+def rotvec_from_quat(q: Floats) -> Floats:
+    """Return the shortest rotation vector of a unit quaternion, rad: (..., 4) to (..., 3)."""
+    q = np.where(q[..., 3:] < 0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1)
+    small = sine < 1e-9
+    size = np.where(small, 2.0, 2 * np.arctan2(sine, q[..., 3]) / np.where(small, 1.0, sine))
+    return q[..., :3] * size[..., None]
+
+
 def quat_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
     """Return the product: p_ab, q_bc to q_ac, (..., 4)."""
     px, py, pz, pw = np.moveaxis(np.asarray(p, dtype=float), -1, 0)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps, keyframes
 from odocal_ros.calib.smoother.leg import BEFORE_MARK, SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.outside import GIVEN_HEADING_NOISE, Heading, OUTSIDE_RATE
@@ -37,12 +37,12 @@ class Ideal:
     A planned drive as the smoother sees it, free of errors.
 
     leg : its samples; fixes and headings are thinned to one for each keyframe or so.
-    imu : their IMU rows with keyframes.     state : what is true at the keyframes.
+    imu : their IMU steps with keyframes.     state : what is true at the keyframes.
     fixes_in_one : how many fixes each fix of the leg stands for.
     """
 
     leg: SmootherLeg
-    imu: ImuRows
+    imu: ImuSteps
     state: State
     fixes_in_one: float
 
@@ -97,8 +97,8 @@ def ideal(drive: PlannedDrive, sigmas: Sigmas, spacing: float) -> Ideal:
         odometer_arm=np.array(config.odometer.lever_arm, float),
         antenna_arm=np.array(config.gnss.lever_arm, float),
         heading=_heading(drive, config, t_begin, spacing))
-    imu = ImuRows.of(leg, spacing)
-    return Ideal(leg, imu, _state(motion, imu.key),
+    key = keyframes(leg.t_imu, leg.t_begin, leg.t_stop, spacing)
+    return Ideal(leg, ImuSteps.between(leg, key), _state(motion, key),
                  max(1.0, (drive.duration - t_begin) * sigmas.fix_rate / len(t_fix)))
 
 

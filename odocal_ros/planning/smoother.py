@@ -103,6 +103,6 @@ def planned_levels(problem: Problem, sigmas: Sigmas, fixes_in_one: float = 1.0) 
 def _fit(problem: Problem, made: Ideal, levels: Levels) -> Fit:
     """Return the fit that stands where it is: no step is taken."""
     state, priors = made.state, problem.priors
-    weighted = Equations(problem, state, problem.sums(state), priors).at(levels)
+    weighted = Equations(problem, state, priors).at(levels)
     return Fit(state, levels, priors, priors, np.ones((len(state.t) - 1, 3)), True, False, 0,
                np.nan, weighted, solve(weighted.normal()))

@@ -44,7 +44,7 @@ def test_it_is_the_residual_of_the_equations_made_anew_at_the_end():
     """The fit has brought its rows there to first order; it ended within 0.03 sigma."""
     _, _, leg, problem, fit = fitted()
     found = left_over(leg, problem, fit)
-    again = Equations(problem, fit.state, problem.sums(fit.state), fit.priors, fit.spread, True)
+    again = Equations(problem, fit.state, fit.priors, fit.spread, True)
     motion = again.parts[MotionRows.name].motion
     begin, end = (np.swapaxes(C, 1, 2) for C in (motion.C, motion.C_end))
     middle = np.swapaxes((motion.C + motion.C_end) @ fit.state.C_bv, 1, 2) / 2

@@ -28,10 +28,10 @@ def scores(fitted):
     """Return what noise alone says of the IMU's errors at the truth, in its sigmas."""
     drive, config, leg = made(duration=300.0, imu_grade='consumer')
     problem, state = Problem.of(leg, config), truth(drive, config, leg)
-    weighted = Equations(problem, state, problem.sums(state), fitted=fitted).at(
+    weighted = Equations(problem, state, fitted=fitted).at(
         problem.first_levels)
     rows = weighted[MotionRows]
-    J = rows._J(slice(0, len(rows.r)))[:, :, -len(CONSTANTS):]
+    J = rows.J[:, :, -len(CONSTANTS):]
     score, information = np.einsum('kij,ki->j', J, rows.r), (J**2).sum(axis=(0, 1))
     return {name: score[i] / np.sqrt(information[i]) for i, name in enumerate(CONSTANTS)
             if name in GYRO_ERRORS or name in ACCEL_ERRORS}

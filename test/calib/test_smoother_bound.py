@@ -30,7 +30,7 @@ def test_bound_is_the_inverse_of_all_rows_stacked(correlation_time):
     problem = Problem.of(leg, config)
     levels = problem.first_levels.but(correlation_time=correlation_time, fix=0.5)
     state = truth(drive, config, leg)
-    parts = Equations(problem, state, problem.sums(state), fitted=True).parts
+    parts = Equations(problem, state, fitted=True).parts
     motion, fixes = parts['motion'], parts['fixes']
     n, N = (WITH_SLOW if correlation_time else BARE), len(state.t)
     size = N * n + M

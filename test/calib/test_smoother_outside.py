@@ -54,7 +54,7 @@ def test_rows_are_true_at_the_truth():
                             heading_sigma=0.0, **ARMS)
     leg = replace(leg_of(with_velocity(drive, lambda e: 0 * e), config), t_stop=60.0)
     problem, state = Problem.of(leg, config), truth(drive, config, leg)
-    parts = Equations(problem, state, problem.sums(state)).parts
+    parts = Equations(problem, state).parts
     # 50 Hz: a turn rate is a mean over 20 ms, 5 mrad/s off at 0.5 rad/s^2, on an arm of 0.6 m
     assert np.abs(parts['velocity'].raw).max() < 5e-3
     # within a step of 20 ms the turn is taken to first order: (0.02 s 0.5 rad/s)^2 / 2

@@ -21,7 +21,7 @@ from odocal_ros.calib.result import Estimate
 from odocal_ros.calib.smoother import growing
 from odocal_ros.calib.smoother.growing import LOOK_PASSES
 from odocal_ros.calib.smoother.problem import Problem
-from odocal_ros.calib.smoother.warm_start import carried, rows_of
+from odocal_ros.calib.smoother.warm_start import carried, steps_of
 from odocal_ros.data.samples import take
 from odocal_ros.errors import BadData, OdocalError
 from odocal_ros.foresee.forecast import Abandoned, as_keys, Forecast, Prospect
@@ -135,7 +135,7 @@ def test_a_fit_that_runs_away_is_told_and_the_next_look_begins_anew(config, look
 def test_keyframes_stay_where_they_are(config, looks):
     so_far = SmootherSoFar()
     views = [so_far._view(x.leg, config) for x in looks[-2:]]
-    first, second = (rows_of(view, 1.0) for view in views)
+    first, second = (steps_of(view, 1.0) for view in views)
     times = [rows.t[rows.key] for rows in (first, second)]
     assert (times[1][:len(times[0]) - 2] == times[0][:-2]).all()
     assert np.diff(times[1])[1:-1] == pytest.approx(1.0, abs=0.11)     # cells are 0.1 s wide
@@ -143,7 +143,7 @@ def test_keyframes_stay_where_they_are(config, looks):
     so_far.look(looks[-2].leg, config)
     going_on = carried(so_far._growing._last, Problem.of(views[1], config, second))
     assert len(going_on.state.t) == len(going_on.spread) + 1 == len(times[1])
-    other = Problem.of(views[1], config, rows_of(views[1], 0.7))
+    other = Problem.of(views[1], config, steps_of(views[1], 0.7))
     assert carried(so_far._growing._last, other) is None
 
 
@@ -151,7 +151,7 @@ def test_the_state_is_reckoned_on_to_where_the_vehicle_is(drive, config, looks):
     so_far = SmootherSoFar()
     so_far.look(looks[-3].leg, config)      # 7 s are to be reckoned on, at speed
     view = so_far._view(looks[-2].leg, config)
-    state = carried(so_far._growing._last, Problem.of(view, config, rows_of(view, 1.0))).state
+    state = carried(so_far._growing._last, Problem.of(view, config, steps_of(view, 1.0))).state
     later = SmootherSoFar()
     later.look(looks[-2].leg, config)
     last = later._growing._last.state
@@ -352,7 +352,7 @@ def test_the_hint_tells_the_value_what_is_lacking_and_how_old_it_is(looks):
     far = of_sigmas(looks[-1], scale=2e-3, yaw=0.02)
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=6.0, **known))
     # twice the asked sigma: 500 m more by white errors, 1500 m by slow ones, here some of both
-    assert ' m/pulse +- 2000 ppm so far; drive 760 m more for the limit of 1000 ppm; yaw ' in told
+    assert ' m/pulse +- 2000 ppm so far; drive 750 m more for the limit of 1000 ppm; yaw ' in told
     assert told.endswith('; for the yaw: stop and start 12 times, or make as many turns')
     told = hint(SessionView(session, Config(), forecast=far, forecast_age_s=40.0, **known))
     assert '; estimate is 40 s old; ' in told

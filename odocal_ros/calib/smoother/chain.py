@@ -94,7 +94,18 @@ class Solved:
             z[:n, :n] = own[k]
             z[:n, n:] = across[:, n:]
             z[n:, :n] = across[:, n:].T
-        return Neighbours(own, wide[:, :, :n + m], corner, self._scale, self._scale_border)
+        return self._unscaled(own, wide[:, :, :n + m])
+
+    def _unscaled(self, own: Floats, across: Floats) -> 'Neighbours':
+        """Return covariances in the units of the unknowns; takes the place of the scaled ones."""
+        n, s, s_c = own.shape[1], self._scale, self._scale_border
+        for rows in blocks(len(own)):
+            own[rows] *= s[rows, :, None] * s[rows, None, :]
+            across[rows] *= s[rows, :, None]
+            across[rows, :, n:] *= s_c
+        for rows in blocks(len(own) - 1):
+            across[rows, :, :n] *= s[rows.start + 1:rows.stop + 1, None, :]
+        return Neighbours(own, across, self.covariance)
 
     def forget(self) -> None:
         """Let go of what the covariances are made from."""
@@ -109,11 +120,9 @@ class Neighbours:
     In full it is (N - 1, 2n + m, 2n + m), which is made some intervals at a time.
     """
 
-    _own: Floats              # (N, n, n) scaled covariance of each block
+    _own: Floats              # (N, n, n) covariance of each block
     _across: Floats           # (N, n, n + m) with the next block and the border
     _corner: Floats           # (m, m)
-    _scale: Floats
-    _scale_border: Floats
 
     def __len__(self) -> int:
         return len(self._own) - 1
@@ -140,16 +149,12 @@ class Neighbours:
         out[:, n:2 * n, n:2 * n], out[:, n:2 * n, 2 * n:] = self._own[rows + 1], after
         out[:, 2 * n:, n:2 * n] = np.swapaxes(after, 1, 2)
         out[:, 2 * n:, 2 * n:] = self._corner
-        scale = np.concatenate([self._scale[rows], self._scale[rows + 1],
-                                np.tile(self._scale_border, (len(rows), 1))], axis=1)
-        out *= scale[:, :, None]
-        out *= scale[:, None, :]
         return out
 
     def variances(self) -> Floats:
         """Return the variance of each unknown of each block: (N, n)."""
         own = [np.einsum('kii->ki', self._own[rows]) for rows in blocks(len(self._own))]
-        return np.concatenate(own) * self._scale**2
+        return np.concatenate(own)
 
     def blocks(self) -> Iterator[tuple[slice, Floats]]:
         """Yield all of them, some intervals at a time."""

@@ -31,7 +31,7 @@ from odocal_ros.calib.smoother.velocity import VelocityRows
 from odocal_ros.data.arrays import Floats
 
 if TYPE_CHECKING:
-    from odocal_ros.calib.smoother.problem import Problem, Sums
+    from odocal_ros.calib.smoother.problem import Problem
 
 SomePart = TypeVar('SomePart', bound=Part)
 PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, SpeedSteps,
@@ -41,11 +41,11 @@ PARTS: tuple[type[Part], ...] = (MotionRows, Fixes, VelocityRows, HeadingRows, S
 class Equations:
     """The parts at one linearisation, for any levels."""
 
-    def __init__(self, problem: 'Problem', state: State, sums: 'Sums',
+    def __init__(self, problem: 'Problem', state: State,
                  priors: Priors | None = None, spread: Floats | None = None,
                  fitted: bool = False) -> None:
         self.state = state
-        here = Here(state, *sums.near(state), priors or problem.priors, spread, fitted)
+        here = Here(state, *problem.sums(state), priors or problem.priors, spread, fitted)
         self.parts = {kind.name: kind(problem, here) for kind in PARTS if kind.there(problem)}
 
     def at(self, levels: Levels) -> 'Weighted':

@@ -142,8 +142,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
     count, state, taken = 0, state.level(), np.zeros(M)
     while True:
         count += 1
-        sums = problem.sums_near(state)
-        weighted = Equations(problem, state, sums, priors, spread, fitted).at(levels)
+        weighted = Equations(problem, state, priors, spread, fitted).at(levels)
         solved = damped(solve(weighted.normal()), taken)
         taken = solved.step_border
         sigma = np.sqrt(np.diag(solved.covariance))
@@ -176,7 +175,7 @@ def fit(problem: Problem, state: State, levels: Levels, most: int = 40, *, froze
             if tail:
                 priors = relaxed(first, priors, state, solved, near)
             del near
-        del sums, weighted, solved      # the most that a long leg takes
+        del weighted, solved      # the most that a long leg takes
     creeping = not settled and bool(max(still, change) < SETTLING.creeping)
     likelihood = -0.5 * (weighted.cost() + weighted.log_R_total() + solved.log_determinant)
     return Fit(state, levels, priors, first, spread, settled or creeping, creeping, count,

@@ -82,7 +82,7 @@ class Fixes(PointRows):
         smoothed, self.by_lag = smoothing(*track, state.constants[FIX_LAG2])
         added, self.by_motion, self.by_time = odometer_error(
             *track, state.constants[FIX_BY_MOTION], state.constants[FIX_TIME])
-        self.raw = np.nan_to_num(raw) + self.v_n * here.change[GNSS_DELAY] - smoothed - added
+        self.raw = np.nan_to_num(raw) - smoothed - added
 
     def errors(self) -> Floats:
         """Return what the fixes err by, white and slow, where they are linearised: (m, 3) m."""
@@ -105,7 +105,7 @@ class Fixes(PointRows):
         J[:, :, BG] = -skew(self.dp) @ self.C * tau / 3 - skew(self.arm_n) @ self.C * tau
         if n > BARE:
             J[:, :, SLOW] = -one * (1 - self.share)[:, None, None]
-        by_yaw, by_pitch = self.state.C_bv_gradient()
+        by_yaw, by_pitch = self.state.C_bv_gradient
         c[:, :, YAW], c[:, :, PITCH] = (-self.C_t @ (g @ self.arm_v) for g in (by_yaw, by_pitch))
         c[:, :, GNSS_ARM] = -self.C_t @ self.state.C_bv
         # stamps late by d: the place is that of d before

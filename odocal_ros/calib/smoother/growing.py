@@ -25,13 +25,12 @@ from odocal_ros.calib.failed import raised_if_wild
 from odocal_ros.calib.result import MethodResult
 from odocal_ros.calib.smoother.chain import NotPositive
 from odocal_ros.calib.smoother.estimate import AGAIN_PASSES, Fit, fit, Trace, WarmStart
-from odocal_ros.calib.smoother.imu_rows import ImuRows
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.outcome import floored, outcome
 from odocal_ros.calib.smoother.problem import NO_ERROR, Problem, SPACING
 from odocal_ros.calib.smoother.smoother import best_fit
 from odocal_ros.calib.smoother.state import LN_K, PITCH, State, YAW
-from odocal_ros.calib.smoother.warm_start import carried, rows_of
+from odocal_ros.calib.smoother.warm_start import carried, steps_of
 from odocal_ros.data.arrays import Floats
 from odocal_ros.errors import BadData
 from odocal_ros.settings.config import Config
@@ -104,7 +103,7 @@ class GrowingFit:
              trace: Trace) -> tuple[Fit, Problem]:
         duration = view.t_stop - view.t_begin
         spacing = SPACING if duration < LONG_LEG else 2 * SPACING
-        problem = Problem.of(view, config, rows_of(view, spacing))
+        problem = Problem.of(view, config, steps_of(view, spacing))
         problem.per_effective = self._per_effective
         begun = None if last is None else carried(last, problem)
         if begun is None:
@@ -129,7 +128,7 @@ class GrowingFit:
         begin = self._cpu_s()
         view = problem.leg
         duration = view.t_stop - view.t_begin
-        other = Problem.of(view, config, rows_of(view, max(SPACING, duration / FEW_KEYS)))
+        other = Problem.of(view, config, steps_of(view, max(SPACING, duration / FEW_KEYS)))
         anew = best_fit(other, config, trace)
         self._judged = duration
         if anew.settled:
@@ -146,7 +145,6 @@ def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> S
     method = outcome(view, problem, best, config)
     covariance = floored(best.solved.covariance * method.details['widened']**2)
     sigmas: Floats = np.sqrt(np.diag(covariance))[[LN_K, YAW, PITCH]]
-    sigmas[0] = np.hypot(sigmas[0], _of_cells(view, problem.imu))
     # an angle that is as set is none that the drive knows
     sigmas[best.first.constants[[LN_K, YAW, PITCH]] <= NO_ERROR] = np.inf
     found = dict(method.estimates)
@@ -156,13 +154,3 @@ def _so_far(view: SmootherLeg, problem: Problem, best: Fit, config: Config) -> S
             factor = abs(e.value) if name == PARAMETERS[0] else 1.0
             found[name] = replace(e, sigma=float(sigma * factor))
     return SoFar(replace(method, estimates=found), sigmas, best.state)
-
-
-def _of_cells(view: SmootherLeg, imu: ImuRows) -> float:
-    """
-    Return the relative error of the way that chords for arcs can make, cells being as wide.
-
-    A turn by theta within a step shortens the chord of its middle by theta^2 / 12.
-    """
-    way = np.abs(np.diff(view.travel.at(imu.t)))
-    return float(way @ (imu.turns()**2).sum(axis=1) / (12 * max(way.sum(), 1e-9)))

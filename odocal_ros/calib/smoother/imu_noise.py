@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.data.arrays import Bools, Floats
-from odocal_ros.data.pieces import by_step, chunks
+from odocal_ros.data.pieces import by_step
 from odocal_ros.screening.force import TILT_SIGMA
 from odocal_ros.settings.grades import G, Grade
 
@@ -39,11 +39,9 @@ def unfelt(grade: Grade) -> Grade:
                    accel_bias_walk=UNFELT_WALK, accel_scale_error=0.0, gyro_by_force=0.0)
 
 
-def at_rest(imu: ImuRows, leg: SmootherLeg, still: Bools) -> dict[str, float]:
+def at_rest(imu: ImuSteps, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     """Return white noise levels of gyro and accelerometer as standstills show them."""
-    turn = imu.turned()
-    force = imu.over_intervals(lambda rows: np.add.reduceat(
-        (rows.f_b[:-1] + rows.f_b[1:]) / 2 * np.diff(rows.t)[:, None], rows.key[:-1]))
+    turn, force = np.split(imu.over_intervals(imu.signals), 2, axis=1)
     T = np.diff(imu.t[imu.key])[:, None]
     inside = still[:-1] & still[1:]
     rest = np.flatnonzero(inside)
@@ -64,7 +62,7 @@ def at_rest(imu: ImuRows, leg: SmootherLeg, still: Bools) -> dict[str, float]:
     return found if leg.felt else {'gyro': found['gyro']}
 
 
-def shaken(imu: ImuRows) -> dict[str, float]:
+def shaken(leg: SmootherLeg) -> dict[str, float]:
     """
     Return white noise levels of gyro and accelerometer as neighbouring samples show them.
 
@@ -75,13 +73,8 @@ def shaken(imu: ImuRows) -> dict[str, float]:
         out: Floats = (np.diff(x, axis=0)**2).sum(axis=1)
         return out
 
-    def of_gyro() -> Floats:
-        steps = chunks(len(imu.t) - 2)
-        return np.concatenate([jumps(
-            imu.turns(some.start, some.stop + 1)
-            / np.diff(imu.t[some.start:some.stop + 2])[:, None]) for some in steps])
-
-    usual = float(np.median(np.diff(imu.t), overwrite_input=True))
-    return {name: float(np.median(jump(), overwrite_input=True) / 2.366 / 2 * usual)
-            for name, jump in (('gyro', of_gyro),             # 2.366: of chi2 with 3
-                               ('accel', lambda: by_step(jumps, imu.f_b)))}
+    rows = slice(*np.searchsorted(leg.t_imu, [leg.t_begin, leg.t_stop]))
+    usual = float(np.median(np.diff(leg.t_imu[rows]), overwrite_input=True))
+    return {name: float(np.median(by_step(jumps, x[rows]), overwrite_input=True)
+                        / 2.366 / 2 * usual)      # 2.366: of chi2 with 3
+            for name, x in (('gyro', leg.w_b), ('accel', leg.f_b))}

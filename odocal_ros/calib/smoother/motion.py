@@ -82,14 +82,12 @@ class Motion:
     """
     The interval equations at one state.
 
-    change : (K, 3 + g), s: by what gyro bias and constants and the odometer's delay differ from
-        those that the sums were made with (for the others the sums have been shifted).
     fitted : the state is so near that residuals are noise: the derivative by the scale goes by
         the way as fitted, for the IMU's see signals.py.
     """
 
     def __init__(self, problem: 'Problem', state: State, intervals: Intervals,
-                 change: tuple[Floats | float, float] = (0.0, 0.0), fitted: bool = False) -> None:
+                 fitted: bool = False) -> None:
         leg, self.axle = problem.leg, Axle(problem, state)
         self.state, self.sums, self.fitted = state, intervals, fitted
         self.by_steps = leg.by_steps
@@ -105,12 +103,10 @@ class Motion:
         half = np.eye(3) - W * T[:, :, None] / 2         # n at mid interval
         self._vary()
         way = turn(intervals.S, self.f + self.leaned) * self.varied
-        if np.any(change[0]):
-            way = way + turn(intervals.S_by, np.asarray(change[0]))
         self.faster = self._faster()
         self.rolled = turn(half @ self.C, way)
         self.heaved = turn(self.C, self.pitched * state.constants[PITCH_CENTRE])
-        self.way = self.rolled + self.heaved + self.faster * change[1]
+        self.way = self.rolled + self.heaved
         self.unsaid = self._unsaid(leg.travel.coarse)
         if self.unsaid is not None:
             self.way = self.way + self.unsaid * state.constants[SPEED_OFFSET]
@@ -209,7 +205,7 @@ class Motion:
         c[:, D, LN_K] = self.heaved - (self.travelled if self.fitted else self.way)
         c[:, D, TYRES] = (c[:, D, LN_K] / self.varied)[:, :, None] \
             * self.from_mean[:, None]
-        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
+        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
             c[:, D, column] = -(C @ s.S @ (state.scale * gradient[:, 0])) \
                 + swing @ gradient @ self.arm_v
         for i, axis in enumerate((self.up, -self.left)):

@@ -10,12 +10,13 @@
 """The motion of the intervals as a part: IMU and odometer from each keyframe to the next."""
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import TYPE_CHECKING
 from weakref import ref
 
 import numpy as np
 
-from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal, SHORT_LEG
+from odocal_ros.calib.smoother.chain import blocks, Neighbours, Normal
 from odocal_ros.calib.smoother.imu_noise import at_rest, sensor_noise
 from odocal_ros.calib.smoother.least import LEAST
 from odocal_ros.calib.smoother.motion import D, Motion, ROWS
@@ -24,7 +25,7 @@ from odocal_ros.calib.smoother.part import Here, Part, Total
 from odocal_ros.calib.smoother.signals import Signals
 from odocal_ros.calib.smoother.slide import HEAVE, least_slide, SIDEWAYS
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
-from odocal_ros.calib.smoother.state import BG, M, ODO_DELAY, State
+from odocal_ros.calib.smoother.state import BG, M, State
 from odocal_ros.data.arrays import Bools, Floats
 from odocal_ros.data.mapped import room
 
@@ -44,15 +45,14 @@ class MotionRows(Part):
     """
     Rows of ``Motion`` in the noise of ``IntervalNoise``; weighed: r (K, 18), whiten (K, 18, 18).
 
-    Unit noises, and the derivatives of a long leg, are made again whenever they are wanted, some
-    intervals at a time: they would take more memory than all else.
+    Unit noises are made again whenever they are wanted, some intervals at a time: they would take
+    more memory than all else.
     """
 
     name = 'motion'
 
     def __init__(self, problem: 'Problem', here: Here) -> None:
-        change = here.gyro_change, here.change[ODO_DELAY]
-        self.motion = Motion(problem, here.state, here.intervals, change, here.fitted)
+        self.motion = Motion(problem, here.state, here.intervals, here.fitted)
         self.raw, self.jacobians = self.motion.residual, self.motion.jacobians
         self.signals = Signals(self.motion) if here.fitted else None
         self.noise = interval_noise(self.motion, problem.leg,
@@ -71,7 +71,6 @@ class MotionRows(Part):
 
     def weigh(self, levels: Levels) -> None:
         """Whiten the rows by the Cholesky root of their covariance."""
-        self._kept: dict[int, Floats] = {}
         self._found: tuple[ref[Neighbours], Floats, Floats] | None = None
         self.whiten = room(len(self.raw), ROWS, ROWS)
         self.r, logs = np.empty((2, len(self.raw), ROWS))
@@ -86,18 +85,19 @@ class MotionRows(Part):
 
     def after(self, step: Floats, constants: Floats, reached: State) -> None:
         """Bring the residuals to where the step leads."""
-        both = np.concatenate([step[:-1], step[1:],
-                               np.broadcast_to(constants, (len(self.r), M))], axis=1)
-        self.r = self.r + np.concatenate([
-            np.einsum('kij,kj->ki', self._J(rows), both[rows]) for rows in blocks(len(self.r))])
+        r, n = self.r.copy(), self.n
+        for rows in blocks(len(r)):
+            J, ends = self.J[rows], slice(rows.start + 1, rows.stop + 1)
+            r[rows] += np.einsum('kij,kj->ki', J[:, :, :n], step[rows]) + np.einsum(
+                'kij,kj->ki', J[:, :, n:2 * n], step[ends]) + J[:, :, 2 * n:] @ constants
+        self.r = r
 
-    def _J(self, rows: slice) -> Floats:
-        """Return the whitened derivatives of some intervals: (k, 18, 2n + M)."""
-        if rows.start in self._kept:
-            return self._kept[rows.start]
-        J = self.whiten[rows] @ np.concatenate(self.derivatives(rows), axis=2)
-        if len(self.r) <= SHORT_LEG:
-            self._kept[rows.start] = J
+    @cached_property
+    def J(self) -> Floats:
+        """Return the whitened derivatives: (K, 18, 2n + M)."""
+        J = room(*self.raw.shape, 2 * self.n + M)
+        for rows in blocks(len(J)):
+            J[rows] = self.whiten[rows] @ np.concatenate(self.derivatives(rows), axis=2)
         return J
 
     def derivatives(self, rows: slice) -> tuple[Floats, Floats, Floats]:
@@ -113,7 +113,8 @@ class MotionRows(Part):
 
     def forget(self) -> None:
         """Let go of the derivatives, and of what was found with them."""
-        self._kept, self._found = {}, None
+        self.__dict__.pop('J', None)
+        self._found = None
 
     def add(self, out: Normal) -> None:
         """Add the rows to normal equations."""
@@ -121,7 +122,7 @@ class MotionRows(Part):
         corner, g_border = Total(), Total()
         for rows in blocks(len(self.r)):
             ends = slice(rows.start + 1, rows.stop + 1)
-            J = self._J(rows)
+            J = self.J[rows]
             H = np.swapaxes(J, 1, 2) @ J
             g = -np.einsum('kij,ki->kj', J, self.r[rows])
             out.diagonal[rows] += H[:, :n, :n]
@@ -144,7 +145,7 @@ class MotionRows(Part):
     def _units(self, rows: slice) -> tuple[Floats, Floats]:
         """Return the whitened unit noises of some intervals, (k, 18, c), and J' of them."""
         A = self.whiten[rows] @ (self.noise.columns(rows) * self.roots())
-        return A, np.swapaxes(self._J(rows), 1, 2) @ A
+        return A, np.swapaxes(self.J[rows], 1, 2) @ A
 
     def roots(self) -> Floats:
         """Return the standard deviation of each unit noise, (c,), per root second."""
@@ -157,7 +158,7 @@ class MotionRows(Part):
     def components(self, near: Neighbours) -> dict[str, tuple[float, float]]:
         """Return for each level its quadratic sum and what is expected of it."""
         estimates, seen = self._noises(near)
-        quadratic, expected = (estimates**2).sum(axis=0), seen.sum(axis=0)
+        quadratic, expected = np.einsum('kc,kc->c', estimates, estimates), seen.sum(axis=0)
         return {name: (float(quadratic[self.of(name)].sum()), float(expected[self.of(name)].sum()))
                 for name in INTERVAL}
 
@@ -168,12 +169,11 @@ class MotionRows(Part):
         (K, c) each; made once for one ``near``, since levels and slips both ask for them.
         """
         if self._found is None or self._found[0]() is not near:
-            found = []
+            estimates, variances = np.empty((2, len(self.r), len(self.noise.component)))
             for rows, block in near.blocks():
                 A, Y = self._units(rows)
-                found.append((np.einsum('kic,ki->kc', A, self.r[rows]),
-                              (A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1)))
-            estimates, variances = (np.concatenate(x) for x in zip(*found, strict=True))
+                estimates[rows] = np.einsum('kic,ki->kc', A, self.r[rows])
+                variances[rows] = (A**2).sum(axis=1) - (Y * (block @ Y)).sum(axis=1)
             self._found = ref(near), estimates, variances
         return self._found[1:]
 
@@ -183,7 +183,7 @@ class MotionRows(Part):
         for rows, block in near.blocks():
             cross = self.with_wanted(block)
             units.append(cross @ self._units(rows)[1])
-            given.append(cross @ np.swapaxes(self._J(rows), 1, 2)
+            given.append(cross @ np.swapaxes(self.J[rows], 1, 2)
                          @ (self.whiten[rows] @ self.noise.given[rows]))
         X = np.concatenate(units)
         for name in INTERVAL:

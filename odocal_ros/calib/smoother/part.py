@@ -42,10 +42,9 @@ WANTED = len(PARAMETERS)    # constants that the budget is of: ln K, yaw, pitch
 @dataclass(frozen=True, eq=False)
 class Here:
     """
-    Where the equations are linearised: a state, and sums over samples brought to it.
+    Where the equations are linearised: a state, and sums over samples at it.
 
-    points : sums to the times of the rows, by the name of their part.   gyro_change (K, 3) rad/s,
-    change (M,) : by what gyro bias and constants exceed those that the sums were made with.
+    points : sums to the times of the rows, by the name of their part.
     spread : (K, SPREAD) factors on the variances of intervals that lie far out.
     fitted : as for ``Motion``.
     """
@@ -53,8 +52,6 @@ class Here:
     state: State
     intervals: Intervals
     points: dict[str, Points]
-    gyro_change: np.ndarray | float
-    change: np.ndarray
     priors: Priors
     spread: np.ndarray | None
     fitted: bool = False

@@ -12,21 +12,29 @@ Preintegration: dR, dv, dp and S of each interval, docs/method.md (S4).
 
 All in the body frame at the interval's begin, so that nothing depends on where the vehicle is:
 with R the attitude since then, dv, dp the single and double integral of R f, S the sum of R over
-travel (Forster et al. 2017 have the first two). Derivatives by a constant change of the biases
-follow from the same sums: a bias db turns R by -A db, A the integral of R. No loop over samples:
-rotations by a prefix product, the rest by cumulative sums, a chunk of intervals at a time.
+travel (Forster et al. 2017 have the first two). Errors of the IMU are constant within a step:
+they turn R by -A d within it, A the integral of R, and shift the force by as much. No loop over
+steps: rotations by a prefix product, the rest by cumulative sums, some intervals at a time.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from odocal_ros.calib.smoother.imu_rows import ImuRows, mended, signals, SomeRows
-from odocal_ros.calib.smoother.state import ACCEL_AXIS, ACCEL_SIGNAL, GYRO_AXIS, GYRO_SIGNAL
+from odocal_ros.calib.smoother.imu_steps import AT_A_TIME, ImuSteps
+from odocal_ros.calib.smoother.state import (
+    ACCEL,
+    ACCEL_AXIS,
+    ACCEL_SIGNAL,
+    GYRO,
+    GYRO_AXIS,
+    GYRO_SIGNAL,
+)
 from odocal_ros.data.arrays import Ints
+from odocal_ros.data.mapped import let_go
 from odocal_ros.nav.rotations import (
     exp_so3,
     matrix_from_quat,
@@ -64,24 +72,9 @@ class Intervals:
     mean_force: Floats  # (K, 3) mean specific force as measured, m/s^2
     longest_step: Floats   # (K,) longest gap between Imu rows, s
 
-    def derived_as(self, other: 'Intervals') -> 'Intervals':
-        """Return these sums with the derivatives of others."""
-        return _with(self, other, 'AA', 'F', 'FF', 'turned', 'dv_by', 'dp_by', 'S_by')
-
     def take(self, rows: slice) -> 'Intervals':
         """Return the intervals of a slice."""
         return Intervals(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
-
-    def shifted(self, gyro: Floats, accel_bias: Floats, accel: Floats) -> 'Intervals':
-        """
-        Return the sums for errors of the IMU that differ a little.
-
-        gyro : (K, 3 + g) biases and constants.   accel_bias : (K, 3).   accel : (a,) constants.
-        """
-        return replace(
-            self, R=exp_so3(-turn(self.turned, gyro)) @ self.R,
-            dv=self.dv + turn(self.dv_by, gyro) - turn(self.A, accel_bias) - self.F @ accel,
-            dp=self.dp + turn(self.dp_by, gyro) - turn(self.AA, accel_bias) - self.FF @ accel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +90,7 @@ class Points:
     FF: Floats       # (m, 3, a)
     force: Floats    # (m, 3) m/s^2, specific force, in the body frame at the begin
     rate: Floats     # (m, 3) rad/s, turn rate, in the body frame at the time
-
-    def derived_as(self, other: 'Points') -> 'Points':
-        """Return these sums with the derivatives of others, of the same points."""
-        return _with(self, other, 'F', 'FF')
+    spin: Floats     # (m, 3) rad/s^2, by which that rises
 
     def take(self, index: Ints) -> 'Points':
         """Return the points that an index picks."""
@@ -110,27 +100,22 @@ class Points:
 Some = TypeVar('Some', Intervals, Points)
 
 
-def _with(sums: Some, other: Some, *names: str) -> Some:
-    return replace(sums, **{name: getattr(other, name) for name in names})
-
-
 def turn(C: Floats, vectors: Floats) -> Floats:
     """Return C @ v row by row: (K, 3, 3), (K, 3)."""
     out: Floats = np.einsum('kij,kj->ki', C, vectors)
     return out
 
 
-def preintegrate(imu: ImuRows, gyro_bias: Floats, accel_bias: Floats,
+def preintegrate(imu: ImuSteps, gyro_bias: Floats, accel_bias: Floats,
                  travel: Callable[[Floats], Floats], forward: Floats, t_points: Floats,
-                 constants: Floats | None = None, owner: Ints | None = None,
-                 derivatives: bool = True) -> tuple[Intervals, Points]:
+                 constants: Floats | None = None) -> tuple[Intervals, Points]:
     """
     Sum up all intervals.
 
     Parameters
     ----------
-    imu : ImuRows
-        Samples.
+    imu : ImuSteps
+        Steps.
     gyro_bias, accel_bias : (K, 3) arrays
         Taken out, one for each interval.
     travel : callable
@@ -141,10 +126,6 @@ def preintegrate(imu: ImuRows, gyro_bias: Floats, accel_bias: Floats,
         Times of fixes, rising, within the keyframes.
     constants : (M,) array, optional
         Of which GYRO and ACCEL are taken out.
-    owner : (m,) array, optional
-        Intervals of the points, rising; default: the one that each lies in.
-    derivatives : bool
-        False: zeros stand in for those that cost most (AA, F, FF, turned, dv_by, dp_by, S_by).
 
     Returns
     -------
@@ -153,19 +134,17 @@ def preintegrate(imu: ImuRows, gyro_bias: Floats, accel_bias: Floats,
     """
     out: list[Intervals] = []
     points: list[Points] = []
-    owner = owners(imu, t_points) if owner is None else owner
-    for first, last, rows in imu.parts():
+    t, K = imu.t, len(imu.key) - 1
+    owner = np.clip(np.searchsorted(t[imu.key], t_points, side='right') - 1, 0, K - 1)
+    per = max(1, int(AT_A_TIME * K / len(t)))
+    for first in range(0, K, per):
+        last = min(first + per, K)
         mine = slice(np.searchsorted(owner, first), np.searchsorted(owner, last))
-        part = _Chunk(rows, mended(rows, constants), gyro_bias[first:last],
-                      accel_bias[first:last], derivatives)
+        part = _Chunk(imu, first, last, gyro_bias[first:last], accel_bias[first:last], constants)
         out.append(part.intervals(travel, forward))
         points.append(part.points(t_points[mine], owner[mine] - first, first))
+        let_go()
     return _joined(Intervals, out), _joined(Points, points)
-
-
-def owners(imu: ImuRows, t: Floats) -> Ints:
-    """Return the intervals between keyframes in which times lie: (m,)."""
-    return np.clip(np.searchsorted(imu.t[imu.key], t, side='right') - 1, 0, len(imu.key) - 2)
 
 
 def _joined(cls: type[Some], parts: list[Some]) -> Some:
@@ -173,12 +152,6 @@ def _joined(cls: type[Some], parts: list[Some]) -> Some:
         return parts[0]
     return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts])
                   for f in fields(cls)})
-
-
-def _mean(t: Floats, x: Floats, key: Ints) -> Floats:
-    """Return the means of x (n, 3) between keyframes, by the trapezoid rule: (K, 3)."""
-    step = (x[:-1] + x[1:]) * (np.diff(t) / 2)[:, None]
-    return np.add.reduceat(step, key[:-1]) / np.diff(t[key])[:, None]
 
 
 def _cross(a: Floats, M: Floats) -> Floats:
@@ -194,36 +167,52 @@ def _cross(a: Floats, M: Floats) -> Floats:
 class _Chunk:
     """Some intervals at once: sums from each interval's begin up to every step."""
 
-    def __init__(self, imu: SomeRows, mended: tuple[Floats, Floats], gyro_bias: Floats,
-                 accel_bias: Floats, derivatives: bool) -> None:
-        t, key = self.t, self.key = imu.t, imu.key
-        self.f_b, self.turn = imu.f_b, imu.turn
-        turn, f = mended
+    def __init__(self, imu: ImuSteps, first: int, last: int, gyro_bias: Floats,
+                 accel_bias: Floats, constants: Floats | None) -> None:
+        key = imu.key[first:last + 1]
+        rows = slice(key[0], key[-1])
+        self.t, self.key = imu.t[key[0]:key[-1] + 1], key - key[0]
         self.own = np.repeat(np.arange(len(key) - 1), np.diff(key))     # interval of each step
-        dt = self.dt = np.diff(t)
-        q = np.empty((len(t), 4))
-        q[0] = 0.0, 0.0, 0.0, 1.0
-        self.rate_turn = turn - gyro_bias[self.own] * dt[:, None]
-        q[1:] = quat_from_rotvec(self.rate_turn)
-        q = prefix_product(q)
-        back = quat_conjugate(q[key[:-1]])[self.own]
-        self.Rs = matrix_from_quat(quat_multiply(back, q[:-1]))
-        self.Re = matrix_from_quat(quat_multiply(back, q[1:]))
-        bias = accel_bias[self.own]
-        self.a_s = np.einsum('nij,nj->ni', self.Rs, f[:-1] - bias)
-        self.a_e = np.einsum('nij,nj->ni', self.Re, f[1:] - bias)
-        self.v, self.dv = self._sums(self.a_s, self.a_e)
-        self.p, self.dp = self._twice(self.v, self.a_s, self.a_e)
-        self.derivatives = derivatives
-        if derivatives:
-            axis, signal = list(ACCEL_AXIS), list(ACCEL_SIGNAL)
-            ends = self.F_s, self.F_e = (self.Rs[:, :, axis] * self.f_b[:-1, None, signal],
-                                         self.Re[:, :, axis] * self.f_b[1:, None, signal])
-            self.F_before, self.F = self._sums(*ends)
-            self.FF_before, self.FF = self._twice(self.F_before, *ends)
+        self.dt = np.diff(self.t)
+        self.signals, self.longest = imu.signals[rows], imu.longest[rows]
+        dt = self.dt[:, None]
+        gyro, accel = self._errors(gyro_bias, accel_bias, constants)
+        self.turn, self.turn_mean = imu.turn[rows] - gyro, imu.turn_mean[rows] - gyro / 2
+        square = skew(self.turn) @ skew(self.turn)
+        # integral of the attitude over a step of unit length, and the integral of that
+        self.G = np.eye(3) + skew(self.turn_mean) + square / 6
+        self.GG = np.eye(3) / 2 + skew(self.turn_mean / 2 - self.turn / 12) + square / 24
+        q = quat_multiply(quat_from_rotvec(-turn(self.G, gyro)), quat_from_rotvec(imu.turn[rows]))
+        q = prefix_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], q]))
+        back = quat_conjugate(q[self.key[:-1]])[self.own]
+        self.R = matrix_from_quat(quat_multiply(back, q[:-1]))
+        self.R_end = matrix_from_quat(quat_multiply(back[self.key[1:] - 1], q[self.key[1:]]))
+        # a turn that grows over the step acts on the force's moment about its begin
+        self.grows = np.eye(3) + skew(self.turn) / 3
+        dv, dp, turned = imu.dv[rows], imu.dp[rows], turn(self.grows, gyro)
+        dv, dp = (dv - np.cross(turned, dv - dp / dt) - turn(self.G, accel),
+                  dp - np.cross(turned, dv * dt / 6) - turn(self.GG, accel) * dt)
+        self.step_v, self.step_p = turn(self.R, dv), turn(self.R, dp)
+        self.v, self.dv = self._running(self.step_v)
+        self.p, self.dp = self._running(self.v * dt + self.step_p)
+        by = list(ACCEL_SIGNAL)
+        self.step_F = (self.R @ self.G)[:, :, ACCEL_AXIS] * self.signals[:, None, 3:][:, :, by]
+        self.step_FF = (self.R @ self.GG)[:, :, ACCEL_AXIS] \
+            * self.signals[:, None, 3:][:, :, by] * dt[:, None]
+        self.F_before, self.F = self._running(self.step_F)
+        self.FF_before, self.FF = self._running(self.F_before * dt[:, None] + self.step_FF)
 
-    def _widen(self, x: Floats, like: Floats) -> Floats:
-        return x.reshape(-1, *(1,) * (like.ndim - 1))
+    def _errors(self, gyro_bias: Floats, accel_bias: Floats,
+                constants: Floats | None) -> tuple[Floats, Floats]:
+        """Return what the errors add up to in a step: (n, 3) rad, (n, 3) m/s, method (S3)."""
+        gyro, accel = (bias[self.own] * self.dt[:, None] for bias in (gyro_bias, accel_bias))
+        if constants is not None:
+            by_gyro, by_accel = np.zeros((3, 6)), np.zeros((3, 3))
+            by_gyro[GYRO_AXIS, GYRO_SIGNAL] = constants[GYRO]
+            by_accel[ACCEL_AXIS, ACCEL_SIGNAL] = constants[ACCEL]
+            gyro = gyro + self.signals @ by_gyro.T
+            accel = accel + self.signals[:, 3:] @ by_accel.T
+        return gyro, accel
 
     def _running(self, step: Floats) -> tuple[Floats, Floats]:
         """Return the sum before each step since the interval's begin, and each interval's sum."""
@@ -232,65 +221,50 @@ class _Chunk:
         start = before[self.key[:-1]]
         return before - start[self.own], total[self.key[1:] - 1] - start
 
-    def _sums(self, at_start: Floats, at_end: Floats) -> tuple[Floats, Floats]:
-        return self._running((at_start + at_end) * self._widen(self.dt / 2, at_start))
-
-    def _twice(self, before: Floats, at_start: Floats, at_end: Floats) -> tuple[Floats, Floats]:
-        """Integrate once more what grows from ``before`` by rates linear over the step."""
-        dt = self._widen(self.dt, at_start)
-        return self._running(before * dt + (2 * at_start + at_end) * (dt**2 / 6))
+    def _sum(self, step: Floats) -> Floats:
+        """Return the sum of each interval."""
+        return np.add.reduceat(step, self.key[:-1])
 
     def intervals(self, travel: Callable[[Floats], Floats], forward: Floats) -> Intervals:
-        """Return the sums of each interval; without derivatives zeros stand for them."""
-        ds = np.diff(travel(self.t)) / 2
-        _, S = self._running((self.Rs + self.Re) * self._widen(ds, self.Rs))
-        T = np.diff(self.t[self.key])
-        _, turn = self._running(self.turn)
-        A_before, A = self._sums(self.Rs, self.Re)
-        AA, F = np.zeros_like(S), np.zeros((len(T), 3, len(ACCEL_AXIS)))
-        by = np.zeros((len(T), 3, 3 + len(GYRO_AXIS)))
-        FF, turned, dv_by, dp_by, S_by = F, by, by, by, by
-        if self.derivatives:
-            F, FF = self.F, self.FF
-            _, AA = self._twice(A_before, self.Rs, self.Re)
-            before, step, turned = self._turned()
-            after = before + step
-            x_s, x_e = _cross(self.a_s, before), _cross(self.a_e, after)
-            dv_before, dv_by = self._sums(x_s, x_e)
-            _, dp_by = self._twice(dv_before, x_s, x_e)
-            x = _cross(self.Rs @ forward, before) + _cross(self.Re @ forward, after)
-            _, S_by = self._running(x * self._widen(ds, x))
-        return Intervals(T, self.Re[self.key[1:] - 1], self.dv, self.dp, A, AA, F, FF, turned,
-                         dv_by, dp_by, S, S_by, turn / T[:, None],
-                         _mean(self.t, self.f_b, self.key),
-                         np.maximum.reduceat(self.dt, self.key[:-1]))
-
-    def _turned(self) -> tuple[Floats, Floats, Floats]:
-        """Return what gyro bias and constants turn: before each step, in it, in all."""
-        x = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
-                            signals(self.turn, self.f_b, self.dt)[:, GYRO_SIGNAL]], axis=1) / 2
-        step = (self.Rs + self.Re)[:, :, [0, 1, 2, *GYRO_AXIS]] * x[:, None, :]
-        before, total = self._running(step)
-        return before, step, total
+        """Return the sums of each interval."""
+        T, dt, ds = np.diff(self.t[self.key]), self.dt[:, None, None], np.diff(travel(self.t))
+        mean = self.R @ self.G
+        A_before, A = self._running(mean * dt)
+        AA = self._sum(A_before * dt + self.R @ self.GG * dt**2)
+        by = np.concatenate([np.repeat(self.dt[:, None], 3, axis=1),
+                             self.signals[:, GYRO_SIGNAL]], axis=1)
+        axes = [0, 1, 2, *GYRO_AXIS]
+        step = mean[:, :, axes] * by[:, None, :]
+        before, turned = self._running(step)
+        grows = (self.R @ self.grows)[:, :, axes] * by[:, None, :]
+        moment = self.step_v - self.step_p / self.dt[:, None]
+        dv_before, dv_by = self._running(_cross(self.step_v, before) + _cross(moment, grows))
+        dp_by = self._sum(dv_before * dt + _cross(self.step_p, before)
+                          + _cross(self.step_v, grows) * (dt / 6))
+        way = mean * ds[:, None, None]
+        cross, ahead = skew(self.turn), skew(forward)
+        own = ahead / 2 + (cross @ ahead + skew(np.cross(self.turn, forward))) / 6
+        own = (self.R @ own * ds[:, None, None])[:, :, axes] * by[:, None, :]
+        S_by = self._sum(_cross(way @ forward, before) + own)
+        measured = self._sum(self.signals) / T[:, None]
+        return Intervals(T, self.R_end, self.dv, self.dp, A, AA, self.F, self.FF, turned, dv_by,
+                         dp_by, self._sum(way), S_by, measured[:, :3], measured[:, 3:],
+                         np.maximum.reduceat(self.longest, self.key[:-1]))
 
     def points(self, t: Floats, interval: Ints, first: int) -> Points:
-        """Return the sums up to times within given intervals of the chunk."""
+        """Return the sums to times in given intervals: rate and force change evenly in a step."""
         j = np.clip(np.searchsorted(self.t, t, side='right') - 1, self.key[interval],
                     self.key[interval + 1] - 1)
-        h = t - self.t[j]
-        h1 = h[:, None]
-        share = h / self.dt[j]
-        a = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 3)[:, None]
-        dp = self.p[j] + self.v[j] * h1 + a * h1**2 / 2
-        dv = self.v[j] + (self.a_s[j] + (self.a_e[j] - self.a_s[j]) * (share / 2)[:, None]) * h1
-        R = self.Rs[j] + self.Rs[j] @ skew(self.rate_turn[j] * share[:, None])
-        force = self.a_s[j] + (self.a_e[j] - self.a_s[j]) * share[:, None]
-        F = FF = np.zeros((len(t), 3, len(ACCEL_AXIS)))
-        if self.derivatives:
-            h2, change = h[:, None, None], self.F_e[j] - self.F_s[j]
-            half, third = share[:, None, None] / 2, share[:, None, None] / 3
-            F = self.F_before[j] + (self.F_s[j] + change * half) * h2
-            FF = self.FF_before[j] + self.F_before[j] * h2 + (
-                self.F_s[j] + change * third) * h2**2 / 2
-        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, F, FF, force,
-                      self.rate_turn[j] / self.dt[j, None])
+        h, dt = (t - self.t[j])[:, None], self.dt[j, None]
+        rise = (6 * self.step_v[j] - 12 * self.step_p[j] / dt) / dt**2
+        force = self.step_v[j] / dt - rise * dt / 2
+        dv = self.v[j] + force * h + rise * h**2 / 2
+        dp = self.p[j] + self.v[j] * h + force * h**2 / 2 + rise * h**3 / 6
+        spin = 6 * (self.turn[j] - 2 * self.turn_mean[j]) / dt**2
+        rate = self.turn[j] / dt - spin * dt / 2
+        R = self.R[j] @ exp_so3(rate * h + spin * h**2 / 2)
+        after, share = h[:, None], (h / dt)[:, None]
+        F = self.F_before[j] + self.step_F[j] * share
+        FF = self.FF_before[j] + self.F_before[j] * after + self.step_FF[j] * share**2
+        return Points(interval + first, t - self.t[self.key[interval]], dv, dp, R, F, FF,
+                      force + rise * h, rate + spin * h, spin)

@@ -17,26 +17,21 @@ from odocal_ros.calib.smoother.axle import rates_at, WARM_TIME
 from odocal_ros.calib.smoother.equations import PARTS, Weighted
 from odocal_ros.calib.smoother.fixes import whitener
 from odocal_ros.calib.smoother.imu_noise import at_rest, shaken, unfelt
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels
 from odocal_ros.calib.smoother.outside import Heading, Velocity, velocity_sigmas
 from odocal_ros.calib.smoother.outside_rows import used
 from odocal_ros.calib.smoother.point_rows import alike, PointRows
-from odocal_ros.calib.smoother.preintegrate import Intervals, owners, Points, preintegrate
+from odocal_ros.calib.smoother.preintegrate import Intervals, Points, preintegrate
 from odocal_ros.calib.smoother.slide import turned
 from odocal_ros.calib.smoother.speed_steps import SpeedSteps
 from odocal_ros.calib.smoother.start import standing
 from odocal_ros.calib.smoother.state import (
     ACCEL,
-    ACCEL_AXIS,
-    ACCEL_SIGNAL,
     FIX_TIME,
     GNSS_ARM,
     GNSS_DELAY,
-    GYRO,
-    GYRO_AXIS,
-    GYRO_SIGNAL,
     HEADING,
     IMPERFECT,
     KIND_SIZES,
@@ -48,7 +43,6 @@ from odocal_ros.calib.smoother.state import (
     SPEED_OFFSET,
     State,
     VELOCITY,
-    VELOCITY_DELAY,
     YAW,
 )
 from odocal_ros.data.arrays import Floats
@@ -56,13 +50,6 @@ from odocal_ros.nav.coarse_speed import CoarseSpeed
 from odocal_ros.settings.config import Config
 from odocal_ros.settings.grades import G, Grade, grade_as_seen, turn_on_bias
 
-# how near to the last pass over the samples a state must lie, by gyro rad/s, accelerometer m/s^2,
-# forward axis, times of odometer and of fixes s. SAME_SUMS, to do without another pass: first
-# order leaves out 5e-9 rad/s, 3 mm of a counter's steps (they are not smooth), 10 um of a fix.
-# SAME_DERIVATIVES, to keep those, which cost most: an interval's are the same to half a per cent.
-# Judgement
-SAME_SUMS = np.array([1e-4, 1e-2, 1e-3, 3e-4, 3e-3])
-SAME_DERIVATIVES = np.array([5e-3, 0.2, 0.02, 0.03, 0.01])
 # s between keyframes. Tuned: half of it costs half as much time again, twice makes the sigmas of a
 # consumer's Imu 6 % larger (docs/decisions/0005)
 SPACING = 1.0
@@ -74,7 +61,7 @@ class Problem:
     """A leg made ready: rows, whitening, priors; what stays the same from pass to pass."""
 
     leg: SmootherLeg
-    imu: ImuRows
+    imu: ImuSteps
     grade: Grade
     priors: Priors
     within: np.ndarray       # (k,) bool, fixes within the keyframes
@@ -90,12 +77,11 @@ class Problem:
     shaken: dict[str, float] = field(default_factory=dict)    # levels of the Imu to come down from
     # velocity, heading, steps of speed: errors that are one
     per_effective: dict[str, float] = field(default_factory=dict)
-    kept: 'Sums | None' = None                    # the last, which the next fit may do with
 
     @classmethod
-    def of(cls, leg: SmootherLeg, config: Config, imu: ImuRows | None = None) -> 'Problem':
-        """Return the problem of a leg; ``imu``: its rows, with keyframes of one's own."""
-        imu = ImuRows.of(leg, SPACING) if imu is None else imu
+    def of(cls, leg: SmootherLeg, config: Config, imu: ImuSteps | None = None) -> 'Problem':
+        """Return the problem of a leg; ``imu``: its steps, with keyframes of one's own."""
+        imu = ImuSteps.of(leg, SPACING) if imu is None else imu
         t = imu.t[imu.key]
         still = standing(leg, t)
         use = (leg.t_fix >= t[0]) & (leg.t_fix <= t[-1])
@@ -104,13 +90,13 @@ class Problem:
         root = whitener(leg.covariance_n[use], np.isnan(leg.fixes_n[use, 2]))
         made = cls(leg, imu, grade, _priors(config, grade, leg), use, use, root, still,
                    used(leg, t), turned(leg, imu), config.gnss.correlation_time,
-                   rates_at(imu.t, imu.w_b, t))
+                   rates_at(leg.t_imu, leg.w_b, t))
         for part in PARTS:
             if part.there(made):
                 first, least = part.first_levels(made)
                 made.first_levels = made.first_levels.but(**first)
                 made.least |= least
-        made.shaken = {k: max(v, made.first_levels[k]) for k, v in shaken(imu).items()}
+        made.shaken = {k: max(v, made.first_levels[k]) for k, v in shaken(leg).items()}
         return made
 
     @property
@@ -125,92 +111,21 @@ class Problem:
             name: alike(part) for name, part in weighted.parts.items()
             if name in (*self.outside, SpeedSteps.name) and isinstance(part, PointRows)}
 
-    def sums_near(self, state: State) -> 'Sums':
-        """Return the last sums where they were made near a state, else those about it."""
-        kept = self.kept
-        if kept is not None and kept.hold_at(state):
-            return kept
-        derived = None if kept is None else kept.derived_at
-        if derived is not None and not derived.hold_at(state, SAME_DERIVATIVES):
-            derived = None
-        kept = self.kept = None        # two at a time are as much as all else
-        self.kept = made = self.sums(state, derived)
-        return made
-
-    def sums(self, state: State, derived: 'Sums | None' = None) -> 'Sums':
-        """Return the preintegrated sums about a state; ``derived``: some with its derivatives."""
+    def sums(self, state: State) -> tuple[Intervals, dict[str, Points]]:
+        """Return the sums over all intervals, and to the times of rows by their part."""
         leg, c = self.leg, state.constants
         delay = c[ODO_DELAY]
         times = {part.name: part.times(self, c) for part in PARTS
                  if issubclass(part, PointRows) and part.there(self)}
         all_t = np.concatenate(list(times.values()))
-        # derivatives go on being those of a point where it leaves its interval by a little
-        owner = owners(self.imu, all_t) if derived is None else np.concatenate(
-            [derived.points[name].interval for name in times])
-        order = np.lexsort((all_t, owner))
+        order = np.argsort(all_t, kind='stable')
         intervals, points = preintegrate(
             self.imu, state.gyro_bias[:-1], state.accel_bias[:-1],
-            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c,
-            owner[order], derived is None)
+            lambda t: leg.travel.at(t + delay), state.scale * state.forward, all_t[order], c)
         place = np.split(np.argsort(order, kind='stable'),
                          np.cumsum([len(t) for t in times.values()])[:-1])
-        made = Sums(state, intervals, {name: points.take(own) for name, own in zip(
-            times, place, strict=True)})
-        return made if derived is None else made.derived_as(derived)
-
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Preintegrated sums with the state they were made about."""
-
-    about: State
-    intervals: Intervals
-    points: dict[str, Points]      # to the times of a part's rows, by its name
-    source: 'Sums | None' = None   # whose derivatives these are, None: their own
-
-    @property
-    def derived_at(self) -> 'Sums':
-        """Return the sums that the derivatives were made with."""
-        return self if self.source is None else self.source
-
-    def derived_as(self, other: 'Sums') -> 'Sums':
-        """Return these sums with another's derivatives."""
-        return replace(
-            self, source=other, intervals=self.intervals.derived_as(other.intervals),
-            points={name: own.derived_as(other.points[name])
-                    for name, own in self.points.items()})
-
-    def _apart(self, state: State) -> tuple[Floats, Floats, Floats]:
-        a, b = state, self.about
-        c = a.constants - b.constants
-        gyro = (a.gyro_bias - b.gyro_bias)[:-1]
-        gyro = np.concatenate([gyro, np.broadcast_to(c[GYRO], (len(gyro), len(c[GYRO])))], axis=1)
-        return gyro, (a.accel_bias - b.accel_bias)[:-1], c
-
-    def near(self, state: State) -> tuple[Intervals, dict[str, Points], Floats | float, Floats]:
-        """Return the sums for a state nearby, and what they leave to be taken in: see Here."""
-        gyro, accel, c = self._apart(state)
-        if not (gyro.any() or accel.any() or c[ACCEL].any()):
-            return self.intervals, self.points, 0.0, c
-        return self.intervals.shifted(gyro, accel, c[ACCEL]), self.points, gyro, c
-
-    def hold_at(self, state: State, limits: Floats = SAME_SUMS) -> bool:
-        """Tell whether a state is near enough: for first order, or within other limits."""
-        gyro, accel, c = self._apart(state)
-        rate, force = self.intervals.mean_rate, self.intervals.mean_force
-        signals = np.concatenate([rate, force], axis=1)
-        gyro = gyro[:, :3] + _errors(signals, c[GYRO], GYRO_AXIS, GYRO_SIGNAL)
-        accel = accel + _errors(force, c[ACCEL], ACCEL_AXIS, ACCEL_SIGNAL)
-        apart = (gyro, accel, c[:3], c[ODO_DELAY], c[[GNSS_DELAY, VELOCITY_DELAY]])
-        return bool(np.all(np.array([np.abs(a).max() for a in apart]) < limits))
-
-
-def _errors(signals: Floats, constants: Floats, axes: tuple[int, ...],
-            by: tuple[int, ...]) -> Floats:
-    """Return what constants make of signals (K, s) on each axis: (K, 3)."""
-    matrix = np.zeros((3, signals.shape[1]))
-    matrix[axes, by] = constants
-    return signals @ matrix.T
+        return intervals, {name: points.take(own) for name, own in zip(
+            times, place, strict=True)}
 
 
 def imperfect_sigmas(grade: Grade) -> Floats:

@@ -19,12 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.noise import Levels, TURNING_RATE
-from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.start import rest_bias
-from odocal_ros.data.pieces import chunks
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.levels import SWAY
 
@@ -44,15 +42,12 @@ NO_TURN = np.pi / 2
 SIDEWAYS = ('side', 'side_turn', 'up')
 
 
-def turned(leg: SmootherLeg, imu: ImuRows) -> float:
+def turned(leg: SmootherLeg, imu: ImuSteps) -> float:
     """Return the angle driven in turns, all counted positive, rad."""
     t = imu.t[imu.key]
     T = np.diff(t)
-    turn = imu.turned() - rest_bias(leg, imu)[0] * T[:, None]
-    total = Total()
-    for some in chunks(len(imu.t)):
-        total.add(imu.f_b[some])
-    up = total.sum / len(imu.t)
+    turn = imu.over_intervals(imu.turn) - rest_bias(leg, imu)[0] * T[:, None]
+    up = imu.signals[:, 3:].sum(axis=0)
     angle = np.abs(turn @ up) / np.linalg.norm(up)
     way = np.abs(np.diff(leg.travel.at(t))) * leg.rough_scale
     return float(angle[(angle > TURNING_RATE * T) & (way > 0.2 * T)].sum())    # m/s: moving

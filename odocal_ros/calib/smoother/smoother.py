@@ -25,8 +25,9 @@ from odocal_ros.calib.smoother.refusal import no_imu, refused
 from odocal_ros.calib.smoother.slow_error import USUAL_TIME, WHITE_SHARE
 from odocal_ros.calib.smoother.speed_offset import judge_offset
 from odocal_ros.calib.smoother.start import first_state, Start
-from odocal_ros.calib.smoother.state import State
+from odocal_ros.calib.smoother.state import State, YAW
 from odocal_ros.data.arrays import Floats
+from odocal_ros.nav.angles import wrap
 from odocal_ros.reasons import Code, Reason
 from odocal_ros.settings.config import Config
 
@@ -83,12 +84,20 @@ def _fit(problem: Problem, config: Config, trace: Trace | None) -> Fit:
     nominal = nominal_yaw(config)
     start = first_state(problem.leg, problem.imu, problem.priors,
                         None if problem.leg.felt else nominal)
-    if not problem.leg.felt or start.yaw_sigma <= TWO_HEADINGS:
-        return fit(problem, start.state, _first_levels(problem, start),
-                   config.leg.compute_limit, trace=trace)
-    other = first_state(problem.leg, problem.imu, problem.priors, nominal)
+    if problem.leg.felt and start.yaw_sigma > TWO_HEADINGS:
+        other = first_state(problem.leg, problem.imu, problem.priors, nominal)
+        turned = wrap(other.state.constants[YAW] - start.state.constants[YAW])
+        if abs(turned) > TWO_HEADINGS:
+            return _likelier(problem, config, (start, other), trace)
+    return fit(problem, start.state, _first_levels(problem, start), config.leg.compute_limit,
+               trace=trace)
+
+
+def _likelier(problem: Problem, config: Config, starts: tuple[Start, Start],
+              trace: Trace | None) -> Fit:
+    """Return the fit from the start that is likelier after some passes."""
     about = max((fit(problem, one.state, _first_levels(problem, one), START_PASSES, trace=trace)
-                 for one in (start, other)), key=lambda f: f.likelihood).outline()
+                 for one in starts), key=lambda f: f.likelihood).outline()
     last = fit(problem, about.state, about.levels, config.leg.compute_limit, about=about,
                trace=trace)
     return replace(last, iterations=about.iterations + last.iterations)
@@ -146,7 +155,7 @@ def bound(leg: SmootherLeg, config: Config, truth: State, levels: Levels,
     problem = Problem.of(leg, config)
     if imperfect is not None:
         problem.priors = with_imperfect(problem.priors, imperfect)
-    equations = Equations(problem, truth, problem.sums(truth), fitted=True)
+    equations = Equations(problem, truth, fitted=True)
     return solve(equations.at(levels).normal()).covariance
 
 

@@ -66,12 +66,14 @@ class SpeedSteps(PointRows):
         self.v_n = state.v_n[self.k] + self.dv + g * tau
         self.ahead = self.C_t @ state.forward
         self.arm_v = leg.odometer_arm - leg.imu_arm + state.constants[ODO_ARM]
-        swing = np.cross(points.rate, state.C_bv @ self.arm_v)
+        arm_b = state.C_bv @ self.arm_v
+        swing = np.cross(points.rate, arm_b)
         self.speed = np.einsum('ki,ki->k', self.ahead, self.v_n) + swing @ state.forward
         self.v_b = turn(np.swapaxes(self.C_t, 1, 2), self.v_n)
         # the way ahead turns too, and the Imu, off the axle, moves across it
         self.gained = np.einsum('ki,ki->k', self.ahead, turn(C, points.force) + g) + np.einsum(
-            'ki,ki->k', np.cross(points.rate, state.forward), self.v_b)
+            'ki,ki->k', np.cross(points.rate, state.forward), self.v_b) + np.cross(
+                points.spin, arm_b) @ state.forward
         c = state.constants
         axle = Axle(problem, state)
         self.from_mean = varies_with(
@@ -80,7 +82,7 @@ class SpeedSteps(PointRows):
         self.varied = 1 + self.from_mean @ c[TYRES]
         said = self.instants.value + self.instants.side * c[SPEED_OFFSET]
         self.said = state.scale * self.varied * said
-        self.raw = (self.said - self.speed + self.gained * here.change[ODO_DELAY])[:, None]
+        self.raw = (self.said - self.speed)[:, None]
 
     @classmethod
     def there(cls, problem: 'Problem') -> bool:
@@ -120,7 +122,7 @@ class SpeedSteps(PointRows):
         c[:, LN_K], c[:, SPEED_OFFSET] = self.said, K * self.instants.side
         c[:, TYRES] = (self.said / self.varied)[:, None] * self.from_mean
         rate = self.points.rate
-        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient(), strict=True):
+        for column, gradient in zip((YAW, PITCH), state.C_bv_gradient, strict=True):
             c[:, column] = -(self.v_b + np.cross(rate, arm)) @ gradient[:, 0] - np.cross(
                 rate, gradient @ self.arm_v) @ state.forward
         c[:, ODO_ARM] = -np.cross(state.forward, rate) @ state.C_bv

@@ -23,13 +23,12 @@ import numpy as np
 
 from odocal_ros.calib.check import steady
 from odocal_ros.calib.reversal import pieces
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
-from odocal_ros.calib.smoother.part import Total
 from odocal_ros.calib.smoother.preintegrate import Intervals, preintegrate
 from odocal_ros.calib.smoother.state import LN_K, M, PITCH, Priors, State, YAW
 from odocal_ros.data.arrays import Bools, Complexes, Floats
-from odocal_ros.data.pieces import by_row, chunks
+from odocal_ros.data.pieces import by_row
 from odocal_ros.nav.alignment import C_nL, level_frame
 from odocal_ros.nav.angles import wrap
 from odocal_ros.nav.earth import gravity
@@ -58,21 +57,18 @@ def standing(leg: SmootherLeg, t: Floats) -> Bools:
     return by_row(within, t)
 
 
-def rest_bias(leg: SmootherLeg, imu: ImuRows) -> tuple[Floats, float]:
+def rest_bias(leg: SmootherLeg, imu: ImuSteps) -> tuple[Floats, float]:
     """Return the mean turn rate of all standstills, (3,), and how long they last, s."""
     inside = standing(leg, imu.t)
     still = inside[:-1] & inside[1:]
-    length = float(np.concatenate([np.diff(imu.t[some.start:some.stop + 1])[still[some]]
-                                   for some in chunks(len(still))]).sum())
+    length = float(np.diff(imu.t)[still].sum())
     if length < 1.0:
         return np.zeros(3), 0.0
-    turned = Total()
-    for some in chunks(len(still)):
-        turned.add(imu.turns(some.start, some.stop)[still[some]])
-    return turned.sum / length, length
+    return imu.turn[still].sum(axis=0) / length, length
 
 
-def first_state(leg: SmootherLeg, imu: ImuRows, priors: Priors, yaw: float | None = None) -> Start:
+def first_state(leg: SmootherLeg, imu: ImuSteps, priors: Priors,
+                yaw: float | None = None) -> Start:
     """
     Return a state to start from.
 
@@ -80,8 +76,8 @@ def first_state(leg: SmootherLeg, imu: ImuRows, priors: Priors, yaw: float | Non
     ----------
     leg : SmootherLeg
         The leg.
-    imu : ImuRows
-        Its IMU rows with the keyframes.
+    imu : ImuSteps
+        Its IMU steps with the keyframes.
     priors : Priors
         Turn-on bias.
     yaw : float, optional
@@ -115,10 +111,10 @@ def first_state(leg: SmootherLeg, imu: ImuRows, priors: Priors, yaw: float | Non
                  yaw_sigma, track.spread)
 
 
-def _sums(leg: SmootherLeg, imu: ImuRows, bias: Floats) -> tuple[Intervals, Floats]:
+def _sums(leg: SmootherLeg, imu: ImuSteps, bias: Floats) -> tuple[Intervals, Floats]:
     K = len(imu.key) - 1
     sums, _ = preintegrate(imu, np.tile(bias, (K, 1)), np.zeros((K, 3)), leg.travel.at,
-                           np.array([1.0, 0.0, 0.0]), np.empty(0), derivatives=False)
+                           np.array([1.0, 0.0, 0.0]), np.empty(0))
     C = np.empty((K + 1, 3, 3))
     C[0] = np.eye(3)
     for k in range(K):

@@ -16,7 +16,8 @@ travel error is that of the odometer's reading at the keyframe (quantisation: bo
 units. The constants are the border.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -135,25 +136,31 @@ class State:
     constants: Floats
     up_b: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """Return K."""
         return float(np.exp(self.constants[LN_K]))
 
-    @property
+    @cached_property
     def forward(self) -> Floats:
         """Return the forward axis in b: (3,)."""
         return forward_b(self.constants[YAW], self.constants[PITCH])
 
-    @property
+    @cached_property
     def C_bv(self) -> Floats:
         """Return the rotation from vehicle to body axes: (3, 3)."""
         return C_bv(self.forward, self.up_b)
+
+    def of_keyframes(self) -> dict[str, Floats]:
+        """Return what has a row for each keyframe, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)
+                if f.name not in ('constants', 'up_b')}
 
     def level(self) -> 'State':
         """Return the state with what its attitudes tell of the IMU's roll."""
         return replace(self, up_b=self.C_nb[:, 2].mean(axis=0))
 
+    @cached_property
     def C_bv_gradient(self) -> tuple[Floats, Floats]:
         """Return the derivatives of C_bv by yaw and by pitch: two (3, 3)."""
         C, up = self.C_bv, self.up_b

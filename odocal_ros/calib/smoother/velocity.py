@@ -98,7 +98,7 @@ def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
     faster = (np.diff(at_keys, axis=0) / here.intervals.T[:, None])[k]
     smoothed, by_lag = smoothing(state.t, at_keys, np.gradient(at_keys, state.t, axis=0),
                                  state.t[k] + points.tau, state.constants[VELOCITY_LAG2])
-    v = state.v_n[k] + dv + g * tau + swing + smoothed - faster * here.change[VELOCITY_DELAY]
+    v = state.v_n[k] + dv + g * tau + swing + smoothed
     # on the prediction: on what is sent it would be on its noise too, and the smallest fit best
     times = 1 + state.constants[VELOCITY_SCALE]
     m, t, rate = len(k), tau[:, :, None], here.intervals.mean_rate[k]
@@ -108,7 +108,7 @@ def _velocity(problem: 'Problem', here: Here, points: Points) -> Rows:
     J[:, :, BA] = C * t
     # a turn rate less by the bias: half the turn acts on what force did, all of it on the arm
     J[:, :, BG] = -(skew(dv) / 2 + skew(swing)) @ C * t - C_t @ skew(arm_b)
-    by_yaw, by_pitch = state.C_bv_gradient()
+    by_yaw, by_pitch = state.C_bv_gradient
     W = C_t @ skew(rate)
     c[:, :, YAW], c[:, :, PITCH] = (-W @ (x @ arm_v) for x in (by_yaw, by_pitch))
     c[:, :, GNSS_ARM] = -W @ state.C_bv

@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from odocal_ros.calib.smoother.estimate import WarmStart
-from odocal_ros.calib.smoother.imu_rows import ImuRows
+from odocal_ros.calib.smoother.imu_steps import ImuSteps
 from odocal_ros.calib.smoother.leg import SmootherLeg
 from odocal_ros.calib.smoother.motion import gravity_n
 from odocal_ros.calib.smoother.part import SPREAD
@@ -29,12 +29,10 @@ from odocal_ros.calib.smoother.start import SPEED_WINDOW
 from odocal_ros.calib.smoother.state import ODO_DELAY, State
 from odocal_ros.data.arrays import Floats
 
-OF_LEG = ('constants', 'up_b')    # of a state what has no row for each keyframe
 
-
-def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
+def steps_of(view: SmootherLeg, spacing: float) -> ImuSteps:
     """
-    Return the rows of a leg with keyframes that stay where they are as it grows.
+    Return the steps of a leg with keyframes that stay where they are as it grows.
 
     They lie at multiples of ``spacing``; first and last row are keyframes too.
     """
@@ -46,7 +44,7 @@ def rows_of(view: SmootherLeg, spacing: float) -> ImuRows:
     k -= grid - t[k - 1] < t[k] - grid
     inside = (t[k] > t[0] + spacing / 2) & (t[k] < t[-1] - spacing / 2)
     key = np.unique(np.concatenate([[0], k[inside], [len(t) - 1]]))
-    return ImuRows(t, view.f_b[first:last + 1], view.w_b[first:last + 1], key)
+    return ImuSteps.between(view, key + first)
 
 
 def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
@@ -59,8 +57,8 @@ def carried(last: WarmStart, problem: Problem) -> WarmStart | None:
     if n < 2 or t[n - 1] < old[-1] - 3.0:       # s at the end, where rows may have come late
         return None
     at = at[:n]
-    state = State(**{name: value if name in OF_LEG else value[at]
-                     for name, value in vars(last.state).items()})
+    state = replace(last.state, **{
+        name: value[at] for name, value in last.state.of_keyframes().items()})
     slipped = [last.spread[a:b].mean(axis=0) for a, b in zip(at[:-1], at[1:], strict=True)]
     spread = np.concatenate([slipped, np.ones((len(t) - n, SPREAD))])
     levels = problem.first_levels.but(**last.levels.values)
@@ -75,7 +73,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     rows = replace(imu, key=key)
     K, c = len(key) - 1, state.constants
     on = {name: np.concatenate([value, np.repeat(value[-1:], K, axis=0)])
-          for name, value in vars(state).items() if name not in OF_LEG}
+          for name, value in state.of_keyframes().items()}
     t = on['t'] = imu.t[imu.key]
     on['travel_error'][n:] = 0.0
     f = state.scale * state.forward
@@ -83,7 +81,7 @@ def _reckoned(state: State, problem: Problem) -> State:
     def travel(t: Floats) -> Floats:
         return leg.travel.at(t + c[ODO_DELAY])
     sums, _ = preintegrate(rows, on['gyro_bias'][n:], on['accel_bias'][n:], travel,
-                           f, np.empty(0), c, derivatives=False)
+                           f, np.empty(0), c)
     for k in range(K):
         on['C_nb'][n + k] = on['C_nb'][n + k - 1] @ sums.R[k]
     C = on['C_nb']

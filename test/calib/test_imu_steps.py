@@ -1,0 +1,138 @@
+# Copyright 2026 odocal_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""IMU steps and the sums over them: a constant turn, coning, gaps, rare samples."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from odocal_ros.calib.smoother.imu_steps import ImuSteps, STEP
+from odocal_ros.calib.smoother.preintegrate import preintegrate
+from odocal_ros.nav.rotations import exp_so3, skew
+
+RATE = np.array([0.05, -0.1, 0.6])      # rad/s
+FORCE = np.array([1.5, -0.7, 9.8])      # m/s^2
+BIAS, FORCE_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.1, 0.05, -0.2])
+SPEED = 7.0
+
+
+def samples(t, w_b, f_b):
+    return SimpleNamespace(t_imu=t, w_b=w_b, f_b=f_b, t_begin=t[0], t_stop=t[-1])
+
+
+def turning(t):
+    """Return the samples of a constant turn under a constant force in b, with biases."""
+    one = np.ones((len(t), 1))
+    return samples(t, one * (RATE + BIAS), one * (FORCE + FORCE_BIAS))
+
+
+def integrals(T, terms=12):
+    """Return the attitude after T, its integral and the integral of that, by their series."""
+    R, A, AA, power = np.eye(3), np.eye(3) * T, np.eye(3) * T**2 / 2, np.eye(3)
+    factorial = 1.0
+    for n in range(1, terms):
+        power, factorial = power @ skew(RATE), factorial * n
+        R = R + power * T**n / factorial
+        A = A + power * T**(n + 1) / factorial / (n + 1)
+        AA = AA + power * T**(n + 2) / factorial / (n + 1) / (n + 2)
+    return R, A, AA
+
+
+def summed(leg, t_points=()):
+    imu = ImuSteps.of(leg, 1.0)
+    K = len(imu.key) - 1
+    return imu, *preintegrate(imu, np.tile(BIAS, (K, 1)), np.tile(FORCE_BIAS, (K, 1)),
+                              lambda t: SPEED * t, np.array([1.0, 0.0, 0.0]),
+                              np.array(t_points))
+
+
+@pytest.mark.parametrize('rate', [10.0, 47.0, 200.0])
+def test_a_constant_turn_has_its_closed_form(rate):
+    imu, sums, points = summed(turning(np.arange(0.0, 5.001, 1 / rate)), [1.23, 3.91])
+    # G leaves out the third power of a step's turn: 0.06^3 / 24 of 7 m and 10 m/s
+    loose = (0.61 * max(STEP, 1 / rate))**3 / 24 * 10
+    for k, T in enumerate(sums.T):
+        R, A, AA = integrals(T)
+        np.testing.assert_allclose(sums.R[k], R, atol=BENT)
+        np.testing.assert_allclose(sums.dv[k], A @ FORCE, atol=loose + 2 * SECOND / rate**2)
+        np.testing.assert_allclose(sums.dp[k], AA @ FORCE, atol=loose + 2 * SECOND / rate**2)
+        np.testing.assert_allclose(sums.S[k], SPEED * A, atol=loose)
+        np.testing.assert_allclose((sums.A[k], sums.AA[k]), (A, AA), atol=loose)
+    for k, tau, dv, dp, R in zip(points.interval, points.tau, points.dv, points.dp, points.R,
+                                 strict=True):
+        assert imu.t[imu.key[k]] + tau == pytest.approx((1.23, 3.91)[int(k > 1)])
+        want = integrals(tau)
+        np.testing.assert_allclose(R, want[0], atol=BENT)
+        # the force is a line within a step: 0.6^2 of it bends by T^2 / 12
+        bent = loose + 4 * SECOND * max(STEP, 1 / rate)**2
+        np.testing.assert_allclose(dv, want[1] @ FORCE, atol=bent)
+        np.testing.assert_allclose(dp, want[2] @ FORCE, atol=bent)
+
+
+# rad: of second order in the turn by the bias in each of ten steps, 0.0027 rad, beside 0.062 rad
+BENT = 10 * 0.0027**2 * 0.062 / 12
+# m/s: of the trapezoid rule between samples, times their interval squared: w^2 f / 12
+SECOND = 0.62**2 * 10.0 / 12
+
+
+def test_coning_at_the_sample_rate_is_in_the_steps():
+    rate, cone, spin = 200.0, 0.02, 2 * np.pi * 8.0
+    t = np.arange(0.0, 4.001, 1 / rate)
+
+    def attitude(t):
+        return Rotation.from_rotvec(cone * np.stack(
+            [np.cos(spin * t), np.sin(spin * t), 0 * t], -1))
+    d = 1e-5
+    w_b = (attitude(t - d).inv() * attitude(t + d)).as_rotvec() / (2 * d)
+    imu = ImuSteps.of(samples(t, w_b, np.zeros((len(t), 3))), 1.0)
+    R = np.eye(3)
+    for turn in imu.turn:
+        R = R @ exp_so3(turn)
+    want = (attitude(t[:1]).inv() * attitude(t[-1:])).as_matrix()[0]
+    # the mean rate alone, 0.01 rad/s about z, would be 0.04 rad off
+    np.testing.assert_allclose(R, want, atol=2e-4)
+    assert abs(imu.signals[:, 2].sum()) == pytest.approx(4 * spin * cone**2 / 2, rel=0.02)
+
+
+def test_steps_are_a_tenth_of_a_second_and_end_at_keyframes():
+    t = np.arange(0.0, 3.001, 0.01)
+    imu = ImuSteps.of(turning(t), 1.0)
+    np.testing.assert_allclose(np.diff(imu.t), STEP, atol=1e-9)
+    np.testing.assert_allclose(imu.t[imu.key], [0.0, 1.0, 2.0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(imu.longest, 0.01, atol=1e-9)
+
+
+def test_a_gap_is_one_step_as_long_as_it_is():
+    t = np.arange(0.0, 4.001, 0.01)
+    imu = ImuSteps.of(turning(t[(t < 1.33) | (t > 1.78)]), 1.0)
+    k = int(np.argmax(imu.longest))
+    assert imu.longest[k] == pytest.approx(0.46, abs=0.011)
+    assert imu.t[k] <= 1.33
+    assert imu.t[k + 1] >= 1.78
+    assert np.delete(np.diff(imu.t), k).max() < 2 * STEP
+
+
+def test_samples_rarer_than_steps_are_steps():
+    t = np.arange(0.0, 30.0, 0.25)
+    imu = ImuSteps.of(turning(t), 1.0)
+    np.testing.assert_array_equal(imu.t, t)
+
+
+def test_chunks_of_any_size_give_the_same_sums(monkeypatch):
+    t = np.arange(0.0, 20.0, 0.01)
+    rng = np.random.default_rng(3)
+    leg = samples(t, 0.2 * rng.standard_normal((len(t), 3)), rng.standard_normal((len(t), 3)))
+    whole = ImuSteps.of(leg, 1.0)
+    monkeypatch.setattr('odocal_ros.calib.smoother.imu_steps.AT_A_TIME', 33)
+    parts = ImuSteps.of(leg, 1.0)
+    for name in ('turn', 'turn_mean', 'dv', 'dp', 'signals', 'longest', 't', 'key'):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-12)
